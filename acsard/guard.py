@@ -1,10 +1,16 @@
-"""The last look at every outgoing line, with code of its own.
+"""Checks every outgoing line a second time, with code of its own.
 
-Shares nothing with `limits.py`, `codec.py` or `check.py`: it reads the finished bytes as the MCU
-will, and lets them pass only if they are finite, within the hard limit, with a right check if they
-have one, and no faster than the last line sent unless a fresh command, a live link and mode DRIVING
-agreed (invariant 2). Without a link only zero passes. Anything else becomes the stop line, and the
-reason goes back into the robot, which latches a fault.
+The guard shares no code with `limits.py`, `codec.py` or `check.py`. It reads the finished bytes as
+the MCU will, and passes a line only if all of these hold:
+
+- The line is whole, within the hard limit, and its check is right. Only `link_check = "require"`
+  asks for a check on a line that moves a wheel.
+- No wheel is faster than in the last line sent, unless a fresh command, a live link and mode
+  `driving` agree (invariant 2).
+- With no link, all wheels are zero.
+
+Otherwise the guard replaces the line with the stop line. It hands the reason to the robot, which
+latches a fault.
 
 The guard also checks that the robot comes to rest. When the last fresh command is older than the
 longest ramp that the limits allow, only zero passes. After a stop, a fault or the end of the daemon
@@ -49,7 +55,7 @@ class Memory(Struct, frozen=True):
     ramp_ns: int = 0
     """Longest ramp to rest under any limits in force since the robot was last at rest."""
     stop_ramp_ns: int = 0
-    """The same at the stop decelerations."""
+    """Longest ramp to rest at the stop decelerations, since the robot was last at rest."""
 
 
 class Guard:
@@ -83,7 +89,10 @@ class Guard:
         self._note_limits()
 
     def check(self, outputs: Outputs) -> tuple[bytes | None, str]:
-        """The line that may really go out, and why it is not the one these outputs have, or ""."""
+        """Return the line that may leave, and the reason if it replaces the one of these outputs.
+
+        The line is None if none is due. The reason is "" if the line is passed unchanged.
+        """
         if outputs.mode == "driving":
             if self._commanded(outputs):
                 self._commanded_ns = outputs.now.mono_ns
@@ -143,8 +152,10 @@ class Guard:
         return abs(outputs.now.mono_ns - arrived) <= timeout
 
     def _sealed(self, line: bytes) -> bool:
-        """From column 31 on: the dialect's comma, `#`, two digits, perhaps `S` or `H`, a right
-        check."""
+        """Return whether the end of a line, from column 31 on, is that of the checked link.
+
+        It is the comma of the dialect, `#`, two digits, perhaps `S` or `H`, and a right check.
+        """
         body, check = line[:-7], line[-7:]
         comma, mark = self._stop[31:-2], body[31:]
         digits = mark[len(comma) + 1 : len(comma) + 3]
@@ -175,9 +186,10 @@ def _ramp_ns(config: Config, *, stop: bool) -> int:
     return int(max(linear / by[0], angular / by[1]) * NS_PER_S)
 
 
-@lru_cache(4)  # the line that went last was new a period ago
+# The last line sent is decoded again with the next one.
+@lru_cache(4)
 def _wheels(line: bytes) -> Wheels | None:
-    """The four motors in hundredths of rad/s, by fixed columns; None when they do not fit."""
+    """Return the four speeds in 0.01 rad/s by fixed columns, None if the columns do not fit."""
     match = _COLUMNS.match(line)
     if match is None:
         return None
@@ -189,7 +201,10 @@ def _wheels(line: bytes) -> Wheels | None:
 
 
 def _crc(data: bytes) -> int:
-    """CRC-16/XMODEM by the shifts of avr-libc's notes, not by the library that made the line."""
+    """Return the CRC-16/XMODEM by the shifts of avr-libc's notes.
+
+    The library that sealed the line has no part in this, so an error there is noticed here.
+    """
     crc = 0
     for byte in data:
         x = crc >> 8 ^ byte

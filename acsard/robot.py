@@ -1,9 +1,10 @@
-"""`Robot.step(Inputs) -> Outputs`: has all parts of a robot, and alone knows their order.
+"""`Robot.step(Inputs) -> Outputs` holds all parts of a robot, and alone knows their order.
 
-Fold the feedback into odometry, choose one command, gate by mode, limit, invert the kinematics,
-report. Pure: time, bytes and commands come in, decisions go out. What a robot remembers from step
-to step is here and in its parts, and changes in a step only (the shell adds to `counters`). The
-shell around it carries bytes, and `guard.py` checks what leaves.
+A step folds the feedback into odometry, chooses one command, gates it by the mode, limits it,
+inverts the kinematics and reports. It is pure: time, bytes and commands come in, decisions go out.
+The memory of a robot is in `Robot` and its parts, and only a step changes it, except that the
+control loop adds to `counters`. The control loop carries the bytes, and `guard.py` checks each line
+that leaves.
 """
 
 from __future__ import annotations
@@ -54,31 +55,31 @@ from acsard.values import (
 )
 
 MAX_DT = 0.05
-"""s; the longest step towards a command, or 1.5 periods if that is longer: after a stall the robot
-must not leap."""
+"""Longest time, s, by which one step may change the speed, or 1.5 periods if that is longer. After
+a stall the robot must not leap."""
 
 UNHEARD_S = WATCHDOG_S - 0.05
-"""s without a line that left: the MCU stops by itself soon after, or, by a clock a little fast, has
-done so. So start over from rest instead of resuming a speed it no longer has."""
+"""Time, s, without a line that left, after which the robot starts over from rest. The MCU stops by
+itself at `WATCHDOG_S`, by its own clock, which may be a little fast."""
 
 HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
-"""What brakes by the stop limits."""
+"""Modes in which the robot brakes at the stop deceleration."""
 
 NS_PER_MS = 1_000_000
 
 MAX_TEXT = 200
-"""Characters of a refusal kept: it may quote what a stranger sent."""
+"""Longest text of a refusal that is kept, in characters: it may quote a stranger's message."""
 
 
 class Robot:
-    """One robot base: its link, pose, mode and commanders."""
+    """One robot base with its link, pose, mode and commanders."""
 
     def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
         """Start in the mode of these latches and with the limits that they keep lowered."""
         self._file_limits = config.limits
         config, self._first_events = with_lowered(config, latches.lowered)
         self.config = config
-        """In force; another one after a step that was asked to `set` something."""
+        """The configuration in force. A step that obeys `set` replaces it."""
         longest_s = longest_reply(config.feedback.fault_time)
         self.session = McuSession(
             config.mcu, config.rate_hz, config.feedback.wheel_speed, longest_s
@@ -99,23 +100,23 @@ class Robot:
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
         self._life = Lifecycle(config.control.auto_activate, latches)
         self._life.lower(lowered(self._file_limits, config.limits))
-        if latches.next or latches.inactive:
+        if latches.in_force:
             mode, why = self._life.mode, self._life.why
             self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
         self._choice = Choice()
         self._speeds = STILL
         self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
-        """Whose command, by its arrival, and the mode: what the last line was made of."""
+        """Arrival of the command, and the mode, that the last line was made of."""
         self._made_ns = 0
-        """When a line was made last."""
+        """Monotonic time at which the last line was made."""
         self._made = self._said = (self._limiter.state, 0)
-        """The limiter and its time at the last line made, and at the last one that went: one that
-        does not go never was."""
+        """State of the limiter and its time, at the last line made and at the last line that left.
+        A line that did not leave has no effect."""
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
-        """Totals since start: `commands`, `commands_first_contact` of senders that were new here
-        and had to show their delays first, `command_<reason>` for each kind refused. The shell adds
-        what it alone sees (lines that were superseded, the bus)."""
+        """Totals since the start: `commands`, `commands_first_contact` of new senders whose delays
+        were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
+        those of the port and the bus."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
@@ -123,14 +124,14 @@ class Robot:
         self._answered = Answered(config.mcu.reply_period)
         self._tally = Tally()
         self._asked: tuple[str, str, int | None] = ("", "", None)
-        """The request before; a stop comes twice, ahead of its query and with it."""
+        """The last request. A stop arrives twice: on a key of its own, and as a query."""
         self._told = Told(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """What `state` and `diagnostics` show; costs too much for every step."""
+        """Return the values for `state` and `diagnostics`. Too slow for every step."""
         session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
@@ -162,12 +163,13 @@ class Robot:
 
     @property
     def travelled(self) -> float:
-        """m by odometry since the start, forwards and backwards."""
+        """Distance by odometry since the start, forwards and backwards, m."""
         return self._odometry.travelled
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Take all that happened since the last step; decide what happens now."""
+        """Take everything that happened since the last step, and decide what happens now."""
         events = list(inputs.events)
+        self._life.begin(inputs.now)
         if self._first_events:
             events += self._first_events
             self._first_events = []
@@ -187,7 +189,8 @@ class Robot:
         applied = self._limiter.twist
         status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
         another, self._status = status != self._status, status
-        if another or news:  # else neither the mode nor the commander is another
+        # Otherwise neither the mode nor the commander has changed.
+        if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
         # By position: a struct takes three times as long by seventeen names.
         return Outputs(
@@ -208,15 +211,16 @@ class Robot:
         )
 
     def _news(self) -> bool:
-        """The next line has something to say that the last did not: worth going at once."""
+        """Return whether the next line has a newer command or mode, so that it may go at once."""
         return (self._choice.arrived_ns, self._life.mode) != self._made_of
 
     # the fate of the line before
 
     def _settle(self, inputs: Inputs) -> None:
-        """What the last line said counts if it went; a line that did not go never was."""
+        """Keep the effect of the last line if it left, and undo it if it did not."""
         if inputs.guard_trip:
-            self._limiter.cut()  # STOP was offered in its place
+            # The guard has sent STOP in its place.
+            self._limiter.cut()
             self._made = (self._limiter.state, self._made_ns)
         if not inputs.superseded:
             self._said = self._made
@@ -242,11 +246,11 @@ class Robot:
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
         if session.restarted:
-            # Nobody has driven before the first link: a zero sent while we started counts.
+            # No sender drives before the first link, so a zero sent during the start counts.
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
         if link != "up":
-            # Nobody can be ramped at the other end, and what was wished then is old now.
+            # Without a link there is no ramp, and the command before the loss is old.
             self._limiter.cut()
             self._speeds = STILL
             self._made = self._said = (self._limiter.state, self._made_ns)
@@ -266,7 +270,10 @@ class Robot:
         )
 
     def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
-        """Fold a line that can be true; None for one that cannot, or is the last straw."""
+        """Fold a line that is possible, and return None for an impossible one.
+
+        Several impossible lines in a row latch a fault.
+        """
         why = self._sanity.impossible(line)
         told = self._dropped.line(why)
         if told is not None:
@@ -294,7 +301,7 @@ class Robot:
         return estimate
 
     def _learn(self, gyro: Gyro, events: list[Event]) -> None:
-        """Turn by the track that the gyro has taught, where that is asked for and known."""
+        """Use the effective track that the gyro has taught, if configured and known."""
         if self._track is not None:
             self._track.look(gyro.learned)
             self._odometry.turn_by(self._track.used)
@@ -340,7 +347,7 @@ class Robot:
                 self._arbiter.require_neutral(asked_ns)
                 return released
             case "activate":
-                if life.activate():
+                if life.activate(request.latch, asked_ns, now):
                     self._arbiter.require_neutral(asked_ns)
                 return "active"
             case "deactivate":
@@ -351,7 +358,7 @@ class Robot:
                 return self._set(request.settings, now.mono_ns)
 
     def _place(self, pose: Pose) -> str:
-        """It is there from now on; to the pose before nothing is owed."""
+        """Set the pose, and drop the corrections that were due to the pose before."""
         self._odometry.set_pose(pose)
         self.session.snapping.forgive()
         if self._gyro is not None:
@@ -360,8 +367,8 @@ class Robot:
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
     def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
-        """Change settings in the middle of whatever the robot does."""
-        # What was made may not have gone: the wheels do what the last line that went said.
+        """Change settings while the robot runs."""
+        # The last line made may not have left, and the wheels obey the last one that did.
         said, made = self._said[0].twist, self._limiter.twist
         before, at_rest = self.config, self._speeds == STILL and said == made == REST
         try:
@@ -402,7 +409,8 @@ class Robot:
 
     def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         events.append(refused(refusal))
-        if refusal.reason == "unproven":  # so begins every sender with a clock of its own
+        # Every sender with a clock of its own begins so.
+        if refusal.reason == "unproven":
             self.counters["commands_first_contact"] += 1
             return
         self.counters[f"command_{refusal.reason}"] += 1

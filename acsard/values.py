@@ -144,7 +144,7 @@ class Request(Struct, frozen=True):
     settings: dict[str, Plain] = {}
     """What `set` is to set, by key as in `config/live.py`."""
     latch: int | None = None
-    """Number of the latch that `clear` releases; None if the client does not name one."""
+    """Number of the latch that `clear` or `activate` releases; None if the client names none."""
 
 
 class Answer(Struct, frozen=True):
@@ -342,6 +342,11 @@ class Latches(Struct, frozen=True):
     def next(self) -> Latch | None:
         """The latch that `clear` releases next: the fault if there is one, else the stop."""
         return self.fault or self.stop
+
+    @property
+    def in_force(self) -> Latch | None:
+        """The latch that decides the mode: the fault, else the stop, else `inactive`."""
+        return self.next or self.inactive
 
     def after_restart(self) -> Latches:
         """Return these latches for the next start of the daemon, each marked as kept."""

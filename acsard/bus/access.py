@@ -1,12 +1,15 @@
-"""Who may do what: the topic table and the ROS names -> Zenoh access rules, default deny.
+"""Makes Zenoh's access rules, default deny, from the topic table, the ROS names and the roles.
 
-Zenoh checks them where a link ends, at the daemon's session or, for TLS, at the door's, against the
-neighbour on the link: who is behind a router has the router's rights. A rule holds for a key
-expression that it includes, so what may be asked with a wildcard has to be allowed with one. Who
-comes by TLS gets exact keys only, since a few wildcards take Zenoh's time without bound. What Zenoh
-lets pass is checked again in code (exact key, kind PUT, listed source).
+- Zenoh checks the rules at the end of a link: at the daemon's session or, over TLS, at the session
+  of the TLS gateway. It sees only the neighbour on that link, so a client behind a router has the
+  rights of the router.
+- A rule holds for each key expression that it includes. A query with a wildcard therefore needs a
+  rule with a wildcard.
+- A client over TLS gets exact keys only, because a few wildcards can take Zenoh's time without
+  bound.
+- The daemon checks each message again in code: exact key, kind PUT, listed source.
 
-Zenoh does not tell the daemon under which certificate a sample came. The rules do it instead: each
+Zenoh does not tell the daemon which certificate a sample came with. The rules do it instead: each
 certificate that commands has keys of its own, which end with its name.
 """
 
@@ -41,14 +44,14 @@ SERVICE_ROLES: dict[Verb, Role] = {
     "set_pose": "maintainer",
     "set": "maintainer",
 }
-"""The least role that may call each service: whoever sees the robot may stop it."""
+"""The least role that may call each service. Every client that sees the robot may stop it."""
 
 MAY: dict[Role, str] = {
     "viewer": "it may follow and stop, not drive",
     "operator": "it may drive by the listed sources, stop and clear",
     "maintainer": "it may do all",
 }
-"""In words, for the person whose tool does not do what was asked."""
+"""What each role may do, for the message of a tool that was refused."""
 
 LOCAL_LINKS = ("tcp",)
 """Links without a certificate. They do not leave the machine unless `bus.insecure` lets them."""
@@ -64,7 +67,7 @@ SPOKEN = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
-"""The messages a daemon sends by itself: data, answers, and what it has and listens to."""
+"""The messages that a daemon sends by itself: data, answers and its declarations."""
 
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
@@ -84,7 +87,7 @@ GRANTS: dict[Role, tuple[str, ...]] = {
         "sense",
     ),
 }
-"""The rules each role has. A router is a maintainer, and tells of a twin that is alive."""
+"""The rules of each role. A router is a maintainer: it forwards the tokens of other daemons."""
 
 DRIVERS: tuple[Role, ...] = ("operator", "maintainer")
 """The roles whose certificates command."""
@@ -94,7 +97,7 @@ WIDE: dict[Role, tuple[str, ...]] = {
     "operator": ("roam", "recall"),
     "maintainer": ("roam", "recall", "browse", "attend"),
 }
-"""What each role has besides with `access.wildcards`."""
+"""The rules that `access.wildcards` adds to each role."""
 
 LOCAL = (
     *GRANTS["maintainer"],
@@ -106,10 +109,11 @@ LOCAL = (
     "err",
     "forge",
 )
-"""Who is at the machine may also look with any wildcard, hear commands, and be wrong: what is put
-on other keys is refused in code, which says why and counts it; but nobody speaks in the robot's
-place."""
+"""The rules of a client on the robot's own machine.
 
+It may also subscribe with any wildcard, receive commands, and put on wrong keys, which the daemon
+refuses with a reason and counts. It may not publish in the robot's place.
+"""
 
 Flow = Literal["ingress", "egress"]
 
@@ -128,7 +132,7 @@ class Rule(TypedDict):
 
 
 class _Keys:
-    """Every key of one robot, native and ROS, by what is done with it."""
+    """The keys of one robot, native and ROS, grouped by their use."""
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
@@ -146,24 +150,25 @@ class _Keys:
         latched = [full_key(robot, topic.key) for topic in told if topic.latched]
         latched += [e.key for e in ros if e.latched]
         self.kept = [f"{key}/@adv/**" for key in latched]
-        """Where Zenoh's advanced publishers keep samples for those who come late."""
+        """Keys under which Zenoh's advanced publishers keep samples for late subscribers."""
         self.heard = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
         self.heard += _of(ros, "in")
-        """What the daemon subscribes to, whoever sends."""
+        """Keys that the daemon subscribes to, for each sender."""
         sources = [source.name for source in config.commands.sources]
         self.commands = [full_key(robot, key) for key in source_keys(sources)]
-        """What listed sources send on, without a certificate."""
+        """Command keys of the listed sources for clients without a certificate."""
         self.ros_commands = [
             e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
         ]
-        """The same by ROS, whose keys have no place for a certificate."""
+        """Command keys of the listed sources in ROS, which have no place for a certificate."""
         self._sources = sources
         self.gyro = [full_key(robot, t.key) for t in topics if t.key == IMU and t not in told]
         self.gyro += [e.key for e in ros if e.native == IMU]
-        """What a gyro is heard on; the simulator has its own."""
+        """Keys on which a gyro sends; none with the simulator, which has a gyro of its own."""
         asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
         self.whoami = {role: full_key(robot, whoami_key(role)) for role in ROLES}
-        """Each role may ask its own and those below it: the highest that answers is who asks."""
+        """Each role may query its own key and those of lower roles, so the highest key that answers
+        is the role of the client."""
         self.any_role = full_key(robot, whoami_key("*"))
         own = (self.config, self.any_role)
         self.questions = [key for key in asked if key not in own]
@@ -172,17 +177,17 @@ class _Keys:
         self.parameters = _of(ros, "query")
 
     def commands_by(self, certificate: str) -> list[str]:
-        """What listed sources send on under this certificate, "*" for any."""
+        """Return the command keys of the listed sources for this certificate, "*" for any."""
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
     def of(self, verb: Verb) -> list[str]:
-        """The keys of a service."""
+        """Return the keys of a service, native and ROS."""
         native = service_key(verb)
         return [full_key(self._robot, native)] + [e.key for e in self._ros if e.native == native]
 
 
 def least_role(key: str) -> Role:
-    """Who may at least use a key below the robot's id."""
+    """Return the least role that may use a key below the robot's id."""
     verb = VERBS.get(key)
     if verb is not None:
         return SERVICE_ROLES[verb]
@@ -192,18 +197,19 @@ def least_role(key: str) -> Role:
 
 
 def access_control(config: Config) -> dict[str, object]:
-    """The value of Zenoh's `access_control` for the session of this daemon.
+    """Return the value of Zenoh's `access_control` for the session of this daemon.
 
-    A TLS link of that session leads to a router, which has let each client put under the name of
-    its own certificate alone, and hands that on.
+    A TLS link of that session leads to a router. The router lets each client put only on the keys
+    of its own certificate, and forwards those samples.
     """
     return _access(config, LOCAL, gateway=False)
 
 
 def door_access(config: Config) -> dict[str, object]:
-    """The same for the door's, whose only link without a certificate is the daemon's.
+    """Return the value of `access_control` for the TLS gateway's session.
 
-    Each certificate that may command has a subject of its own beside that of its role.
+    Its only link without a certificate is that to the daemon. Each certificate that may command has
+    a subject of its own beside the subject of its role.
     """
     return _access(config, ("pass",), gateway=True)
 
@@ -217,7 +223,7 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
         "operator": access.operators,
         "maintainer": access.maintainers,
     }
-    # A certificate counts on a link that was authenticated by it.
+    # Zenoh compares the name of a certificate only on a link that it authenticated.
     subjects: dict[str, dict[str, list[str]]] = {"local": {"link_protocols": list(LOCAL_LINKS)}}
     subjects |= {
         role: {"link_protocols": ["tls"], "cert_common_names": list(held)}
@@ -262,7 +268,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
     answered = [*keys.published, *keys.kept, *keys.questions, keys.config, *keys.parameters]
     answered.append(keys.any_role)
     answered += [key for verb in SERVICE_ROLES for key in keys.of(verb)]
-    # Who puts his gyro beside the simulator's is told so, by the code that refuses it.
+    # A gyro beside the simulator's is let through, because the code refuses it with a reason.
     forged = [key for key in answered if key != keys.imu]
     watching = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
     asked = [*keys.published, *keys.exact_questions, *services("viewer"), keys.whoami["viewer"]]
@@ -283,18 +289,18 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("drive", "ingress", ["put"], keys.ros_commands),
         _rule("operate", "ingress", ["query"], operated),
         _rule("maintain", "ingress", ["query"], maintained),
-        # who bends the pose, as by set_pose
+        # A gyro changes the pose, as set_pose does, so it needs the same role.
         _rule("sense", "ingress", ["put"], keys.gyro),
-        # wildcards: all robots at once, the discovery of ROS, what is kept for who comes late
+        # with wildcards: all robots at once, the discovery of ROS, samples for late subscribers
         _rule("roam", "ingress", watching, [f"{ROOT}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.questions]),
         _rule("browse", "ingress", ["query"], [keys.all]),
         _rule("attend", "ingress", ["liveliness_token"], keys.kept),
-        # at the machine
+        # on the robot's own machine
         _rule("look", "ingress", ["declare_subscriber"], ["**"]),
         _rule("err", "ingress", ["put", "delete"], ["**"]),
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),
-        # between the door and the daemon; ** includes no key with an @
+        # between the TLS gateway and the daemon; ** includes no key with an @
         _rule("pass", "both", EVERYTHING, ["**", *tokens]),
     )
     return {rule["id"]: rule for rule in rules}

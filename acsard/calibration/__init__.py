@@ -1,1 +1,1 @@
-"""`acsard calibrate`: recorded drives -> wheel radii and effective track, and how sure they are."""
+"""`acsard calibrate`: computes wheel radii, effective track and their uncertainty from drives."""

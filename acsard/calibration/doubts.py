@@ -1,6 +1,7 @@
-"""What is wrong with a log rather than with a robot: signs, sides, units, times.
+"""Validation of a log: signs, sides, units and times.
 
-What would lead astray is refused, with what it may be; what was allowed for is told.
+Errors that would corrupt the calibration are refused, with their probable cause. Deviations that
+the calibration corrects are reported as remarks.
 """
 
 from __future__ import annotations
@@ -15,47 +16,56 @@ from acsard.calibration.table import Floats
 from acsard.values import AcsardError
 
 UNLIKE = 0.5
-"""Share of what a sensor shows that the wheels may leave unexplained."""
+"""Fraction of a sensor's motion that the wheels may leave unexplained."""
 
 UNITS = 8.0
-"""Times too much or too little that only another unit explains."""
+"""Factor by which a result may be too large or too small. Beyond it, a unit must be wrong."""
 
 LEAST_TURN = 0.2
-"""Times as far as the configured wheels say: less is not of a robot that skids, but rpm."""
+"""Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
+
+A robot that skids turns further than this. If it turns less, its wheel speeds are probably in rpm.
+"""
 
 FAR_SIZE = 2e-3
-"""So little no other unit of the wheels makes of a way."""
+"""Ratio of radii below which the positions, not the wheel speeds, have a wrong unit."""
 
 FASTEST_TURN = 12.0
-"""rad/s; who turns twice a second drives no odometry: that is in degrees."""
+"""Fastest credible turn rate, rad/s.
+
+A higher rate is in degrees, since no robot turns twice a second.
+"""
 
 LEAST_CHI = 0.4
-"""Effective over configured track: wheels that skid make it larger, never so much smaller."""
+"""Smallest ratio of effective track to wheel separation.
+
+Wheels that skid make the effective track larger, and nothing makes it this much smaller.
+"""
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
-"""What a multiplier may be."""
+"""Range of multipliers that the configuration accepts."""
 
 
 NOTABLE_S, FAR_S = 0.005, 0.5
 LARGE_BIAS = 0.05
-"""rad/s"""
+"""Gyro bias above which a remark is made, rad/s."""
 ONE_SIDED = 0.1
-"""Share of the turns that must be to the lesser side."""
+"""Fraction of the turns below which the less frequent side is reported as missing."""
 ODD_SIZE = 1.25
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Times the configured size: what lies beyond is told."""
+"""Ratio of effective to configured track; values outside this range are reported."""
 
 
 class RefusedError(AcsardError):
-    """The log cannot be calibrated with; the text says why and what to do."""
+    """Refusal of a log that cannot be used for a calibration. The text says why and what to do."""
 
 
 class UnlikeError(RefusedError):
-    """Positions do not follow the wheels, over blocks as long as these."""
+    """Refusal because positions do not follow the wheels over blocks of the length tried."""
 
 
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
-    """The sensor shows the turns of the wheels, whatever sign; raises `RefusedError`."""
+    """Raise `RefusedError` if the sensor does not show the turns of the wheels, of either sign."""
     spread = float(turned @ turned)
     if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
         raise RefusedError(
@@ -66,7 +76,7 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
 
 
 def places_follow(begun: Begin) -> None:
-    """The positions show the path of the wheels; raises `RefusedError`."""
+    """Raise `RefusedError` if the positions do not show the path of the wheels."""
     if begun.unexplained > UNLIKE:
         raise UnlikeError(
             "the positions do not follow what the wheels do: are they x ahead and y to the left in "
@@ -75,9 +85,12 @@ def places_follow(begun: Begin) -> None:
 
 
 def turns_the_right_way(source: str, sides: Floats | None, begun: Begin | None) -> None:
-    """The signs of all agree; raises `RefusedError` with what is the wrong way round.
+    """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
 
-    `sides`: g_l and g_r of the heading sensor `source`; `begun`: the best start for positions.
+    Args:
+        source: the name of the heading sensor.
+        sides: g_l and g_r that the heading sensor gives, or None.
+        begun: the best starting point that the positions give, or None.
     """
     left = right = 1.0
     if begun is not None:
@@ -121,9 +134,10 @@ _ALSO = {
 
 
 def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
-    """A robot can turn so fast; raises `RefusedError` for degrees. `turned`: rad in each row.
+    """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
 
-    Where the wheels are in another unit too, one may hide the other.
+    If the wheel speeds have a wrong unit as well, one error may hide the other. `turned` is in rad
+    per row.
     """
     rate = float(np.percentile(np.abs(turned) / seconds, 90))
     if rate > FASTEST_TURN:
@@ -134,10 +148,13 @@ def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """The robot turns about as far as the wheels say; raises `RefusedError` for other units.
+    """Raise `RefusedError` if the turns are so much too large or too small that a unit is wrong.
 
-    `turn`: what it turns, over what the configured wheels and track say; `bare`: over what wheel
-    radius and separation say.
+    Args:
+        source: the name of the sensor of turns.
+        turn: the ratio of the measured turn to the turn by the configured multipliers.
+        bare: the ratio of the measured turn to the turn by wheel radius and separation alone.
+        base: the configured geometry.
     """
     if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
         return
@@ -155,8 +172,10 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
 
 
 def way_units(size: float, base: Base) -> None:
-    """It goes about as far; raises `RefusedError` for other units. `size`: radius over the
-    configured one."""
+    """Raise `RefusedError` if the way is so much too long or too short that a unit is wrong.
+
+    `size` is the ratio of the radius found to the configured one.
+    """
     if 1 / UNITS < size < UNITS:
         return
     may = (
@@ -174,7 +193,7 @@ def way_units(size: float, base: Base) -> None:
 
 
 def in_range(values: Floats) -> None:
-    """The multipliers can be written; raises `RefusedError`."""
+    """Raise `RefusedError` if the configuration does not accept these multipliers."""
     if np.all((values >= LEAST_FACTOR) & (values <= MOST_FACTOR)):
         return
     shown = ", ".join(f"{value:.3g}" for value in values)
@@ -188,7 +207,16 @@ def in_range(values: Floats) -> None:
 def remarks(
     late: dict[str, float], bias: float, turned: Floats, values: Floats, base: Base, *, sized: bool
 ) -> Iterator[str]:
-    """What is unusual but was allowed for, a sentence each."""
+    """Yield a sentence for each unusual fact that the calibration corrects or tolerates.
+
+    Args:
+        late: the delay of each sensor behind the wheels, s.
+        bias: the gyro bias, rad/s.
+        turned: the turns of all rows, rad, positive to the left.
+        values: the multipliers of the track, the left and the right radius.
+        base: the configured geometry.
+        sized: whether the size of the wheels was measured.
+    """
     for source, seconds in late.items():
         if abs(seconds) >= NOTABLE_S:
             word = "later" if seconds > 0 else "earlier"

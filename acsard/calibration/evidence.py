@@ -1,10 +1,14 @@
-"""What a source of measurements says of the parameters: one contribution a block.
+"""The contribution of a source of measurements to the parameters, one per block.
 
-The parameters are numbers about 1: radius of left and right over the wheel radius, wheel separation
-over the effective track (its inverse makes the turn linear in all), then how the track shrinks with
-the turn rate, three that only positions know: how late they are (s) and where on the robot they are
-taken (m ahead, m to the left), and two of a gyro: by how much its bias is off (rad/s), and by which
-share its rate is too large.
+The nine parameters, by their index:
+
+- LEFT, RIGHT: ratio of the left and right wheels' radius to the configured wheel radius, about 1.
+- TURN: ratio of the wheel separation to the effective track, about 1. It is an inverse because
+  turns are linear in it.
+- RATE: growth of the track with the turn rate.
+- LATE, AHEAD, ASIDE: only for positions: their delay in s and where on the robot they are measured,
+  m ahead and m to the left.
+- DRIFT, STRETCH: only for a gyro: the error of its bias, rad/s, and of its scale, a fraction.
 """
 
 from __future__ import annotations
@@ -20,46 +24,54 @@ LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE, DRIFT, STRETCH = range(9)
 COUNT = 9
 
 HUBER = 2.0
-"""Residuals of so many standard deviations begin to count less."""
+"""Standard deviations above which a residual counts less (Huber's weight)."""
 
 
 class Base(Struct, frozen=True):
-    """What the parameters are measured in, and what is configured: m, and multipliers."""
+    """The geometry that the parameters are relative to, m, and the configured multipliers."""
 
     radius: float
     separation: float
     left: float
     right: float
     track: float
-    """The wheel separation multiplier."""
+    """Configured wheel separation multiplier."""
 
     def start(self) -> Floats:
-        """The configured parameters."""
+        """Return the parameters that are configured now."""
         return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - RATE)])
 
     @property
     def gain(self) -> float:
-        """R / L of parameters that are all 1."""
+        """Ratio R / L of wheel radius to wheel separation: the gain if all parameters are 1."""
         return self.radius / self.separation
 
 
 class Evidence(Struct, frozen=True):
-    """Per block the normal equations of unit weight; `turn` are rad by the parameters."""
+    """Normal equations per block, for unit weight."""
 
     normal: Floats
-    """blocks x COUNT x COUNT."""
+    """Shape (blocks, COUNT, COUNT)."""
     score: Floats
-    """blocks x COUNT."""
+    """Shape (blocks, COUNT)."""
     squares: Floats
-    """Sum of squared residuals, per block."""
+    """Sum of squared residuals per block."""
     counts: Floats
-    """Independent residuals, per block."""
+    """Number of independent residuals per block."""
 
 
 def of_rows(
     jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
 ) -> Evidence:
-    """From rows, each of one block."""
+    """Sum rows into the blocks that they belong to.
+
+    Args:
+        jacobian: shape (rows, COUNT).
+        residual: shape (rows,).
+        weight: weight of each row.
+        block: block number of each row.
+        blocks: number of blocks.
+    """
     normal = np.zeros((blocks, COUNT, COUNT))
     score = np.zeros((blocks, COUNT))
     weighted = jacobian * weight[:, None]
@@ -71,7 +83,10 @@ def of_rows(
 
 
 def huber(normalised: Floats | Complexes, least: float) -> Floats:
-    """Weights for residuals in units of which `least` are usual, or more where all are larger."""
+    """Return Huber weights, between 0 and 1, for residuals.
+
+    The usual size of a residual is `least`, or more if most residuals are larger.
+    """
     size = np.abs(normalised)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
     return np.asarray(np.minimum(1.0, HUBER * scale / np.maximum(size, 1e-300)))

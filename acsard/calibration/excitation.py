@@ -1,4 +1,4 @@
-"""Whether a log has enough in it, and what to drive when it has not."""
+"""Checks that a log contains enough movement, and advice on what to drive if it does not."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from acsard.calibration.paths import Block
 from acsard.calibration.table import Floats
 
 LEAST_TURN = 2 * np.pi
-"""rad that the robot must turn in all."""
+"""Smallest total turn of the robot, rad."""
 
 LEAST_ROLL = 3.0
-"""rad that the wheels must roll in all, together as well as against each other."""
+"""Smallest total roll of the wheels, rad, both in the same direction and against each other."""
 
 ALIKE = 0.98
-"""Squared correlation of both: more, and they are one movement."""
+"""Squared correlation of both rolls above which they count as a single movement."""
 
 WORST_TRACK, WORST_RATIO = 0.2, 0.03
-"""Standard deviations, as shares, that are too large for the result to be of use: of the track by
-chance, and of the ratio of the wheels."""
+"""Largest useful standard deviations, as fractions: of the track by chance, of the radii ratio."""
 
 WORST_CONDITION = 1e4
-"""Of the covariance as correlations: the parameters cannot be told apart."""
+"""Largest condition number of the scaled normal equations at which parameters can be told apart."""
 
 DRIVE = (
     "drive 60 s: stand 3 s, 2 m straight ahead and back, three full turns to the left and three to "
@@ -36,15 +35,17 @@ DRIVE = (
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
-    """There is movement at all; raises `RefusedError`."""
+    """Raise `RefusedError` if the wheels hardly move at all."""
     if len(parts) < LEAST_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
         raise RefusedError(f"the wheels turn for {seconds:.0f} s only, too little: {DRIVE}")
 
 
 def rolls_enough(rows: Rows) -> None:
-    """The wheels turn together, against each other, and not always both at once in the same
-    way; raises `RefusedError`."""
+    """Raise `RefusedError` if the wheels lack a movement that the fit needs.
+
+    They must roll together and against each other, and not always in the same proportion.
+    """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
         if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
@@ -60,7 +61,7 @@ def rolls_enough(rows: Rows) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """The robot turns; raises `RefusedError`. `turned`: rad in each row."""
+    """Raise `RefusedError` if the robot hardly turns. `turned` is in rad per row."""
     if (angle := float(np.abs(turned).sum())) < LEAST_TURN:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
@@ -69,8 +70,11 @@ def turns_enough(turned: Floats) -> None:
 
 
 def sure_enough(found: Multipliers, chance: float) -> None:
-    """The result is of use; raises `RefusedError`. `chance`: the track's standard deviation
-    without what its changes make of it, as a share."""
+    """Raise `RefusedError` if the result is too uncertain to be useful.
+
+    `chance` is the standard deviation of the track as a fraction, without the track's own
+    variation.
+    """
     size = np.outer(found.values, found.values)
     share = found.covariance / size
     ratio = share[LEFT_RADIUS, LEFT_RADIUS] + share[RIGHT_RADIUS, RIGHT_RADIUS]
@@ -84,9 +88,9 @@ def sure_enough(found: Multipliers, chance: float) -> None:
 
 
 def told_apart(normal: Floats) -> None:
-    """The log tells radii and track from each other; raises `RefusedError`.
+    """Raise `RefusedError` if the log cannot separate the radii from the track.
 
-    `normal`: `Fit.apart`.
+    `normal` is the result of `Fit.apart`.
     """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0) or np.linalg.cond(normal / np.outer(size, size)) > WORST_CONDITION:

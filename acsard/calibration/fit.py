@@ -1,13 +1,14 @@
-"""All sources together -> the parameters and how sure they are.
+"""Fits the parameters to all sources together and estimates their uncertainty.
 
-Gauss-Newton on sums over blocks. The standard deviations are a jackknife's over the blocks: each
-is left out in turn, and what that changes is what chance can do, however the errors within a block
-hang together (Quenouille's and Tukey's; with the step linear, its one-step form). Few blocks are
-answered for with the spread of Student's t.
+The fit is Gauss-Newton on sums over blocks. The standard deviations come from a jackknife over the
+blocks: each block is left out in turn, and the resulting change shows the effect of chance,
+whatever the correlation of errors within a block (Quenouille and Tukey; since the step is linear,
+this is the one-step form). If there are few blocks, the deviation is widened to that of Student's
+t.
 
-The effective track of a skidding robot is no constant. So its standard deviation also has what the
-constant does not say: half of how much it changes from slow to fast turns, or how much it differs
-from block to block, whichever is more.
+The effective track of a skidding robot is not constant. Its standard deviation therefore also
+includes the larger of two terms: half of its change from slow to fast turns, and its variation from
+block to block.
 """
 
 from __future__ import annotations
@@ -37,55 +38,62 @@ Source = Callable[[Floats], Evidence]
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""A step that ends the search, and one that may be its last."""
+"""Size of a step that ends the search, and size below which the last step counts as converged."""
 
 USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
-"""Standard deviations before anything is seen, of parameters that a log may not tell: by which
-share a track grows with each rad/s, s, m, m."""
+"""Prior standard deviations of parameters that a log may not determine.
+
+They are the growth of the track, as a fraction per rad/s, the delay in s, and two lengths in m.
+"""
 
 GYRO_SCALE = 0.005
-"""The same of what a gyro calls one rad/s, of a usual MEMS gyro: no log of it alone shows that."""
+"""Prior standard deviation of a gyro's scale, a fraction, for a usual MEMS gyro.
+
+A log of a gyro alone cannot show this error.
+"""
 
 HELD = 1e9
-"""Weight by which the mean radius is held where nothing measures it."""
+"""Weight that holds the mean radius if no source measures it."""
 
 MANY = 16
-"""Blocks that make enough pairs."""
+"""Number of blocks from which on neighbouring pairs are left out as well."""
 
 LEAST_FREE = 3.0
-"""Of Student's t, which has no standard deviation at 2."""
+"""Smallest degrees of freedom for Student's t, which has no standard deviation at 2."""
 
 LEAST_BLOCKS = 5
-"""Fewer say too little of how they differ."""
+"""Smallest number of blocks. Fewer do not show how much blocks differ."""
 
 
 class Fit(Struct, frozen=True):
-    """The parameters, and what each block said of them at the end."""
+    """The parameters found, and the normal equations of each block at that point."""
 
     parameters: Floats
     normal: Floats
-    """blocks x COUNT x COUNT."""
+    """Normal equations, shape (blocks, COUNT, COUNT)."""
     score: Floats
-    """blocks x COUNT."""
+    """Right-hand sides, shape (blocks, COUNT)."""
     known: Floats
-    """COUNT x COUNT: what was known beforehand."""
+    """Prior information as normal equations, shape (COUNT, COUNT)."""
     active: tuple[int, ...]
     varies: float
-    """Share by which the effective track differs from block to block."""
+    """Fraction by which the effective track differs from block to block."""
     converged: bool
     usual: Mapping[int, float]
-    """Standard deviations before anything is seen."""
+    """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: npt.NDArray[np.bool_]) -> Floats:
-        """The parameters if those blocks (a mask) were not there; one step, linear."""
+        """Return the parameters without the blocks of this mask, by one linear step."""
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
         found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
         return found
 
     def apart(self) -> Floats:
-        """Normal equations of left, right and turn, with all that goes with them taken out; where
-        the mean radius is held, of left against right and turn."""
+        """Return the normal equations of left, right and turn with all other parameters eliminated.
+
+        If the mean radius is held, the result has two parameters: left against right, and turn.
+        """
         total = self.normal.sum(axis=0) + self.known
         rest = [index for index in self.active if index > TURN]
         inner, cross = total[np.ix_(rest, rest)], total[np.ix_([LEFT, RIGHT, TURN], rest)]
@@ -94,10 +102,10 @@ class Fit(Struct, frozen=True):
         return np.asarray(free @ three @ free.T)
 
     def covariance(self) -> Floats:
-        """Of the parameters: by chance, and by what was only held to be usual."""
+        """Return the covariance of the parameters from chance and from prior assumptions."""
         alone = self._jackknife(1)
         size = np.sqrt(np.maximum(np.diag(alone), 1e-300))
-        # Errors that last longer than a block show when neighbours are left out together.
+        # Leaving out neighbours together shows errors that last longer than a block.
         paired = np.sqrt(np.diag(self._jackknife(2))) if len(self.score) >= MANY else size
         wider = np.maximum(1.0, paired / size)
         chance = alone * np.outer(wider, wider)
@@ -109,12 +117,13 @@ class Fit(Struct, frozen=True):
         return np.asarray(chance + pull @ np.diag(1 / np.where(usual, usual, np.inf)) @ pull.T)
 
     def _jackknife(self, together: int) -> Floats:
-        """Covariance by leaving out so many neighbouring blocks at a time."""
+        """Return the covariance from leaving out groups of `together` neighbouring blocks."""
         group = np.arange(len(self.score)) // together
         change = np.array(
             [self.without(group == number) - self.parameters for number in range(group[-1] + 1)]
         )
-        # A variance that few of the groups make up is known as badly as of so few.
+        # If a few groups make up most of a variance, it has as few degrees of freedom as those
+        # groups.
         squares = np.maximum(change**2, 1e-150)
         free = np.maximum(LEAST_FREE, squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0))
         student = np.sqrt(free / (free - 2))
@@ -126,9 +135,15 @@ def fit(
     sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
     drift: float = 0.0,
 ) -> Fit:  # fmt: skip
-    """From parameters that are nearly right; what is among the sources: positions, a gyro.
+    """Fit the parameters, starting from parameters that are nearly right.
 
-    `drift`: standard deviation of the gyro's bias, rad/s, 0 where that is taken out of all.
+    Args:
+        sources: functions from parameters to their evidence.
+        start: the parameters to start from.
+        places: whether positions are among the sources.
+        gyro: whether a gyro is among the sources.
+        drift: standard deviation of the gyro bias, rad/s; 0 if the bias was eliminated from the
+            rows.
     """
     active: tuple[int, ...] = (LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE)[: None if places else 4]
     usual = dict(USUAL)
@@ -143,8 +158,9 @@ def fit(
         known, told = _known(parameters, held, places, usual)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + told, active)
-        # Far off, only part of the way: the path must stay near what it is linear about.
-        # Later on, half of it, lest outliers count and not in turn.
+        # Far from the solution, go only part of the way: the path must stay near its linearization
+        # point. After a third of the steps, halve each step, so that outliers do not alternately
+        # count and not count.
         size = float(np.max(np.abs(step[: RATE + 1])))
         whole = 1.0 if at < MOST_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
@@ -158,8 +174,10 @@ def fit(
 
 
 def _sum(found: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    """Of all sources, each weighed by what its blocks' scores show of its noise: residuals that
-    hang together say less than as many that do not."""
+    """Sum the evidence of all sources. Each is weighted by the noise that its blocks' scores show.
+
+    Correlated residuals contain less information than the same number of independent ones.
+    """
     normal, score = np.zeros_like(found[0].normal), np.zeros_like(found[0].score)
     for one in found:
         weight = _weight(one)
@@ -174,7 +192,7 @@ def _weight(one: Evidence) -> float:
         return 0.0
     inner = np.linalg.pinv(total[np.ix_(used, used)], rcond=1e-10, hermitian=True)
     rank = int(np.linalg.matrix_rank(inner, hermitian=True))
-    # About their mean, which is not noise while the parameters are still off.
+    # Take the deviations from the mean: while the parameters are still off, the mean is not noise.
     apart = one.score[:, used] - one.score[:, used].mean(axis=0)
     noise = float(np.einsum("bi,ij,bj->", apart, inner, apart))
     white = float(one.squares.sum() / max(1.0, one.counts.sum()))
@@ -184,7 +202,7 @@ def _weight(one: Evidence) -> float:
 def _known(
     parameters: Floats, held: float, places: bool, usual: Mapping[int, float]
 ) -> tuple[Floats, Floats]:
-    """What is known beforehand, as normal equations."""
+    """Return the prior information as normal equations."""
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
@@ -198,15 +216,15 @@ def _known(
 
 
 def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
-    """Of the active parameters; the rest is held."""
+    """Solve for the active parameters. All others keep their value."""
     part = normal[np.ix_(active, active)]
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])
 
 
 def _varies(found: Sequence[Evidence], parameters: Floats) -> float:
-    """Share by which the track differs from block to block, beyond the noise within them.
+    """Return the fraction by which the track differs between blocks, beyond the noise within them.
 
-    Of random effects, the estimate by moments (DerSimonian & Laird 1986).
+    This is the moment estimator for random effects (DerSimonian & Laird 1986).
     """
     spread = weight = 0.0
     for one in found:

@@ -1,7 +1,7 @@
-"""What a calibration improves, on drives it was not fitted to.
+"""The improvement that a calibration brings, measured on drives that were not fitted.
 
-Each run (or, of few runs, each fifth of the log) is left out in turn, and what is found without it
-is tried on it.
+Each run is left out in turn and the parameters found without it are tested on it. If there are
+fewer than three runs, fifths of the log are left out instead.
 """
 
 from __future__ import annotations
@@ -23,43 +23,49 @@ from acsard.calibration.turning import turned
 
 FOLDS = 5
 LEAST_RUNS = 3
-"""So many runs are left out each; of fewer, fifths of the log."""
+"""Number of runs from which on whole runs are left out. Below it, fifths of the log are."""
 
 STRAIGHT = 0.1
-"""rad/m; what bends more by the wheels is no straight, however slowly it turns."""
+"""Largest curvature of a straight by the wheels, rad/m, however slowly the robot turns."""
 
 TOLD = 0.1
-"""Standard deviation, as a share, of a block's own track by positions that is sure enough."""
+"""Largest standard deviation, as a fraction, of a block's own track by positions that is used."""
 
 
 class Error(Struct, frozen=True):
-    """How far off, as configured and as calibrated; None: nothing to tell it by."""
+    """An error as configured and as calibrated; None if it cannot be measured."""
 
     now: float | None
     then: float | None
 
 
 class Gain(Struct, frozen=True):
-    """The errors of both, with the parameters of the calibration found without what they are
-    tried on."""
+    """Errors before and after the calibration.
+
+    The parameters after the calibration are those that were found without the data they are tested
+    on.
+    """
 
     turn: Error
-    """deg after a turn of 360."""
+    """Heading error after a turn of 360 deg, deg."""
     straight: Error
-    """deg after 10 m straight on, by turns that were not commanded or seen by the wheels."""
+    """Heading error after 10 m straight on, deg.
+
+    It comes from turns that were neither commanded nor seen by the wheels.
+    """
     place: Error
-    """m rms of positions off the path, over a block's length."""
+    """Distance of the positions from the path over the length of a block, m rms."""
 
 
 class Held(Struct, frozen=True):
-    """Blocks that were left out, and the parameters without them."""
+    """The mask of blocks that were left out, and the parameters found without them."""
 
     blocks: npt.NDArray[np.bool_]
     parameters: Floats
 
 
 def folds(fit: Fit, parts: Sequence[Block], rate: Rates) -> Iterator[Held]:
-    """Every block once among those left out."""
+    """Yield groups of blocks to leave out. Each block is in exactly one group."""
     runs = np.array([part.run for part in parts])
     group = runs
     if len(set(runs.tolist())) < LEAST_RUNS:
@@ -70,7 +76,7 @@ def folds(fit: Fit, parts: Sequence[Block], rate: Rates) -> Iterator[Held]:
 
 
 def constant(parameters: Floats, rate: Rates) -> Floats:
-    """With one track for all rates, as the robot will have it."""
+    """Return the parameters with one track for all turn rates, as the robot uses them."""
     fixed = parameters.copy()
     fixed[TURN] *= 1.0 - fixed[RATE] * rate.mean
     fixed[RATE] = 0.0
@@ -81,7 +87,10 @@ def gain(
     fit: Fit, base: Base, parts: Sequence[Block], rate: Rates, rows: Rows, truth: Floats,
     spots: Sequence[Spots], grids: Sequence[Grid],
 ) -> Gain:  # fmt: skip
-    """`truth`: how far the robot turned in each row, rad, as well as it is known."""
+    """Return the errors before and after the calibration.
+
+    `truth` is the robot's turn in each row as well as it is known, rad.
+    """
     held = list(folds(fit, parts, rate))
     now = fit.parameters.copy()
     now[: RATE + 1] = base.start()[: RATE + 1]
@@ -107,7 +116,7 @@ def _error(
     now: Floats, then: Floats, group: npt.NDArray[np.int64], among: npt.NDArray[np.bool_],
     unit: float, amount: float,
 ) -> Error:  # fmt: skip
-    """The sizes of what is summed in each group, per unit of the amount."""
+    """Return the sums of absolute group errors, per unit of `amount`, before and after."""
     if amount <= 0.0:
         return Error(None, None)
     sizes = [np.abs(np.bincount(group[among], off[among])).sum() for off in (now, then)]
@@ -130,8 +139,11 @@ def _place(
 
 
 def seen_by_places(fit: Fit, rows: Rows, base: Base) -> Floats:
-    """How far the robot turned in each row by positions alone, rad: each block with the track that
-    suits it best; 0 where that is not sure enough."""
+    """Return the robot's turn in each row, rad, as the positions alone show it.
+
+    Each block uses the track that suits it best. The turn is 0 in a block whose track is too
+    uncertain.
+    """
     size = np.maximum(fit.normal[:, TURN, TURN], 1e-300)
     own = 1.0 + fit.score[:, TURN] / size / fit.parameters[TURN]
     own[1 / np.sqrt(size) > TOLD * abs(fit.parameters[TURN])] = 0.0

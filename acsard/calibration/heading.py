@@ -1,8 +1,8 @@
-"""What a gyro, or the yaw of a pose source, says of how far the robot turned.
+"""Turns of the robot as a gyro, or the yaw of a position source, shows them.
 
 The rows follow Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots
-based on the least-squares technique, 2005): turned = g_r dphi_r - g_l dphi_l, linear in
-g_r = R_r / L and g_l = R_l / L.
+based on the least-squares technique, 2005): turned = g_r dphi_r - g_l dphi_l, linear in g_r = R_r /
+L and g_l = R_l / L.
 """
 
 from __future__ import annotations
@@ -18,30 +18,39 @@ from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats, LogError
 
 REST_S, EDGE_S = 0.6, 0.3
-"""The bias is what the gyro says while all wheels stand for so long, less what shakes after."""
+"""Shortest rest in which the gyro bias is measured, and the margin cut off at both of its ends, s.
+
+The robot still shakes within the margin.
+"""
 
 TURNED_BY_HAND = 0.05
-"""rad/s from the usual bias: no bias but a robot that somebody turns."""
+"""Deviation from the usual bias, rad/s, above which a resting robot is being turned by hand."""
 
 LEAST_SAMPLES, OUTLIER = 5, 6.0
-"""Of a gyro in a rest; times the median deviation, what is no noise."""
+"""Smallest number of gyro samples in a rest.
+
+`OUTLIER` is the multiple of the median deviation above which a sample is not noise.
+"""
 
 WALK, UNSEEN_WALK = 5e-5, 2e-4
-"""rad/s that a bias walks in a second, times its root: of a usual MEMS gyro, at the least; and
-where a single rest says nothing of it."""
+"""Random walk of a gyro bias, rad/s per square root of a second.
+
+`WALK` is the smallest that is assumed, for a usual MEMS gyro. `UNSEEN_WALK` is assumed if there is
+only a single rest, which shows no walk.
+"""
 
 ROW_S = 1.0
-"""Turns are compared over about so long."""
+"""Approximate time over which turns are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
-"""Steps and reach of the search for the time offset."""
+"""Step and range of the search for the time offset, s."""
 
 DEGREES = 10.0
-"""Times as far as the wheels say: in degrees, not in radians."""
+"""Multiple of the wheels' turn above which a yaw is in degrees instead of radians."""
 
 
 class Heading(Struct, frozen=True):
-    """The angle of a run as a sensor has it, rad, at the sensor's own times."""
+    """The heading of a run as a sensor measures it, rad, at the sensor's own times."""
 
     t: Floats
     angle: Floats
@@ -49,38 +58,46 @@ class Heading(Struct, frozen=True):
 
 
 class Headings(Struct, frozen=True):
-    """Of all runs: one each, and what they share."""
+    """The headings of all runs, one each, and the values that they share."""
 
     source: str
-    """The column it comes from."""
+    """Column of the log that the headings come from."""
     of: tuple[Heading, ...]
     late: float
-    """s by which the sensor's times are later than the wheels' for the same event."""
+    """Delay of the sensor's times behind the wheels' for the same event, s."""
     bias: float
-    """rad/s, the mean of what was taken off."""
+    """Mean bias that was subtracted, rad/s."""
     drifts: bool
-    """The bias was not seen at rest: it has to be found with the rest."""
+    """Whether the bias was not seen at rest, so that the fit has to find it."""
     unsure: float = 0.0
-    """Standard deviation of the bias where the robot moves, rad/s; 0: it has none, or drifts."""
+    """Standard deviation of the bias while the robot moves, rad/s.
+
+    It is 0 if the sensor has no bias or if `drifts` is true.
+    """
 
 
 class Rows(Struct, frozen=True):
-    """Turns over a second or so: what the sensor says and what the wheels did."""
+    """Turns over about a second each, by the sensor and by the wheels."""
 
     block: npt.NDArray[np.int64]
     turned: Floats
-    """rad by the sensor."""
+    """Turn by the sensor, rad."""
     left: Floats
-    """rad of the wheels."""
+    """Angle that the left wheels rolled, rad."""
     right: Floats
     fast: Floats
-    """Integral of |right - left| (right - left), rad2/s: what a track that grows with the rate
-    is told by."""
+    """Integral of |right - left| (right - left), rad2/s.
+
+    It reveals a track that grows with the turn rate.
+    """
     seconds: Floats
 
 
 def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
-    """From the yaw rate; None when no run has it."""
+    """Return headings from the yaw rate, or None if no run has it.
+
+    Raises `LogError` if the yaw rate never changes.
+    """
     if not any(len(run.gyro) for run in driven):
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
@@ -104,9 +121,10 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
 
 
 def of_yaw(driven: Sequence[Run], angles: Sequence[Wheels], gain: float) -> Headings | None:
-    """From the yaw of positions; None when no run has it. `gain`: R / L as configured, about.
+    """Return headings from the yaw of positions, or None if no run has it.
 
-    Raises `LogError` when it is in degrees: they would be unwrapped in the wrong places.
+    Raises `LogError` if the yaw is in degrees, because it would be unwrapped in the wrong places.
+    `gain` is about R / L, as configured.
     """
     if not any(len(run.yaw) for run in driven):
         return None
@@ -132,8 +150,10 @@ def _in_degrees(run: Run, turned: Wheels, gain: float) -> bool:
 
 
 Rests = tuple[Floats, Floats, Floats]
-"""Middle of each rest of a run in which the gyro spoke, s, its bias, rad/s, and the variance of
-that by noise."""
+"""The rests of a run in which the gyro was recorded.
+
+The arrays are the middle of each rest, s, the bias, rad/s, and the variance of the bias by noise.
+"""
 
 
 def _biases(run: Run) -> Rests:
@@ -147,9 +167,9 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Of all but outliers, and its variance, noise of samples that hang together counted as such.
+    """Return the mean without outliers, and its variance; correlated noise is taken into account.
 
-    No median: a gyro with few digits has it on one of its steps.
+    The median is not used: that of a coarsely quantized gyro lies on one of its quantization steps.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -162,16 +182,19 @@ def _mean(samples: Floats) -> tuple[float, float]:
 
 
 def _unsure(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Standard deviation of the bias in the mean of all drives, rad/s: noise at the rests, and a
-    random walk between them."""
+    """Return the standard deviation of the mean bias over all drives, rad/s.
+
+    It consists of noise in the rests and a random walk between them.
+    """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
     gone, lasted = np.concatenate(walked).sum(axis=0)
-    # Few differences are answered for with more.
+    # An estimate from few differences is increased.
     few = 1 + 2 / max(1, count - len(rested))
     walk = max(WALK**2, few * gone / lasted) if lasted else UNSEEN_WALK**2
-    # Between two rests the bias is off by a Brownian bridge; outside of them, by a free walk.
+    # Between two rests the bias error is a Brownian bridge; outside of them it is a free random
+    # walk.
     whole = sum(seconds)
     between = sum(float(np.sum(np.diff(t) ** 3)) for t, _, _ in rested) / 12
     outside = sum(
@@ -186,9 +209,10 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
 
 
 def offset(found: Sequence[Heading], angles: Sequence[Wheels]) -> float:
-    """By how many s the sensor is late: where its turn rate resembles the wheels' most.
+    """Return the delay of the sensor, s, at which its turn rate resembles the wheels' most.
 
-    Of the wheels, what they turn against each other; or together, should a side be reversed.
+    The turn rate of the wheels is the difference of both sides, or their sum in case one side is
+    reversed.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
@@ -215,7 +239,7 @@ def offset(found: Sequence[Heading], angles: Sequence[Wheels]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Of two series of one length for shifts of -reach to reach."""
+    """Return the correlation of two series of equal length for shifts from -reach to reach."""
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -228,7 +252,7 @@ def rows(
     angles: Sequence[Wheels],
     parts: Sequence[Block],
 ) -> Rows:
-    """What each block says; of the wheels alone where there is no sensor of heading."""
+    """Return the rows of all blocks. Without a heading sensor they contain the wheels alone."""
     fast = [_fast(run, turned) for run, turned in zip(driven, angles, strict=True)]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
@@ -253,7 +277,7 @@ def rows(
 
 
 def level(rows: Rows) -> Rows:
-    """What one bias for all would explain is taken out of every column alike: for the fit."""
+    """Remove from every column the part that a common bias would explain, for the fit."""
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, fast = (
         column - rows.seconds * float(share @ column)

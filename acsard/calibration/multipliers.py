@@ -1,4 +1,4 @@
-"""The parameters as the settings of `[drive]`, and how sure they are."""
+"""Converts the fitted parameters and their uncertainty to the settings of `[drive]`."""
 
 from __future__ import annotations
 
@@ -11,25 +11,24 @@ from acsard.calibration.heading import Rows
 from acsard.calibration.table import Floats
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
-"""Indices of `values` and `covariance`."""
+"""Indices into `values` and `covariance`."""
 
 TURNING = 0.05
-"""rad/s; a row that turns less is straight."""
+"""Turn rate below which a row counts as straight, rad/s."""
 
 FASTEST = 0.95
-"""So much of all that was turned was turned slower than what is called the fastest."""
+"""Fraction of all turning that is slower than the rate called the fastest."""
 
 
 class Rates(Struct, frozen=True):
-    """At which rates the robot turned, rad/s: the mean, each rad weighing the same, and the
-    fastest."""
+    """Turn rates of the robot, rad/s: the mean, weighted by angle, and the fastest."""
 
     mean: float
     fastest: float
 
 
 class Multipliers(Struct, frozen=True):
-    """Of wheel separation, left and right wheel radius, and their covariance."""
+    """Multipliers of wheel separation, left and right wheel radius, and their covariance."""
 
     values: Floats
     covariance: Floats
@@ -39,11 +38,13 @@ class Multipliers(Struct, frozen=True):
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def own(self) -> tuple[Floats, float]:
-        """The standard deviations apart from what all three have in common, and of that: a share.
+        """Return each multiplier's own standard deviation, and the common one as a fraction.
 
-        A tape says how large everything is, whatever compares turns says how the three relate. The
-        odometry takes all four for independent. A side's own has half the variance d of the radii's
-        difference, so that of the mean radius d / 4 is the sides' and no scale's, nor the track's.
+        A tape measures the common scale, and comparing turns measures the ratios of the three
+        multipliers. The odometry treats all four deviations as independent. Let d be the variance
+        of the difference of both radii. Each side's own variance is d / 2. Of the variance of the
+        mean radius, d / 4 therefore comes from the sides, and belongs neither to the scale nor to
+        the track.
         """
         shares = self.covariance / np.outer(self.values, self.values)
         mean, track, apart = (
@@ -55,12 +56,15 @@ class Multipliers(Struct, frozen=True):
 
 
 def configured(base: Base) -> Multipliers:
-    """As they are now, of which nobody knows how sure they are."""
+    """Return the configured multipliers.
+
+    Their covariance is zero because their uncertainty is unknown.
+    """
     return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Of these rows; `by_wheels` is how far each turned, rad."""
+    """Return the turn rates of these rows. `by_wheels` is the turn of each row, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -74,15 +78,16 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
 
 
 def found(fit: Fit, rate: Rates) -> Multipliers:
-    """The constants that serve best at the rates that were driven."""
+    """Return the constant multipliers that serve best at the turn rates of the log."""
     return constant(fit.parameters, fit.covariance(), rate, fit.varies)
 
 
 def constant(parameters: Floats, every: Floats, rate: Rates, varies: float) -> Multipliers:
-    """The same of parameters and their covariance; `varies`: from block to block, a share.
+    """Return the multipliers for given parameters and their covariance.
 
-    The variance of the track has how far it is from this constant at the slowest or fastest of
-    them, or from block to block, whichever is more.
+    The variance of the track includes how far the true track differs from this constant: at the
+    slowest or fastest turn rate or, if that is more, from block to block. `varies` is the latter,
+    as a fraction.
     """
     turn, slope = parameters[TURN], parameters[RATE]
     left = 1.0 - slope * rate.mean

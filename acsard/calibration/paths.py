@@ -1,8 +1,8 @@
-"""What the wheels did in a run: angles over time, where they stood, and the blocks it is cut into.
+"""Motion of the wheels in a run: angles over time, rests, and the blocks that the run is cut into.
 
-A block is a few seconds of driving. All that is estimated is a sum over blocks, and how far blocks
-disagree is what the standard deviations come from: within a block errors hang together (a skid
-lasts as long as the turn), from one to the next hardly.
+A block is a few seconds of driving. All estimates are sums over blocks, and the standard deviations
+come from the disagreement between blocks. Errors within a block are correlated, since a skid lasts
+as long as its turn; errors of different blocks hardly are.
 """
 
 from __future__ import annotations
@@ -17,37 +17,43 @@ from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
-"""Samples further apart than both are a gap: nothing is known of what was between."""
+"""Distance of samples, in s and in usual periods, above both of which there is a gap.
+
+Nothing is known of the motion within a gap.
+"""
 
 STILL = 0.02
-"""rad/s; wheels that turn slower all stand."""
+"""Speed below which a wheel stands, rad/s."""
 
 BLOCKS = 16
 SHORTEST_S, LONGEST_S = 4.0, 12.0
-"""As many blocks are aimed at, of such lengths."""
+"""Target length of blocks, s; `BLOCKS` is the target number."""
 
 SMOOTH_S = 0.3
-"""Turn rates that are squared are means over so long: a coarse encoder says 0 or far too much."""
+"""Time over which a turn rate is averaged before it is squared, s.
+
+A coarse encoder otherwise shows 0 or far too much.
+"""
 
 LEAST_TURN = 0.2
-"""rad that the faster side must turn in a block for it to tell anything."""
+"""Turn of the faster side, rad, below which a block is not used."""
 
 
 class Wheels(Struct, frozen=True):
-    """Angles of each side in rad at times `t`, with what happened in gaps left out."""
+    """Angle of each side in rad at times `t`. Motion within gaps is left out."""
 
     t: Floats
     left: Floats
     right: Floats
     gaps: Floats
-    """Rows of (begin, end) in s."""
+    """Gaps, one row (begin, end) each, in s."""
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """Of left and right, at any times."""
+        """Return the angles of left and right at any times."""
         return np.interp(t, self.t, self.left), np.interp(t, self.t, self.right)
 
     def apart(self, t: Floats) -> Floats:
-        """rad/s by which the right side turns faster, about these times."""
+        """Return the speed of right minus left around these times, rad/s."""
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -55,7 +61,7 @@ class Wheels(Struct, frozen=True):
 
 
 class Block(Struct, frozen=True):
-    """A stretch of a run, s."""
+    """A part of a run, in s."""
 
     run: int
     begin: float
@@ -63,7 +69,7 @@ class Block(Struct, frozen=True):
 
 
 def gaps(t: Floats) -> Floats:
-    """(begin, end) of each gap between sample times, one row each."""
+    """Return the gaps between sample times, one row (begin, end) each."""
     steps = np.diff(t)
     if not len(steps):
         return np.zeros((0, 2))
@@ -72,14 +78,14 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> npt.NDArray[np.bool_]:
-    """Which stretches touch none of the gaps."""
+    """Return a mask of the intervals that touch none of the gaps."""
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
     return np.asarray(after == before)
 
 
 def wheels(run: Run) -> Wheels:
-    """Angles from the speeds of a run, by the trapezoid."""
+    """Return the angles of a run, integrated from its speeds by the trapezoidal rule."""
     holes = gaps(run.t)
     steps = np.diff(run.t)
     steps[np.isin(run.t[:-1], holes[:, 0])] = 0.0
@@ -88,12 +94,15 @@ def wheels(run: Run) -> Wheels:
 
 
 def cumulative(steps: Floats) -> Floats:
-    """Sums from 0 on, one more than there are steps."""
+    """Return the cumulative sums from 0 on, one element more than `steps` has."""
     return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """(begin, end) of each time of at least so long in which all wheels stood, less its edges."""
+    """Return (begin, end) of each time in which all wheels stood.
+
+    A margin of `edge_s` is cut off at both ends, and at least `least_s` must remain.
+    """
     moving = (np.abs(run.left) > STILL) | (np.abs(run.right) > STILL)
     changes = np.flatnonzero(np.diff(np.concatenate(([True], moving, [True])).astype(np.int8)))
     spans = [(run.t[a], run.t[b - 1]) for a, b in changes.reshape(-1, 2)]
@@ -102,7 +111,7 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
 
 
 def blocks(driven: Sequence[Run], angles: Sequence[Wheels], shortest_s: float) -> list[Block]:
-    """The parts of all runs in which the robot moved."""
+    """Return the blocks of all runs in which the robot moved."""
     moved = sum(_moving_s(run) for run in driven)
     length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
     found = []
@@ -121,7 +130,7 @@ def blocks(driven: Sequence[Run], angles: Sequence[Wheels], shortest_s: float) -
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """The wheels did enough there; back and forth counts as well."""
+    """Return whether the wheels turned enough there; turning back and forth counts as well."""
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

@@ -1,7 +1,7 @@
-"""Positions from any source as evidence: each block's path, laid onto what was seen.
+"""Positions of any source as evidence: the path of each block is aligned with the positions.
 
-The residual of a block is what is left after the wheels' path has been shifted and turned onto the
-positions, so no start pose, no frame and no yaw are needed. Paths are complex numbers x + iy in m.
+The residual of a block remains after the wheels' path has been shifted and turned onto the
+positions, so no start pose, frame or yaw is needed. Paths are complex numbers x + iy in m.
 """
 
 from __future__ import annotations
@@ -29,21 +29,24 @@ from acsard.calibration.runs import Complexes, Run
 from acsard.calibration.table import Floats
 
 LEAST_POINTS = 5
-"""Positions of a block; three unknowns are its shift and turn."""
+"""Smallest number of positions in a block, which has three unknowns: shift (two) and rotation."""
 
 FINE_S = 0.02
-"""The path is summed in steps not much shorter: a long log is not to take longer than it must."""
+"""Time step in which the path is summed, s. Finer steps would only make long logs slower."""
 
 JUMP, JUMP_M = 6.0, 0.05
-"""A position that far from where the wheels can have brought it, in standard deviations of that
-and in m, is an outlier, or the first after the source has found itself elsewhere."""
+"""Excess of a step over the wheels' motion that counts as a jump.
+
+It is the sum of `JUMP` standard deviations and `JUMP_M` m. The position is an outlier, or the first
+one after the source has relocalized.
+"""
 
 SLOPE_S = 0.05
-"""The path's speed is taken over twice this."""
+"""Half of the interval from which the path's speed is computed, s."""
 
 
 class Spots(Struct, frozen=True):
-    """The positions of one block, between two jumps of their source."""
+    """The positions of a block between two jumps of their source."""
 
     block: int
     run: int
@@ -52,20 +55,20 @@ class Spots(Struct, frozen=True):
 
 
 class Grid(Struct, frozen=True):
-    """A run's wheel angles in steps that are fine enough."""
+    """Wheel angles of a run in sufficiently fine steps."""
 
     t: Floats
     left: Floats
-    """rad in each step."""
+    """Angle that the left wheels roll in each step, rad."""
     right: Floats
     fast: Floats
     """|right - left| (right - left) in each step, rad2/s."""
 
 
 class Path(Struct, frozen=True):
-    """Where the wheels bring a run, and how that changes with each parameter, at the grid's times.
+    """The path of a run by the wheels at the grid's times, and its derivatives by the parameters.
 
-    Linear in between.
+    Between the times it is linear.
     """
 
     t: Floats
@@ -73,10 +76,13 @@ class Path(Struct, frozen=True):
     heading: Floats
     slopes: dict[int, Complexes]
     bends: dict[int, Floats]
-    """How the heading changes with each, rad."""
+    """Derivatives of the heading by each parameter, rad."""
 
     def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Where the sensor is at these times of the positions, and its slopes, COUNT columns."""
+        """Return the sensor's place at these times of the positions, and its slopes.
+
+        The slopes have COUNT columns.
+        """
         t = t - parameters[LATE]
         slopes = np.zeros((len(t), COUNT), dtype=np.complex128)
         here, ahead = self._sensor(t, parameters)
@@ -90,14 +96,14 @@ class Path(Struct, frozen=True):
         return here, slopes
 
     def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
-        """Where it is, and which way the robot looks, as a number of size 1."""
+        """Return the sensor's place, and the robot's direction as a unit number."""
         ahead = np.exp(1j * np.interp(t, self.t, self.heading))
         lever = complex(parameters[AHEAD], parameters[ASIDE])
         return np.interp(t, self.t, self.place) + lever * ahead, ahead
 
 
 def spots(driven: Sequence[Run], angles: Sequence[Wheels], parts: Sequence[Block]) -> list[Spots]:
-    """The positions of each block, those after a jump apart."""
+    """Return the positions of each block, split at jumps."""
     edges = [jumps(run, turned) for run, turned in zip(driven, angles, strict=True)]
     found = []
     for number, part in enumerate(parts):
@@ -111,7 +117,7 @@ def spots(driven: Sequence[Run], angles: Sequence[Wheels], parts: Sequence[Block
 
 
 def jumps(run: Run, turned: Wheels) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Indices of positions that do not follow from the one before."""
+    """Return the indices of positions that do not follow from the one before."""
     steps = np.abs(np.diff(run.place))
     if len(steps) < LEAST_POINTS:
         return np.zeros(0, dtype=np.int64)
@@ -125,7 +131,7 @@ def jumps(run: Run, turned: Wheels) -> np.ndarray[tuple[int], np.dtype[np.int64]
 
 
 def grid(run: Run, turned: Wheels, fine_s: float = FINE_S) -> Grid:
-    """The steps in which a run's path is summed."""
+    """Return the steps in which a run's path is summed."""
     usual = float(np.median(np.diff(run.t)))
     every = max(1, int(fine_s / usual))
     kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
@@ -135,7 +141,7 @@ def grid(run: Run, turned: Wheels, fine_s: float = FINE_S) -> Grid:
 
 
 def path(steps: Grid, base: Base, parameters: Floats) -> Path:
-    """Exact arcs from (0, 0, 0), with the slopes by summing those of each step."""
+    """Return the path from (0, 0, 0) in exact arcs, with the summed slopes of all steps."""
     left, right, turn, rate = parameters[[LEFT, RIGHT, TURN, RATE]]
     gain = base.gain * turn
     mean = gain * (left + right) / 2
@@ -158,14 +164,14 @@ def path(steps: Grid, base: Base, parameters: Floats) -> Path:
 
 
 def place(steps: Grid, base: Base, parameters: Floats) -> Complexes:
-    """Where the wheels bring a run, at the grid's times, without the rest of a `Path`."""
+    """Return the place of the robot at the grid's times, without the other fields of a `Path`."""
     left, right = parameters[LEFT] * steps.left, parameters[RIGHT] * steps.right
     _, ahead = _directions(base.gain * parameters[TURN] * (right - left))
     return _sums(ahead * base.radius * (left + right) / 2)
 
 
 def _directions(turns: Floats) -> tuple[Floats, Complexes]:
-    """Headings at the ends of all steps, and each step's chord for an arc of length 1."""
+    """Return the headings at the step ends, and each step's chord for an arc of length 1."""
     heading = cumulative(turns)
     return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
 
@@ -175,11 +181,11 @@ def _sums(steps: Complexes) -> Complexes:
 
 
 Paths = Sequence[Path] | Mapping[int, Path]
-"""By the number of the run."""
+"""Paths by the number of the run."""
 
 
 class Laid(Struct, frozen=True):
-    """A path laid onto positions: residuals in m, and slopes with shift and turn taken out."""
+    """A path aligned with positions: residuals in m, and slopes without shift and rotation."""
 
     block: int
     residual: Complexes
@@ -187,7 +193,7 @@ class Laid(Struct, frozen=True):
 
 
 def laid(found: Sequence[Spots], paths: Paths, parameters: Floats) -> Iterator[Laid]:
-    """Each block's path shifted and turned onto its positions, outliers counting less."""
+    """Yield the path of each block, aligned with its positions. Outliers count less."""
     for spot in found:
         place, slopes = paths[spot.run].at(spot.t, parameters)
         weight = np.ones(len(place))
@@ -209,7 +215,7 @@ def laid(found: Sequence[Spots], paths: Paths, parameters: Floats) -> Iterator[L
 
 
 def evidence(found: Sequence[Spots], paths: Paths, parameters: Floats, blocks: int) -> Evidence:
-    """At these parameters."""
+    """Return the evidence at these parameters."""
     normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
     squares, counts = np.zeros(blocks), np.zeros(blocks)
     for one in laid(found, paths, parameters):
@@ -222,7 +228,7 @@ def evidence(found: Sequence[Spots], paths: Paths, parameters: Floats, blocks: i
 
 
 def spread(found: Sequence[Spots], paths: Paths, parameters: Floats) -> float:
-    """m rms by which positions lie off the paths laid onto them."""
+    """Return the rms distance of positions from the paths aligned with them, m."""
     sums = [(float(np.sum(np.abs(o.residual) ** 2)), len(o.residual))
             for o in laid(found, paths, parameters)]  # fmt: skip
     return float(np.sqrt(sum(s for s, _ in sums) / max(1, sum(n for _, n in sums))))

@@ -1,7 +1,7 @@
-"""A log cut into blocks, with what is compared in each and parameters to begin with.
+"""A log cut into blocks, with the quantities to compare and the parameters to start from.
 
-Here it is seen whether the log can be used at all: signs, units, whether anything follows the
-wheels, whether there is enough of it.
+This module decides whether a log can be used at all: its signs and units, whether a sensor follows
+the wheels, and whether there is enough of it.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from acsard.calibration.table import Floats
 
 
 class Prepared(Struct, frozen=True):
-    """Blocks of one length and what is compared in them."""
+    """Blocks of one length and the quantities that are compared in them."""
 
     parts: list[Block]
     rows: Rows
-    """As they are: of a gyro whose bias was not seen at rest with that in them."""
+    """Unchanged rows; if the gyro bias was not seen at rest, they still contain it."""
     spots: list[Spots]
     grids: list[Grid]
     sources: list[Source]
@@ -47,7 +47,11 @@ def prepared(
     driven: Sequence[Run], angles: Sequence[Wheels], headings: Headings | None, base: Base,
     length: float,
 ) -> Prepared:  # fmt: skip
-    """Cut into blocks, and checked for what would lead astray: signs, units, nothing to go by."""
+    """Cut the log into blocks of about `length` s and check it.
+
+    Raises `RefusedError` for wrong signs or units, and if there is nothing to compare the wheels
+    with.
+    """
     parts = blocks(driven, angles, length)
     drives_enough(parts)
     count, start = len(parts), base.start()

@@ -1,4 +1,4 @@
-"""Messages of the bus -> rows of a log as `table.py` reads it."""
+"""Converts bus messages to rows of a log that `table.py` reads."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from acsard.values import NS_PER_S
 HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
 
 KEYS = ("wheel_states", "imu", "sim/pose")
-"""What a log can be made of; wheels in the order in which they are published."""
+"""Keys that a log can contain. Wheel speeds are in the order in which they are published."""
 
 
 def row(message: Message, arrived_ns: int) -> str:
-    """Of one message of `KEYS`; `arrived_ns` is the wall clock's, for one without a stamp.
+    """Return the row of one message of `KEYS`. Raises `ValueError` for any other message.
 
-    Raises `ValueError` for another one.
+    `arrived_ns` is the wall-clock time that a message without a stamp gets.
     """
     if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
         cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]

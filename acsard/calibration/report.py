@@ -1,4 +1,4 @@
-"""A calibration in words for people, as one object for programs, and as lines for `acsard.toml`."""
+"""A calibration as text, as an object for programs, and as lines for `acsard.toml`."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from acsard.config.writing import excerpt
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
 )  # fmt: skip
-"""In the order of `Multipliers.values`."""
+"""Settings of `[drive]` in the order of `Multipliers.values`."""
 
 DIGITS = 5
-"""Behind the point, of what is written."""
+"""Number of decimals of the settings that are written."""
 
 MOST_STD = 1.0
-"""The largest that the configuration takes."""
+"""Largest standard deviation that the configuration accepts."""
 
 
 class Refusal(Struct, frozen=True):
-    """What `--json` prints when the log gives nothing: why, and what was told of it until then."""
+    """The object that `--json` prints if a log gives no result: the reason and earlier notes."""
 
     log: str
     refused: str
@@ -33,15 +33,18 @@ class Refusal(Struct, frozen=True):
 
 
 class Report(Struct, frozen=True):
-    """What `--json` prints. Multipliers and their standard deviations are pure numbers; errors are
-    those now and with the multipliers found, on parts of the log left out of the fit, None where
-    nothing tells them."""
+    """The object that `--json` prints.
+
+    Multipliers and their standard deviations are pure numbers. Errors are those with the present
+    multipliers and with the new ones, on parts of the log that were left out of the fit; they are
+    None if nothing measures them.
+    """
 
     log: str
     way: str
-    """What the wheels were compared with."""
+    """Sensors that the wheels were compared with."""
     scale: str
-    """What measured the wheels' size; "" is nothing: then their mean stays as configured."""
+    """Sensors that measured the wheels' size. If it is "", the mean radius stays as configured."""
     wheel_separation_multiplier: float
     left_wheel_radius_multiplier: float
     right_wheel_radius_multiplier: float
@@ -49,46 +52,48 @@ class Report(Struct, frozen=True):
     left_wheel_radius_multiplier_std: float
     right_wheel_radius_multiplier_std: float
     covariance: Sequence[Sequence[float]]
-    """Of the three multipliers, in this order."""
+    """Covariance of the three multipliers, in the order of the fields above."""
     odometry: dict[str, float]
-    """The standard deviations as `[odometry]` takes them: of each apart from what all three have in
-    common, and of that."""
+    """Standard deviations as the settings of `[odometry]`.
+
+    They are those of each multiplier without the common part, and that of the common part.
+    """
     effective_track: float
-    """m"""
+    """Effective track, m."""
     effective_track_std: float
     effective_track_growth: float
-    """Share by which it grows with each rad/s of turn rate."""
+    """Fraction by which the track grows with each rad/s of turn rate."""
     effective_track_growth_std: float
     left_wheel_radius: float
-    """m"""
+    """Radius of the left wheels, m."""
     right_wheel_radius: float
     turn_error_before: float | None
-    """deg after a turn of 360 deg."""
+    """Heading error after a turn of 360 deg, deg."""
     turn_error_after: float | None
     straight_error_before: float | None
-    """deg after 10 m straight on."""
+    """Heading error after 10 m straight on, deg."""
     straight_error_after: float | None
     position_error_before: float | None
-    """m rms over a few seconds."""
+    """Position error over a few seconds, m rms."""
     position_error_after: float | None
     time_offsets: dict[str, float]
-    """s by which each sensor is later than the wheels."""
+    """Delay of each sensor behind the wheels, s."""
     gyro_bias: float
-    """rad/s"""
+    """Gyro bias, rad/s."""
     runs: int
     seconds: float
     distance: float
-    """m rolled ahead and back."""
+    """Distance rolled ahead and back, m."""
     turns: float
-    """Of 360 deg, to both sides."""
+    """Number of turns of 360 deg to both sides."""
     notes: Sequence[str]
     written: str | None
-    """The file that has the multipliers now."""
+    """File that contains the multipliers now, or None."""
     refused: None = None
 
 
 def report(log: str, found: Calibration, drive: DriveConfig, written: str) -> Report:
-    """Put together."""
+    """Return the report of a calibration. `written` is the file that it was written to, or ""."""
     track, left, right = found.found.values.tolist()
     track_std, left_std, right_std = found.found.std.tolist()
     gain, drives = found.gain, found.drives
@@ -112,7 +117,7 @@ def report(log: str, found: Calibration, drive: DriveConfig, written: str) -> Re
 
 
 def keys(found: Calibration) -> dict[str, object]:
-    """What `--write` sets: dotted keys."""
+    """Return the settings that `--write` sets, by dotted key."""
     wanted: dict[str, object] = {
         f"drive.{name}": round(float(value), DIGITS)
         for name, value in zip(NAMES, found.found.values, strict=True)
@@ -121,7 +126,7 @@ def keys(found: Calibration) -> dict[str, object]:
 
 
 def deviations(found: Calibration) -> dict[str, float]:
-    """The keys of `[odometry]`. Of a scale that nothing has measured there is nothing to say."""
+    """Return the settings of `[odometry]`; the scale is included only if it was measured."""
     own, scale = found.found.own()
     given = {f"{name}_std": float(value) for name, value in zip(NAMES, own, strict=True)}
     if found.scale:
@@ -130,7 +135,7 @@ def deviations(found: Calibration) -> dict[str, float]:
 
 
 def text(found: Report, calibration: Calibration, where: str) -> str:
-    """For people."""
+    """Return the report as text."""
     return "\n".join(_text(found, calibration, where))
 
 
@@ -167,7 +172,7 @@ def _wrapped(sentences: Sequence[str]) -> Iterator[str]:
 
 
 def _better(found: Report) -> list[str]:
-    """What improves, as it was seen where it was not fitted."""
+    """Return sentences about the improvement, as measured on data that was not fitted."""
     told = []
     for before, after, words, unit, factor in (
         (found.turn_error_before, found.turn_error_after,
@@ -185,12 +190,12 @@ def _better(found: Report) -> list[str]:
 
 
 def _two(value: float) -> str:
-    """Two digits that say something, never an exponent."""
+    """Return a number with about two significant digits and without an exponent."""
     return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
 def _remains(found: Report, calibration: Calibration) -> list[str]:
-    """What the calibration cannot take away."""
+    """Return sentences about the errors that the calibration cannot remove."""
     fastest = calibration.drives.fastest
     share = calibration.found.std[SEPARATION] / calibration.found.values[SEPARATION]
     told = [

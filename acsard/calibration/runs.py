@@ -1,7 +1,7 @@
-"""A table of a log -> runs, each with its sensors as streams in order of time.
+"""Splits the table of a log into runs, each with its sensors as streams in order of time.
 
-Times may be anything that counts seconds: each run begins at 0 here. Rows out of order are sorted;
-where the time itself began anew, so does a run.
+Times may have any origin; within a run they begin at 0. Rows that are out of order are sorted. If
+the time itself restarts, a new run begins.
 """
 
 from __future__ import annotations
@@ -19,65 +19,70 @@ Complexes = npt.NDArray[np.complex128]
 Rows = npt.NDArray[np.int64]
 
 RESTART_S = 1.0
-"""A time that much before the last one is out of order, or begins anew."""
+"""Step back in time, s, above which rows are out of order or the time has restarted."""
 
 FEW_RESTARTS = 100
-"""More blocks than that are rows in no order at all."""
+"""Largest number of restarts. With more, the rows are in no order at all."""
 
 SLOWEST_S = 0.7
-"""Between two wheel samples: more is no log of a drive, or not in seconds."""
+"""Longest period of wheel samples, s. A longer one is not a log of a drive, or not in seconds."""
 
 LEAST_ROWS = 20
-"""Wheel samples of a run, and of a log."""
+"""Smallest number of wheel samples in a run, and in a log."""
 
 PAUSE_S = 60.0
-"""Without a wheel sample for so long one drive has ended, and another begun."""
+"""Time without a wheel sample after which a new drive begins, s."""
 
 ENOUGH_S, REPEATED = 0.2, 4.0
-"""Between wheel samples of different times, and samples to each of these: with more of both, times
-were rounded away."""
+"""Signs of rounded times if both are exceeded: their period in s, and the samples per time."""
 
 ROLLING, AGAIN = 0.2, 0.5
-"""rad/s of both sides together at which no position stays the same, and the share of such rows with
-the one before in them that only a logger makes which fills in what has not come."""
+"""Evidence for a logger that repeats a position until the next one arrives.
+
+`ROLLING` is the speed of both sides together, rad/s, at which no true position stays the same.
+`AGAIN` is the fraction of such rows that repeat the row before.
+"""
 
 MOST_RUNS = 1000
-"""In a log: more are no drives."""
+"""Largest number of runs in a log. With more, the column does not name drives."""
 
 TOGETHER, TOLD, APART = 50, 0.15, 0.8
-"""Rows that are summed up before front and rear of a side are compared, and the shares of their way
-by which they may differ untold, and at all."""
+"""Thresholds for the comparison of the front and rear wheels of a side.
+
+`TOGETHER` is the number of rows that are summed first. The others are the fractions of their way by
+which both may differ without a note, and at all.
+"""
 
 
 class Run(Struct, frozen=True):
-    """One drive: times in s since `start`, in order and each only once."""
+    """One drive. Times are in s since `start`, in order, and each occurs once."""
 
     name: str
     start: float
     t: Floats
     left: Floats
-    """Mean speed of the side's wheels, rad/s."""
+    """Mean speed of the left wheels, rad/s."""
     right: Floats
     gyro_t: Floats
     gyro: Floats
     """Yaw rate, rad/s."""
     yaw_t: Floats
     yaw: Floats
-    """As it was recorded: rad, wrapped or not."""
+    """Yaw as recorded: rad, wrapped or not."""
     place_t: Floats
     place: Complexes
-    """x + iy, m from the first one."""
+    """Positions x + iy in m, relative to the first one."""
 
 
 class Log(Struct, frozen=True):
-    """The drives of a file, and what was told while it was read."""
+    """The drives of a file, and notes made while it was read."""
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
 
 
 def runs(table: Table) -> Log:
-    """The drives in a table; raises `LogError`."""
+    """Return the drives in a table. Raises `LogError` if there are none."""
     notes = list(table.notes)
     columns = dict(table.columns)
     t = columns["t"]
@@ -136,8 +141,10 @@ def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """The share of their way by which both wheels of a side, that roll over one floor, differ;
-    raises `LogError` where they cannot."""
+    """Return the fraction of their way by which both wheels of a side differ.
+
+    Both roll over the same floor. Raises `LogError` if they differ impossibly far.
+    """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
     if not len(starts):
@@ -157,9 +164,9 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """The rows of each drive of a run that has no other mark than that its time begins anew.
+    """Return the rows of each drive in a run whose drives are marked only by a restart of the time.
 
-    Told by the wheels' rows alone: sensors may follow each other in a file, each in its own order.
+    Only wheel rows decide it: sensors may follow one another in a file, each in its own order.
     """
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
     back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
@@ -168,18 +175,18 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
     blocks = [part for part in np.split(wheels, back) if len(part) >= LEAST_ROWS]
     spans = sorted((float(np.min(t[part])), float(np.max(t[part]))) for part in blocks)
     if not any(a[1] > b[0] for a, b in pairwise(spans)):
-        return [rows]  # blocks of one drive in another order
+        return [rows]  # these are blocks of a single drive in another order
     return list(np.split(rows, np.searchsorted(rows, wheels[back])))
 
 
 def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    """Of the rows that have both sides, in order, repeated ones too."""
+    """Return the sorted times of the rows that have both sides, with repetitions."""
     held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
     return np.sort(t[rows[held]])
 
 
 def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floats]) -> None:
-    """Times are in seconds, and fine enough; raises `LogError`."""
+    """Raise `LogError` if the times are not in seconds or too coarse."""
     for rows in parts:
         times = _wheel_times(t, rows, columns)
         if len(times) < LEAST_ROWS:
@@ -199,7 +206,10 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """The rows of each drive: a stamp of another day must not make one of a thousand hours."""
+    """Return the rows of each drive, split at long pauses.
+
+    Otherwise a stamp of another day would make one drive of a thousand hours.
+    """
     times = _wheel_times(t, rows, columns)
     ends = np.flatnonzero(np.diff(times) > PAUSE_S)
     if not len(ends):
@@ -233,7 +243,7 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
 def _new(
     stream: tuple[Floats, ...], wheels: tuple[Floats, ...], what: str, notes: list[str]
 ) -> tuple[Floats, ...]:
-    """Without what a logger that fills every row says again between two samples."""
+    """Remove the values that a logger repeats in every row until the next sample arrives."""
     t, *values = stream
     if len(t) < LEAST_ROWS:
         return stream
@@ -242,7 +252,7 @@ def _new(
     rolling = int((again & rolls).sum())
     if rolling <= AGAIN * rolls.sum():
         return stream
-    # Also those at rest: the first of them may be of before.
+    # This includes repetitions at rest: the first of them may be older than its row.
     notes.append(
         f"{what} stay between samples: of {rolling} rows that say them again "
         "while the wheels turn none is taken"
@@ -253,7 +263,7 @@ def _new(
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], run: str, notes: list[str]
 ) -> tuple[Floats, ...]:
-    """The times and values of one sensor: rows that have all of it, sorted, one a time."""
+    """Return the times and values of a sensor from its complete rows: sorted, one per time."""
     held = [columns.get(name) for name in names]
     if any(values is None for values in held):
         return (np.zeros(0),) * (1 + len(held))
@@ -263,7 +273,7 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, run: str, notes: list[str]) -> Iterator[Floats]:
-    """Sorted by time; of several samples at one time the first."""
+    """Sort by time and keep the first of several samples at the same time."""
     t = stream[0]
     if count := int((np.diff(t) < 0).sum()):
         notes.append(f"run {run}: {count} rows of {what} are out of order and were sorted")

@@ -1,10 +1,10 @@
-"""Where to begin with positions: Gauss-Newton needs a track that is nearly right.
+"""Finds a starting point for positions, because Gauss-Newton needs a nearly correct track.
 
-Tried are tracks from a tenth to thirty times the configured one, turned the right way round and the
-wrong, and with one side reversed. How large the path comes out then is the radius.
+It tries tracks from a tenth to thirty times the configured one, with both signs of the turn and
+with one side reversed. The size of the resulting path gives the radius.
 
-Positions alone often tell a turn in place only up to whole turns: 90 deg to the left end as 270 deg
-to the right do. Of begins that explain about as much, the likelier robot counts.
+Positions alone often determine a turn in place only up to whole turns: 90 deg to the left end like
+270 deg to the right. Among starting points that explain about as much, the more likely robot wins.
 """
 
 from __future__ import annotations
@@ -25,41 +25,54 @@ from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
-"""Configured over true track, for wheels of the configured radius; finer where robots are."""
+"""Ratios of configured to true track that are tried. They are finer in the usual range.
+
+They apply to wheels of the configured radius.
+"""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
-"""s."""
+"""Delays of positions that are tried, s."""
 
 MOST_SPOTS, SETTLED_SPOTS = 60, 20
-"""Blocks that are looked at, those that reach furthest: it is a search, and no fit yet."""
+"""Number of blocks that are used, those with the longest reach first.
+
+This is a search, not a fit.
+"""
 
 MOST_POINTS = 80
-"""Positions of each that are looked at, evenly."""
+"""Number of positions per block that are used, evenly spaced."""
 
 MOST_BEGUN, FAR_WORSE = 4, 20.0
-"""Begins that are looked at more closely, and how much worse than the best is too bad for that."""
+"""Number of starting points that are refined, and how much worse than the best they may be."""
 
 USUAL_TURN, NEAR_HEADING = (0.31, 1.25), (0.8, 1.25)
-"""What a robot turns over what its bare wheels and separation say, from skid-steer to none; and
-over what a sensor of heading says."""
+"""Usual ratios of the robot's turn to that of another source: lowest and highest.
+
+`USUAL_TURN` is relative to the wheels and the wheel separation, from skid-steer to no skidding.
+`NEAR_HEADING` is relative to a heading sensor.
+"""
 
 WRONG_WAY = 4.0
-"""Times more must be left unexplained by a robot as it should be than by one of which a side is
-reversed, or which turns to the other side, before that is believed."""
+"""Penalty for a robot with a reversed side, or one that turns to the other side.
+
+A correct robot must leave this many times more unexplained before the reversed one is believed.
+"""
 
 NOTHING = 1e-3
-"""Share of the positions' spread that says nothing for one begin or another: of short straights
-any explains all but the noise."""
+"""Fraction of the positions' spread that cannot distinguish starting points.
+
+Any starting point explains short straights except for their noise.
+"""
 
 STRAYED = 1.3
-"""Times another turn than it began with is no settling."""
+"""Factor by which the turn may change during refinement. Beyond it, the result is not used."""
 
 COARSE_S = 0.1
-"""The paths are summed in such steps here."""
+"""Time step in which the paths are summed here, s."""
 
 
 class Begin(Struct, frozen=True):
-    """What fits best; `unexplained` is the share of the positions' spread that it leaves."""
+    """A starting point; `unexplained` is the fraction of the positions' spread that it leaves."""
 
     parameters: Floats
     unexplained: float
@@ -69,7 +82,10 @@ def search(
     found: Sequence[Spots], driven: Sequence[Run], angles: Sequence[Wheels], base: Base,
     sides: Floats | None = None,
 ) -> Begin:  # fmt: skip
-    """The best of all that is tried; `sides`: g_l and g_r over the gain, by a sensor of heading."""
+    """Return the best starting point.
+
+    `sides` are g_l and g_r by a heading sensor, divided by the gain, or None.
+    """
     kept = _furthest(found, MOST_SPOTS)
     needed = sorted({spot.run for spot in kept})
     grids = {run: grid(driven[run], angles[run], COARSE_S) for run in needed}
@@ -105,13 +121,13 @@ def _furthest(found: Sequence[Spots], most: int) -> list[Spots]:
 
 
 def _neighbours(tried: Sequence[Begin]) -> list[tuple[Begin, float, float]]:
-    """Each with what those beside it leave unexplained."""
+    """Return each starting point with the unexplained fractions of its neighbours."""
     left = [np.inf, *(one.unexplained for one in tried), np.inf]
     return [(one, left[at], left[at + 2]) for at, one in enumerate(tried)]
 
 
 def _doubt(begun: Begin, sides: Floats | None) -> float:
-    """How much less likely such a robot is than any that should be."""
+    """Return how much less likely this robot is than a usual one, as a factor of at least 1."""
     signed = begun.parameters[[LEFT, RIGHT]] * begun.parameters[TURN]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
     like = np.ones(2)
@@ -123,12 +139,12 @@ def _doubt(begun: Begin, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """What it turns by the right side, with its sign."""
+    """Return the turn by the right side, with its sign."""
     return float(parameters[TURN] * parameters[RIGHT])
 
 
 def _timed(begun: Begin, kept: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
-    """With the delay that suits it best."""
+    """Return the starting point with the delay that suits it best."""
     parameters = begun.parameters
     shape = float(np.sign(parameters[LEFT])), float(parameters[TURN] * parameters[RIGHT])
     tried = [_tried(kept, grids, base, (*shape, late)) for late in DELAYS]
@@ -138,7 +154,7 @@ def _timed(begun: Begin, kept: Sequence[Spots], grids: dict[int, Grid], base: Ba
 def _tried(
     kept: Sequence[Spots], grids: dict[int, Grid], base: Base, shape: tuple[float, float, float]
 ) -> Begin:
-    """What this sign of the left side, turn and delay explain."""
+    """Return the starting point for a sign of the left side, a turn and a delay."""
     parameters = base.start()
     parameters[[LEFT, RIGHT, TURN, LATE]] = shape[0], 1.0, shape[1], shape[2]
     paths = {run: place(steps, base, parameters) for run, steps in grids.items()}
@@ -146,7 +162,7 @@ def _tried(
     for spot in kept:
         path = np.interp(spot.t - shape[2], grids[spot.run].t, paths[spot.run])
         seen, gone = spot.place - spot.place.mean(), path - path.mean()
-        # Along the best rotation of each, one scale for all.
+        # Each path is rotated in the best way; all share one scale.
         cross += abs(complex(np.vdot(gone, seen)))
         size += float(np.sum(np.abs(gone) ** 2))
         spread += float(np.sum(np.abs(seen) ** 2))
@@ -159,8 +175,10 @@ def _tried(
 
 
 def _settled(begun: Begin, few: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
-    """The same as the fit will have it: with where on the robot the positions are taken, and
-    outliers counting less."""
+    """Refine a starting point by the fit.
+
+    The fit also finds where on the robot the positions are measured, and outliers count less.
+    """
     spots = [replace(spot, block=number) for number, spot in enumerate(few)]
 
     def evidence(parameters: Floats) -> Evidence:
@@ -180,6 +198,6 @@ def _settled(begun: Begin, few: Sequence[Spots], grids: dict[int, Grid], base: B
     parameters = fit([evidence], begun.parameters, places=True).parameters
     moved = _turn(parameters) / _turn(begun.parameters)
     if not 1 / STRAYED < moved < STRAYED:
-        return before  # nothing tells it there
+        return before  # the data does not determine the turn there
     after = Begin(parameters, unexplained(parameters))
     return min([before, after], key=lambda one: one.unexplained)

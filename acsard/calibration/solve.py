@@ -1,4 +1,4 @@
-"""A log -> the calibration, or why it gives none."""
+"""Computes the calibration from a log, or raises an error that says why it cannot."""
 
 from __future__ import annotations
 
@@ -35,54 +35,57 @@ from acsard.config.settings import DriveConfig
 from acsard.values import AcsardError
 
 LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
-"""Of blocks: with a sensor of heading, and without. Where positions are coarse, longer blocks tell
-more; where they are fine, more blocks do."""
+"""Block lengths that are tried, s: with a heading sensor, and without.
+
+Longer blocks are better if positions are coarse. More blocks are better if positions are fine.
+"""
 
 
 PERFECT = 1e-3
-"""Share of what was driven by which a sensor differs from the wheels at the least: floors and
-sensors are not so good."""
+"""Fraction of the motion by which a true sensor differs from the wheels at least."""
 
 PLENTY = 100
-"""Blocks after which others are not worth the time."""
+"""Number of blocks from which on other lengths are not tried, to save time."""
 
 
 class Drives(Struct, frozen=True):
-    """What was driven, in sums."""
+    """Totals of the drives."""
 
     runs: int
     seconds: float
     metres: float
     turns: float
-    """Of 360 deg, to both sides together, with the parameters found."""
+    """Number of turns of 360 deg to both sides together, with the parameters found."""
     fastest: float
-    """rad/s, of the fastest turns."""
+    """Rate of the fastest turns, rad/s."""
 
 
 class Calibration(Struct, frozen=True):
-    """What was found; all standard deviations are in the unit of what they belong to."""
+    """The result. Each standard deviation has the unit of its quantity."""
 
     way: str
-    """What the wheels were compared with."""
+    """Sensors that the wheels were compared with."""
     drives: Drives
     now: Multipliers
     found: Multipliers
     scale: str
-    """What measured how far the robot went: "positions", "distance" or, with nothing, ""."""
+    """Sensors that measured the distance: "positions", "distance", both, or "" for none."""
     growth: float
-    """Share by which the effective track grows with each rad/s of turn rate."""
+    """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
     gain: Gain
     late: dict[str, float]
-    """s by which each sensor is later than the wheels."""
+    """Delay of each sensor behind the wheels, s."""
     bias: float
-    """rad/s, of the gyro."""
+    """Gyro bias, rad/s."""
     notes: tuple[str, ...]
 
 
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
-    """Of the robot that left this log; raises `LogError` or `RefusedError`, with the log's notes
-    as theirs."""
+    """Return the calibration of the robot that recorded this log.
+
+    Raises `LogError` or `RefusedError`, to which the log's notes are added.
+    """
     try:
         return _calibrated(log, drive, tape)
     except AcsardError as error:
@@ -104,7 +107,7 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
             made = prepared(log.runs, angles, headings, base, length)
         except UnlikeError as error:
             unlike = unlike or error
-            continue  # coarse positions may follow over a longer time
+            continue  # coarse positions may follow the wheels over longer blocks
         except RefusedError as error:
             raise unlike or error from None
         gyro = headings is not None and headings.source == "yaw_rate"
@@ -113,7 +116,7 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
         unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
         tries.append((unsure, len(tries), made, fitted))
         if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:
-            break  # half as many would be too few, or these are plenty
+            break  # half as many blocks would be too few, or these are plenty
     if unlike is not None and not tries:
         raise unlike
     _, _, made, fitted = min(tries)
@@ -124,7 +127,7 @@ def _calibration(
     log: Log, angles: Sequence[Wheels], headings: Headings | None, base: Base, tape: Tape | None,
     made: Prepared, fitted: Fit,
 ) -> Calibration:  # fmt: skip
-    """What was fitted, as settings; and what it is worth."""
+    """Convert the fit to settings and evaluate its improvement."""
     rows, spots, every = made.rows, made.spots, fitted.covariance()
     if not fitted.converged:
         raise RefusedError(f"the search for the parameters does not settle: {DRIVE}")
@@ -171,7 +174,7 @@ def _calibration(
 
 
 def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
-    """Where the log was taken apart, a sentence each."""
+    """Yield a sentence for each kind of place where the log was cut."""
     if gone := sum(len(turned.gaps) for turned in angles):
         yield f"the wheel speeds have {gone} gaps: nothing is taken across them"
     pairs = zip(driven, angles, strict=True)
@@ -183,7 +186,7 @@ def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
 
 
 def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base) -> Iterator[str]:
-    """What agrees with the wheels as no sensor does, a sentence each."""
+    """Yield a sentence for each source that agrees too well with the wheels for a true sensor."""
     rows = made.rows
     if headings is not None:
         off = rows.turned - turning.turned(rows, base, fitted.parameters)
@@ -208,7 +211,10 @@ def _own(what: str) -> str:
 def _follow(
     driven: Sequence[Run], angles: Sequence[Wheels], base: Base, fitted: Fit, rate: Rates
 ) -> Follow:
-    """What a run did by some multipliers, the track changing with the rate as it was found to."""
+    """Return a function that computes the way of a run for given multipliers.
+
+    The track changes with the turn rate as the fit found.
+    """
 
     def follow(values: Floats, number: int) -> Way:
         parameters = fitted.parameters.copy()

@@ -1,4 +1,4 @@
-"""Cells that cannot be a measurement: made missing, counted and told."""
+"""Removes impossible values from a log, and counts and reports them."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Greater ones are no measurement (rad/s, s, rad, m); degrees and ns must come through to be
-told."""
+"""Bounds above which a value is impossible (rad/s, s, rad, m).
+
+They are wide enough for degrees and nanoseconds, so that later checks can name the wrong unit.
+"""
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
 SPIKE, FEW, SLOW = 10.0, 0.02, 0.02
-"""Times what all but this share of the rates over so many rad/s stay below, and times each
-neighbour: a misread number. Whoever stands nearly all day turns as fast, but not for one sample."""
+"""Definition of a spike, which is a misread number.
+
+It is more than `SPIKE` times as large as each neighbour and as the usual speed. Of the rates over
+`SLOW` rad/s, all but the fraction `FEW` stay below the usual speed. A robot that stands for nearly
+the whole log also turns much faster than that, but never for a single sample.
+"""
 
 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
-    """Make what cannot be a measurement missing, in place; what was."""
+    """Replace impossible values with NaN in place. Yield a sentence for each column with any."""
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
@@ -40,10 +46,10 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 
 
 def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Which rates all others are far below; `order` is that of time.
+    """Return a mask of the rows that are spikes; `order` sorts the rows by time.
 
-    Alone among its neighbours in the file and in time: in a shuffled file, or one of several
-    drives, a true turn has its like beside it in one of both only.
+    A spike stands out among its neighbours both in the file and in time. In a shuffled file, or one
+    of several drives, a true turn stands out in only one of them.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -56,7 +62,10 @@ def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Far over what is usual, and over its neighbours that are not missing."""
+    """Return a mask of the values far above `usual` and above both neighbours.
+
+    Missing values are skipped in the search for a neighbour.
+    """
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
     around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)

@@ -1,8 +1,8 @@
-"""The bytes of a CSV file -> columns of numbers and the runs they belong to.
+"""Reads the bytes of a CSV file into columns of numbers and the runs that they belong to.
 
-The header names the columns, in any order. A cell may be empty, so that sensors of different
-rates share a file. A row that cannot be read is left out, counted and told; a file with more than
-a few of them is refused, since what is left would not be what was recorded.
+The header names the columns in any order. A cell may be empty, so that sensors of different rates
+share a file. A row that cannot be read is left out, counted and reported. A file with more than a
+few such rows is refused, since the rest would not be what was recorded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from acsard.values import AcsardError
 Floats = npt.NDArray[np.float64]
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
-"""Wheel speeds in rad/s: of each wheel, or the mean of each side."""
+"""Columns of wheel speeds in rad/s: of each wheel, or the mean of each side."""
 
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw")
 COLUMNS = (*NUMBERS, "run")
@@ -33,13 +33,13 @@ COLUMNS = (*NUMBERS, "run")
 MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
 
 COMMENTS = ("#", "%")
-"""What a line above the numbers begins with that is none of the table."""
+"""Beginnings of lines above the numbers that do not belong to the table."""
 
 BEHIND = re.compile(r"(?:^|\s)#")
-"""A comment behind a number; "1.#QNAN" has none."""
+"""Pattern of a comment after a number; "1.#QNAN" does not contain one."""
 
 FEW, SHARE = 3, 0.01
-"""Rows that may be unreadable: as many as this, or this share of all."""
+"""Number of rows that may be unreadable, and fraction of all rows; the larger one counts."""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
 
@@ -48,28 +48,28 @@ AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
-    """The file cannot be used; the text says where, what was wrong and what to do."""
+    """Refusal of a file that cannot be used. The text names the place, the fault and the remedy."""
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
-    """What was told of the log until then goes with a refusal: it may be why."""
+    """Add the notes made so far to an error, because they may explain it."""
     for note in notes:
         error.add_note(note)
 
 
 class Table(Struct, frozen=True):
-    """Columns by name, NaN where a cell is empty; `runs` has the number of each row's run."""
+    """Columns by name, with NaN for an empty cell; `runs` has the number of each row's run."""
 
     columns: dict[str, Floats]
     runs: npt.NDArray[np.int64]
     names: tuple[str, ...]
-    """Of the runs, by number."""
+    """Names of the runs, by number."""
     notes: tuple[str, ...]
-    """What was left out, a sentence each."""
+    """Sentences about data that was left out."""
 
 
 def read(data: bytes) -> Table:
-    """The table in a file; raises `LogError`."""
+    """Return the table in a file. Raises `LogError`."""
     lines = _text(data).splitlines()
     number, header, separator = _header(lines)
     names = _columns([name for name, _ in header], number)
@@ -91,16 +91,17 @@ def _text(data: bytes) -> str:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
-    """How many lines it ends after, its names with their units, and what separates them.
+    """Return the number of lines before the data, the names with their units, and the separator.
 
-    numpy and others write it as a comment: then the last comment before the numbers is it.
+    Some programs, such as numpy, write the header as a comment. The last comment before the numbers
+    is then the header.
     """
     comment = ""
     for at, line in enumerate(lines):
         text = line.strip()
         if text.startswith(COMMENTS):
             comment = text.strip("#% \t") or comment
-        elif text and not text.lower().startswith("sep="):  # a hint for a spreadsheet
+        elif text and not text.lower().startswith("sep="):  # `sep=` is a hint for spreadsheets
             separator = _separator(text)
             cells = _cut(text, separator)
             if not all(_is_number(cell) for cell in cells):
@@ -121,7 +122,7 @@ def _separator(text: str) -> str:
 
 
 def _cut(line: str, separator: str) -> list[str]:
-    """Into cells, of which some may be in quotes."""
+    """Split a line into cells, some of which may be in quotes."""
     try:
         cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error:
@@ -142,7 +143,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(header: list[str], number: int) -> list[str]:
-    """What each cell of a row is, "" for what is not used; raises `LogError`."""
+    """Return the use of each column, "" for one that is not used. Raises `LogError`."""
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
     if twice:
@@ -169,7 +170,7 @@ def _columns(header: list[str], number: int) -> list[str]:
 
 
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
-    """What may have been meant."""
+    """Return a hint to the column that may have been meant, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (is {times[0][:40]} it? rename it t, in s)"
@@ -196,15 +197,15 @@ def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]
 
 
 class _Reader:
-    """Takes line by line; a million must be quick."""
+    """Parser of the lines below the header. It must be fast for a million lines."""
 
     def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
         self._names, self._separator, self._factors = names, separator, factors
         self._run = names.index("run") if "run" in names else -1
-        # What is neither a number of ours nor the run is not looked at.
+        # Columns that are neither a known number nor the run are not parsed.
         self._picks = [i for i, name in enumerate(names) if name and name != "run"]
         self._last = max(*self._picks, self._run)
-        self._values = array("d")  # a list of lists takes ten times the memory
+        self._values = array("d")  # a list of lists would take ten times the memory
         self._runs: list[int] = []
         self._known: dict[str, int] = {}
         self._bad, self._first = 0, ""
@@ -233,9 +234,9 @@ class _Reader:
         self._runs.append(self._known.setdefault(name, len(self._known)))
 
     def _cells(self, line: str) -> list[str]:
-        """Of a line with quotes or a comment; none of one that is a comment.
+        """Return the cells of a line with quotes or a comment, or [] if all of it is a comment.
 
-        The name of a run, and texts that are not looked at, may have any "#".
+        The name of a run, and text columns that are not used, may contain "#".
         """
         cells = _cut(line, self._separator)
         if line.lstrip().startswith("#") and not self._begins_with_its_run(cells):
@@ -265,7 +266,7 @@ class _Reader:
                 row.append(float(cell))
             except ValueError:
                 if parted(cell)[0] == self._names[i]:
-                    return []  # the header once more: logs were put one behind the other
+                    return []  # the header is repeated because logs were concatenated
                 shown = cell if len(cell) <= 30 else cell[:27] + "..."
                 shown = "".join(c if c.isprintable() else "?" for c in shown)
                 date = self._names[i] == "t" and ":" in cell
@@ -279,7 +280,7 @@ class _Reader:
         self._first = self._first or why
 
     def table(self, notes: list[str]) -> Table:
-        """All of it; raises `LogError` when too much could not be read."""
+        """Return the table. Raises `LogError` if too many rows could not be read."""
         rows = len(self._runs)
         if self._bad > max(FEW, SHARE * rows) or (self._bad and not rows):
             raise LogError(

@@ -1,4 +1,4 @@
-"""A distance measured by tape: what makes turn rates know how large the wheels are."""
+"""A distance measured by tape, which gives the size of the wheels to a log of turn rates."""
 
 from __future__ import annotations
 
@@ -12,49 +12,52 @@ from acsard.calibration.multipliers import LEFT_RADIUS, RIGHT_RADIUS, SEPARATION
 from acsard.calibration.table import Floats
 
 TAPE_M = 0.01
-"""Standard deviation of a distance read off by tape, and of where on the robot it was taken."""
+"""Standard deviation of a distance by tape, including where on the robot it was measured, m."""
 
 UNKNOWN = 1.0
-"""Standard deviation of the scale's logarithm where nothing else has measured it."""
+"""Standard deviation of the scale's logarithm if nothing else has measured it."""
 
 LEAST_M = 0.5
-"""A run that ends nearer to its start, by odometry, is none to measure."""
+"""Shortest distance of a run's end from its start by odometry that can be used, m."""
 
 STRAIGHT = 0.8
-"""The start and the end must be so far apart, as a share of the way between."""
+"""Smallest distance from start to end, as a fraction of the way between them."""
 
 
 class Tape(Struct, frozen=True):
-    """How far a run's end is from its start in a straight line, m; `run` "" is the
-    straightest."""
+    """Straight-line distance of a run's end from its start, m.
+
+    If `run` is "", the straightest run is meant.
+    """
 
     metres: float
     run: str = ""
 
 
 class Way(Struct, frozen=True):
-    """What a run did by some multipliers: from start to end, and along the path, m."""
+    """The way of a run for given multipliers: from start to end, and along the path, m."""
 
     apart: float
     along: float
 
     @property
     def straight(self) -> float:
-        """1 for a straight line, 0 for a run that gets nowhere."""
+        """Straightness: 1 for a straight line, 0 for a run that gets nowhere."""
         return self.apart / self.along if self.apart > LEAST_M else 0.0
 
 
 Follow = Callable[[Floats, int], Way]
-"""What run number n did by these multipliers (as in `Multipliers.values`)."""
+"""Function from multipliers (as in `Multipliers.values`) and a run's number to its way."""
 
 
 def scaled(
     found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
 ) -> tuple[Multipliers, str]:
-    """The multipliers with the distance taken in (a Kalman step in their logarithms), and the
-    run it was taken for; `known`: positions have measured the scale already.
+    """Return the multipliers corrected by the distance, and the name of the run it was used for.
 
-    Raises `RefusedError` when there is no such run, or none that got anywhere.
+    The correction is a Kalman step in the logarithms of the multipliers. `known` says whether
+    positions have already measured the scale. Raises `RefusedError` if there is no such run or if
+    no run is straight enough.
     """
     if tape.run and tape.run not in names:
         raise RefusedError(

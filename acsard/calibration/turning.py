@@ -21,26 +21,29 @@ from acsard.calibration.heading import Rows
 from acsard.calibration.table import Floats
 
 NOISE = 0.01
-"""rad in a second, and this share of the turn, are taken for usual when outliers are sought."""
+"""Residuals that are usual when outliers are sought.
+
+They are `NOISE` rad per second and the fraction `SHARE` of the turn, added as squares.
+"""
 SHARE = 0.03
 
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """rad that the wheels say each row is, by these parameters."""
+    """Return the turn of each row by the wheels for these parameters, rad."""
     left, right, turn, slope = parameters[[LEFT, RIGHT, TURN, RATE]]
     straight = base.gain * turn * (right * rows.right - left * rows.left)
     return np.asarray(straight + slope * _slower(rows, base, parameters))
 
 
 def _slower(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """rad that each row turns less for each unit of `RATE`."""
+    """Return the reduction of each row's turn per unit of `RATE`, rad."""
     left, right, turn = parameters[[LEFT, RIGHT, TURN]]
     rate = base.gain * turn * (left + right) / 2
     return np.asarray(-rate * abs(rate) * rows.fast)
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """At these parameters."""
+    """Return the evidence at these parameters."""
     turn = parameters[TURN]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))
@@ -57,7 +60,7 @@ def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidenc
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """rad/s that the sensor says more than the wheels, by least squares without outliers."""
+    """Return the rate by which the sensor exceeds the wheels, rad/s, by robust least squares."""
     seconds, found = rows.seconds, 0.0
     for _ in range(10):
         off = rows.turned - by_wheels
@@ -68,7 +71,10 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def first(rows: Rows, base: Base) -> Floats:
-    """g_l and g_r over the gain of parameters that are all 1: by least squares, whatever sign."""
+    """Return g_l and g_r, of any sign, by least squares.
+
+    They are relative to the gain of parameters that are all 1.
+    """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))
     found: Floats = np.zeros(2)
@@ -82,5 +88,5 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """rad that the wheels say each row is, by what `first` found."""
+    """Return the turn of each row by the wheels for the result of `first`, rad."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

@@ -1,4 +1,4 @@
-"""Units in the names of columns: "t [ms]", "yaw_rate (deg/s)"."""
+"""Units in the names of columns, such as "t [ms]" and "yaw_rate (deg/s)"."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TURNS = {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
 RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE}
-"""By column, in s, m and rad; all others are rates, in rad/s."""
+"""Known units by column, as factors to s, m and rad. All other columns are rates in rad/s."""
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad"}
 
@@ -21,8 +21,11 @@ _NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
 
 
 def parted(cell: str) -> tuple[str, str]:
-    """The name of a column, in lower case with _ for what joins words, and the unit behind it in
-    brackets, up to a comma; "" is none."""
+    """Return the name and the unit of a column from a header cell.
+
+    The name is in lower case with "_" between words. The unit stands in brackets and ends at a
+    comma; without brackets it is "".
+    """
     found = _NAME.match(cell.strip().lower())
     assert found is not None
     name = re.sub(r"[\s-]+", "_", found["name"].strip())
@@ -30,6 +33,6 @@ def parted(cell: str) -> tuple[str, str]:
 
 
 def factor(name: str, unit: str) -> float | None:
-    """What a number in that unit is multiplied by; None for one that is not known."""
+    """Return the factor that converts this unit to SI, or None if the unit is unknown."""
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)

@@ -1,1 +1,1 @@
-"""`acsard mcu check`: proves the microcontroller's side, step by step, without I/O of its own."""
+"""`acsard mcu check`: tests the microcontroller step by step. The package itself does no I/O."""

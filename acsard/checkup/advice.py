@@ -1,4 +1,4 @@
-"""What the findings say of the configuration: the lines of `acsard.toml` that should differ."""
+"""Changes to `acsard.toml` that the findings suggest."""
 
 from __future__ import annotations
 
@@ -15,19 +15,25 @@ from acsard.config.parsing import effective, from_builtins
 from acsard.config.settings import Config
 
 Changes = dict[str, object]
-"""Dotted key -> value, in the order of the file."""
+"""New values by dotted key, in the order of the file."""
 
 OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
-"""Better with, but good without: left out where the wire has no room for the longer lines."""
+"""Keys that improve the link but are not necessary.
+
+They are left out if the wire has no room for the longer lines.
+"""
 
 
 def answered(findings: Iterable[Finding]) -> bool:
-    """A board is at the port: its rate was found."""
+    """Return whether a board answered at the port, that is, whether its baud rate was found."""
     return any(finding.name == "baud rate" and finding.keys for finding in findings)
 
 
 def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
-    """The keys that should be other than configured; the `port` too if a board answered there."""
+    """Return the keys that should differ from the configuration.
+
+    `port` is included if it is not "" and a board answered there.
+    """
     wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
     for finding in findings:
         wanted |= finding.keys
@@ -37,7 +43,8 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
         changed = applied(given, config)
         return changed is not None and not contradictions(changed)
 
-    # What makes lines longer or slower can leave no room for the rate: give up the least first.
+    # Longer or slower lines may leave no room for the control rate. Give up the least important
+    # first.
     for optional in ("", *OPTIONAL):
         if optional and attrgetter(optional)(config) in (0, "off"):
             differing.pop(optional, None)
@@ -48,7 +55,10 @@ def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Chan
 
 
 def withheld(simulated: bool, config: Config) -> str:
-    """Why nothing that was found is for this configuration: it is another's; "" where it is not."""
+    """Return why the findings do not apply to this configuration, or "" if they do.
+
+    Findings about the simulator do not apply to the configuration of a real robot.
+    """
     if not simulated or config.mcu.simulated:
         return ""
     return (
@@ -58,7 +68,7 @@ def withheld(simulated: bool, config: Config) -> str:
 
 
 def applied(given: Changes, config: Config) -> Config | None:
-    """The configuration with these keys; None when they cannot be its values."""
+    """Return the configuration with these keys, or None if a value is not permitted."""
     plain: Any = effective(config)
     for key, value in given.items():
         where, _, name = key.rpartition(".")

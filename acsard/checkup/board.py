@@ -1,9 +1,10 @@
-"""The robot on its blocks: what goes out to the motors a to d, what came back, what keeps it safe.
+"""The robot with lifted wheels: sends speeds to motors a to d and records the replies.
 
-Every step of the check is an experiment: lines go out for some time, all that comes back is one
-recording, `replies`, and the step judges what it holds. Speeds are the motors', not the wheels':
-which wheel a motor turns is what the check has to find out. A motor that runs away, or an MCU that
-falls silent while one turns, ends any experiment at once, as one that starts anew: zeros, silence.
+Each step of the check is an experiment. It sends lines for some time, all replies go into one
+recording, `replies`, and the step judges the recording. Speeds belong to motors, not to wheels: the
+check has to find out which wheel a motor turns. Three events end any experiment at once, with zeros
+and then silence: a motor runs away, the MCU falls silent while a motor turns, or the board
+restarts.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from acsard.mcu.lines import LineReader
 from acsard.values import NS_PER_S, WheelSpeeds
 
 LEAST_S = 0.001
-"""No line goes out for less than this."""
+"""Shortest time for which a line is sent, s."""
 
 BEAT_NS = int(limits.PERIOD_S * NS_PER_S)
-"""So often it is looked whether this computer is late, however long is listened."""
+"""Interval at which the lateness of this computer is measured while listening, ns."""
 
 FAREWELL = 5
-"""How many times the last zeros go out, in each form."""
+"""Number of times that the last zeros are sent, in each form."""
 
 
 class Known(NamedTuple):
-    """What later steps use of what earlier ones found out; each has its words at `Board`."""
+    """Results of earlier steps that later steps use. `Board` describes each of them."""
 
     comma: bool
     latched: bool
@@ -51,48 +52,51 @@ class Known(NamedTuple):
 
 
 class Board:
-    """One wire; entering opens it, leaving sends zeros and falls silent, whatever happened."""
+    """One wire. Entering opens it; leaving always sends zeros and then falls silent."""
 
     def __init__(
         self, wire: Wire, mcu: McuConfig, rate_hz: float, longest_reply: float = LONGEST_REPLY_S
     ) -> None:
         self.wire, self.mcu, self.rate_hz = wire, mcu, rate_hz
         self.longest_reply_s = longest_reply
-        """The most that mcu.reply_period may be."""
+        """Largest permitted value of mcu.reply_period, s."""
         self.armed = False
-        """The motors have been seen to stand: from now on a runaway ends the check."""
-        # what is found out of it
+        """Whether the motors were seen at rest. From then on, a runaway ends the check."""
+        # Results of the steps
         self.baud_rate: int = mcu.baud_rate
         self.comma = mcu.trailing_comma
         self.latched = False
-        """Zeros without what is `comma` now left the last motor turning."""
+        """Whether zeros in the form that is not `comma` left the last motor turning."""
         self.sealed = self.sampled = False
-        """Lines go out with the check, and ask for the sample fields."""
+        """Whether lines carry the checksum, and whether they ask for the sample fields."""
         self.identity: dict[str, str] = {}
         self.own_clock = False
-        """It reports by its own clock."""
+        """Whether the board reports by its own clock."""
         self.gap_s = mcu.reply_period
-        """Between two replies while lines go out."""
+        """Time between two replies while lines are sent, s."""
         self.paced = False
-        """Those two were measured."""
+        """Whether `own_clock` and `gap_s` were measured."""
         self.lost = 0.0
-        """Share of the lines that get lost or damaged, of either way."""
-        # the recording
+        """Fraction of the lines that are lost or damaged in either direction."""
+        # The recording
         self.replies: list[Reply] = []
         self.others: list[bytes] = []
-        """Lines that are no good replies."""
+        """Lines that are not good replies."""
         self.heard = Heard()
-        """All that came since the line was opened."""
+        """Everything that was received since the port was opened."""
         self.sent_lines = 0
         self.sent_s = 0.0
         self.lateness = Lateness()
-        """Of this computer; of the board, too, where it is one of its programs."""
+        """Lateness of this computer, and of the board too if the board is a program on it."""
         self.fled = False
-        """Zeros do not stop a motor, or make it run: silence, and the MCU's watchdog, may."""
+        """Whether zeros fail to stop a motor, or make it run away.
+
+        Then only silence, by the MCU's watchdog, may stop it.
+        """
 
         self._commanded = ZERO
         self._unanswered_s = 0.0
-        """For how long `drive` has had no reply; what this host paused does not count."""
+        """Time for which `drive` has had no reply, s. Pauses of this host do not count."""
         self._listened_s = 0.0
         self._sequence = 0
         self._lines = LineReader()
@@ -100,13 +104,13 @@ class Board:
         self._codecs = {comma: Codec(WheelMap(), comma) for comma in (False, True)}
 
     def open(self, baud_rate: int) -> None:
-        """Open the line at this rate; what was half received is forgotten."""
+        """Open the port at this rate and discard a line that was half received."""
         self.wire.open(baud_rate)
         self.baud_rate, self.heard = baud_rate, Heard()
         self.forget()
 
     def forget(self) -> None:
-        """What was heard says nothing of the board that is there now; how it speaks, it does."""
+        """Discard the recording after a restart, but keep the results about the board's dialect."""
         self.restarts, self._unanswered_s = Restarts(), 0.0
         for heard in (self._lines, self.replies, self.others):
             heard.clear()
@@ -119,16 +123,16 @@ class Board:
         try:
             self._farewell()
         except BaseException:
-            self._farewell()  # a signal in the middle of it: the zeros still have to go
+            self._farewell()  # a signal arrived in the middle of it; the zeros must still be sent
             raise
         finally:
             self.wire.close()
 
     def _farewell(self) -> None:
-        """Zeros, then silence.
+        """Send zeros, then nothing more.
 
-        Where zeros make a motor run away (its encoder is reversed, and the firmware regulates it
-        to zero), each further one would feed the watchdog that can cut it.
+        If the encoder of a motor is reversed, the firmware's speed control makes it run away on
+        zeros. Each further zero would then feed the watchdog that can cut the motor.
         """
         self.armed, self.restarts.watched = False, False
         try:
@@ -139,16 +143,16 @@ class Board:
                 self.listen(2 * self.period_s)
                 self.fled = motion.fastest(self.replies, limits.RUNAWAY) is not None
         except WireLostError:
-            pass  # nothing reaches the motors any more; the MCU's own watchdog has to
+            pass  # nothing reaches the motors any more, so the MCU's own watchdog has to stop them
 
     @property
     def now_s(self) -> float:
-        """The time."""
+        """Monotonic time, s."""
         return self.wire.now_ns() / NS_PER_S
 
     @property
     def known(self) -> Known:
-        """What a step may have found out of it, to be what it was when that is tried again."""
+        """Results that a step may have changed, to be restored before it is repeated."""
         return Known(*(getattr(self, name) for name in Known._fields))
 
     @known.setter
@@ -158,19 +162,24 @@ class Board:
 
     @property
     def line_s(self) -> float:
-        """What the wire needs for a line and a little room."""
+        """Time that the wire needs for a line, with some margin, s."""
         longest = line_bytes(True, self.sealed, self.sampled)
         return 1.25 * wire_ns(longest, self.baud_rate) / NS_PER_S
 
     @property
     def period_s(self) -> float:
-        """Between two lines."""
+        """Time between two lines, s."""
         return max(limits.PERIOD_S, self.line_s)
 
-    # what goes out
+    # Sending
 
     def line(self, motors: Motors, comma: bool | None = None) -> bytes:
-        """The command for these speeds in the form in force, or with or without its last comma."""
+        """Return the command for these speeds.
+
+        Args:
+            motors: speeds of motors a to d, rad/s.
+            comma: whether the line ends in a comma; None uses the form in force.
+        """
         line = self._codecs[self.comma if comma is None else comma].encode(WheelSpeeds(*motors))
         if not self.sealed:
             return line
@@ -178,7 +187,7 @@ class Board:
         return seal(line, self._sequence, ASK_SAMPLE if self.sampled else b"")
 
     def send(self, motors: Motors, comma: bool | None = None) -> None:
-        """One command, now."""
+        """Send one command now."""
         turned, self._commanded = any(self._commanded), motors
         self.wire.send(self.line(motors, comma))
         self.sent_lines += 1
@@ -188,14 +197,14 @@ class Board:
         self.restarts.sent(motors, self.sent_s)
 
     def zeros(self) -> None:
-        """Zeros that any firmware takes: on a line of their own, with the comma and without."""
+        """Send zeros that any firmware accepts: on their own line, with and without the comma."""
         self._commanded = ZERO
         plain = self._codecs[True].stop + self._codecs[False].stop
         self.wire.send(b"\r\n" + plain + (self.line(ZERO) if self.sealed else b""))
         self.restarts.sent(ZERO, self.now_s)
 
     def wakes(self, seconds: float) -> bool:
-        """Zeros until it answers; False when it does not for so long."""
+        """Send zeros until the board answers. Return False if it does not within `seconds`."""
         before, end_s = len(self.replies), self.now_s + seconds
         while len(self.replies) == before:
             if self.now_s >= end_s:
@@ -205,15 +214,16 @@ class Board:
         return True
 
     def ask(self, wait_s: float = 0.0, comma: bool | None = None) -> None:
-        """Zeros once, and their answer waited for, a period at the least."""
+        """Send zeros once and listen for their answer, for at least one period."""
         self.send(ZERO, comma)
         self.listen(max(wait_s, self.period_s))
 
     def answers(
         self, lines: int, wait_s: float, comma: bool | None = None
     ) -> list[tuple[float, Reply]]:
-        """The first reply to each of so many lines, sent one by one, and how soon it came."""
-        self.listen(max(limits.GLANCE_S / 4, wait_s))  # one to an earlier line is none to these
+        """Send this many lines one by one, and return the first reply to each with its delay, s."""
+        # Replies to earlier lines must not count for these.
+        self.listen(max(limits.GLANCE_S / 4, wait_s))
         got: list[tuple[float, Reply]] = []
         for _ in range(lines):
             self.ask(max(wait_s, 1.5 * self.period_s), comma)
@@ -222,9 +232,9 @@ class Board:
         return got
 
     def drive(self, motors: Motors, seconds: float, period_s: float = 0.0) -> list[Reply]:
-        """Command these speeds for so long, line after line; the answers of that time.
+        """Command these speeds for `seconds`, line after line, and return the replies of that time.
 
-        Ends the check when the MCU falls silent meanwhile: nobody would see a runaway.
+        Ends the check if the MCU falls silent meanwhile, because a runaway would not be seen.
         """
         period_s = period_s or self.period_s
         end_s = self.now_s + seconds
@@ -243,17 +253,23 @@ class Board:
         return got
 
     def let_go(self, silent_s: float) -> None:
-        """Zeros once, then silence: it is the watchdog that cuts a motor that zeros do not stop."""
+        """Send zeros once, then nothing for `silent_s`.
+
+        In the silence, the watchdog cuts a motor that zeros do not stop.
+        """
         self.zeros()
         self.listen(silent_s)
 
-    # what comes back
+    # Receiving
 
     def listen(self, seconds: float) -> list[Reply]:
-        """What the MCU answers in the next so many seconds; a runaway or new start in it raises."""
+        """Return the replies of the next `seconds`.
+
+        Raises if a motor runs away or the board restarts.
+        """
         end_ns = self.wire.now_ns() + ceil(seconds * NS_PER_S)
         if self.now_s - self._listened_s > BEAT_NS / NS_PER_S:
-            self.wire.late_ns()  # that was while nothing was measured
+            self.wire.late_ns()  # discard this lateness: nothing was measured at that time
         got: list[Reply] = []
         while True:
             until_ns = min(end_ns, self.wire.now_ns() + BEAT_NS)
@@ -266,7 +282,7 @@ class Board:
                 return got
 
     def _hear(self, until_ns: int) -> list[Reply]:
-        """One beat of it."""
+        """Receive until `until_ns` and return the good replies."""
         got = []
         for at_ns, data in self.wire.listen(until_ns):
             self.heard.take(data)
@@ -298,7 +314,7 @@ class Board:
 
     @property
     def silent_s(self) -> float:
-        """Since the last reply, 0 where none has come or may be asked for."""
+        """Time since the last reply, s; 0 if there was none or if the board must not be asked."""
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
@@ -314,22 +330,22 @@ class Board:
         raise StoppedError(found)
 
     def _flee(self) -> None:
-        """Zeros once, and none after them."""
+        """Send zeros once, and no more after them."""
         self.fled = True
         self.zeros()
 
-    # standing
+    # Standing still
 
     def turning(self) -> list[int]:
-        """The motors that turn by the last reply."""
+        """Return the motors that turn according to the last reply."""
         last = self.replies[-1].motors if self.replies else ZERO
         return motion.moving(last, limits.STANDING)
 
     def rest(self) -> None:
-        """Stop, and wait until everything stands; ends the check when nothing does that.
+        """Stop all motors and wait until they stand. Ends the check if they do not.
 
-        Where zeros in the other form stop the last motor, which kept its speed, that form is in
-        force from then on.
+        If the last motor kept its speed and zeros in the other form stop it, that form is in force
+        from then on.
         """
         began_s = self.now_s
         if self.settles(self.comma):
@@ -346,8 +362,10 @@ class Board:
         raise StoppedError(manual.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
-        """Zeros until two replies say that every motor stands; False when none of them does, and
-        no motor slows down any more."""
+        """Send zeros until two replies show that every motor stands.
+
+        Returns False if a motor still turns and none of the motors slows down any more.
+        """
         began_s = self.now_s
         while True:
             last = motion.since(self.replies[-2:], began_s)
@@ -359,5 +377,5 @@ class Board:
             self.ask(comma=comma)
 
     def _slows(self) -> bool:
-        """Some motor slows down."""
+        """Return whether any motor slows down."""
         return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.FALLS

@@ -1,4 +1,4 @@
-"""The sample fields against the speeds: encoder counts per wheel turn, and whether they agree."""
+"""Compares the sample fields with the speeds and finds the encoder counts per wheel turn."""
 
 from __future__ import annotations
 
@@ -12,17 +12,23 @@ from acsard.checkup.limits import GLANCE_S
 from acsard.checkup.motion import Reply, steps
 
 LEAST_ANGLE = 2.0
-"""rad; over less the speeds' own rounding spoils the figure."""
+"""Smallest angle for a measurement of the counts, rad.
+
+Below it, the speeds' own rounding spoils the result.
+"""
 
 AGREES = 0.02
-"""By which share the measured counts may differ from those stated."""
+"""Fraction by which the measured counts may differ from the stated ones."""
 
 MOST_COUNTS = 100_000
-"""What `mcu.encoder_counts` takes."""
+"""Largest value that `mcu.encoder_counts` accepts."""
 
 
 def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
-    """Counts per turn of these motors' encoders, by the speeds the MCU says; None: too little."""
+    """Return the counts per turn of these motors, relative to the reported speeds.
+
+    Returns None if the motors turned too little.
+    """
     counts = angle = 0.0
     for step in steps(replies):
         for motor in motors if step.counts and step.mcu_s <= GLANCE_S else ():
@@ -34,7 +40,10 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """`mcu.encoder_counts`, from the identification or measured; `motors` have moved right."""
+    """Judge `mcu.encoder_counts` by the identification or a measurement.
+
+    `motors` are motors that have turned as commanded.
+    """
     if not board.sampled:
         return manual.find("encoder counts: none")
     if board.lost > loss.MOST:

@@ -1,4 +1,4 @@
-"""Broken lines that say speeds, to motors that stand: none may move anything."""
+"""Sends damaged lines with speeds to motors that stand: none of them may move a motor."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from acsard.mcu.check import seal
 from acsard.mcu.codec import LETTERS
 
 REPEATS = 3
-"""How often each broken line goes out: a motor needs a moment to show that it took it."""
+"""Number of times each damaged line is sent. A motor needs a moment to show that it obeyed."""
 
 
 WHOLE = {"over-long", "garbage before it"}
-"""Wrong is only what is around the four values: who takes them is lenient, not dangerous."""
+"""Kinds of damage that leave the four values intact.
+
+Firmware that accepts them is lenient, but not dangerous.
+"""
 
 
 def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple[str, bytes]]:
-    """Every kind of damage, in the dialect the firmware takes; all but these motors at zero."""
+    """Return every kind of damaged line, with its name, in the dialect of the firmware.
+
+    All motors except `motors` are at zero.
+    """
     a, b, c, d = (
         f"{letter}p{SPEED if motor in motors else 0.0:05.2f}"
         for motor, letter in enumerate(LETTERS)
@@ -51,7 +57,10 @@ def broken_lines(comma: bool, sealed: bool, motors: Sequence[int]) -> list[tuple
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Send them all, to motors that turn as told; they stand before and after."""
+    """Send all damaged lines and judge the effect.
+
+    `motors` are motors that turn as commanded. They stand before and after.
+    """
     if not motors:
         return manual.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
@@ -65,7 +74,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 
 def _moves(board: Board, line: bytes) -> bool:
-    """Whether anything that stands turns because of it; it stands again."""
+    """Return whether a standing motor turns because of this line. It stands again afterwards."""
     for _ in range(REPEATS):
         board.wire.send(line)
         board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))

@@ -1,6 +1,6 @@
-"""The microcontroller's language: baud rate, who it is, which form of line it takes, the check.
+"""The microcontroller's dialect: baud rate, identification, form of lines and the checked link.
 
-Sends zeros and questions only; what is found here is used by the steps after it.
+These steps send only zeros and questions. Later steps use the results.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
 
 OTHER_S = 0.6
-"""How long each other baud rate is tried."""
+"""Time for which each other baud rate is tried, s."""
 
 ENOUGH = 3
-"""Good replies that prove a baud rate."""
+"""Number of good replies that prove a baud rate."""
 
 ASKED = 3
-"""How often it is asked who it is: the question or its answer may be lost."""
+"""Number of times that the identification is asked for. The question or its answer may be lost."""
 
 TRIES = 5
-"""Lines that are sent to see whether they are answered."""
+"""Number of lines that are sent to see whether the board answers."""
 
 
 def baud(board: Board) -> Finding:
-    """At which rate it answers; ends the check when at none."""
+    """Find the baud rate at which the board answers. Ends the check if there is none."""
     configured = board.mcu.baud_rate
     if board.baud_rate != configured:
-        board.open(configured)  # it started anew when another one was tried
-    if _knock(board, BOOT_S):  # opening the port resets many boards
+        board.open(configured)  # the board restarted while another rate was being tried
+    if _knock(board, BOOT_S):  # the wait is long because opening the port resets many boards
         return manual.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     heard = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
@@ -49,11 +49,11 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Zeros in both forms until it has answered often enough."""
+    """Send zeros in both forms until enough good replies have arrived."""
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
-        # For firmware that has taken a checked line since it booted, and refuses others since.
+        # Firmware that has accepted a checked line since it booted refuses plain ones.
         board.wire.send(seal(board.line(ZERO), 0))
         board.listen(max(GLANCE_S / 4, 5 * board.period_s))
         if len(board.replies) >= ENOUGH:
@@ -63,7 +63,10 @@ def _knock(board: Board, seconds: float) -> bool:
 
 
 def identity(board: Board) -> Finding:
-    """Who it says it is; ends the check when it only says what we say."""
+    """Ask for the board's identification.
+
+    Ends the check if the answer is an echo of the question.
+    """
     board.others.clear()
     for _ in range(ASKED):
         board.restarts.asked(board.now_s)
@@ -83,11 +86,14 @@ def identity(board: Board) -> Finding:
 
 
 def form(board: Board) -> Finding | None:
-    """Whether it answers the configured form of line at all; None when it does, or cannot tell."""
+    """Check whether the board answers the configured form of line.
+
+    Returns None if it does, or if that cannot be determined.
+    """
     if board.own_clock or _answers(board, board.comma) or not _answers(board, not board.comma):
         return None
     if _answers(board, board.comma):
-        return None  # it had been held up
+        return None  # the board had only been delayed
     board.comma = not board.comma
     return _comma_wrong(board, "refused")
 
@@ -97,7 +103,10 @@ def _answers(board: Board, comma: bool) -> list[Reply]:
 
 
 def comma(board: Board, dead: bool) -> Finding:
-    """Whether the last motor, unless it is dead, needed another comma at the line's end."""
+    """Judge whether the last motor needs the other form of the comma at the end of the line.
+
+    `dead` says that no movement of the last motor was seen, or that it could not be judged.
+    """
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
     if dead:
@@ -107,7 +116,10 @@ def comma(board: Board, dead: bool) -> Finding:
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
-    """The configured form of the last comma is wrong; `board.comma` is already the right one."""
+    """Return the finding that the configured form is wrong.
+
+    `board.comma` is already the right one.
+    """
     return manual.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},
@@ -119,7 +131,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
 
 def replies(board: Board) -> Finding:
-    """How its replies are written; every form here is one the host reads."""
+    """Judge the form of the replies. The host can read every form that is named here."""
     lines = [reply.line.partition(b"#")[0] for reply in board.replies]
     forms = {"spaces": rb", ", "unpadded": rb"[pn]\d\.", "trailing comma": rb", *\Z"}
     found = [name for name, sign in forms.items() if any(re.search(sign, line) for line in lines)]
@@ -131,7 +143,10 @@ def replies(board: Board) -> Finding:
 
 
 def check(board: Board) -> Finding:
-    """Whether it knows the checked link and the sample fields; from here on they are used."""
+    """Find out whether the board knows the checked link and the sample fields.
+
+    From here on the check uses those that it knows.
+    """
     wanted = board.mcu.link_check
     board.sealed = board.sampled = True
     if not any(reply.reading for reply in _answers(board, board.comma)):

@@ -1,4 +1,4 @@
-"""What the check finds: one `Finding` per thing looked at, and the end of a check cut short."""
+"""Results of the check: one `Finding` per subject, and the errors that end a check early."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from acsard.values import WHEELS, AcsardError
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 
 REST = "the rest"
-"""The row of a check that ended early: what it did not come to."""
+"""Name of the row that lists the steps which an early end left out."""
 
 
 class Finding(Struct, frozen=True):
-    """One thing that was looked at; the words are those of `manual.py`.
+    """The result for one subject; `manual.py` has the words.
 
-    `figure` is what was measured, `text` what it means, `mend` what to do unless it passed, and
-    `keys` what it says of the configuration: dotted key -> value, whether configured so or not.
+    `figure` is the measurement, `text` its meaning, `mend` the remedy unless the subject passed,
+    and `keys` the configuration values by dotted key, whether they are configured already or not.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Finding(Struct, frozen=True):
 
 
 class StoppedError(AcsardError):
-    """The check must end here; `finding` is why."""
+    """Early end of the check; `finding` is the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
@@ -41,11 +41,11 @@ class StoppedError(AcsardError):
 
 
 class WireLostError(AcsardError):
-    """The line is gone: unplugged, or its driver has hung."""
+    """Loss of the serial line: it was unplugged, or its driver hangs."""
 
 
 def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
-    """The wheel a motor turns by the configuration, and 1 or -1 for which way is forward."""
+    """Return the wheel of a motor by the configuration, and 1 or -1 for its forward direction."""
     for wheel in WHEELS:
         entry = getattr(mcu.wheels, wheel)
         if entry[1] == LETTERS[motor]:
@@ -54,15 +54,15 @@ def wheel_of(mcu: McuConfig, motor: int) -> tuple[str, int]:
 
 
 def words(wheel: str) -> str:
-    """A wheel's name for people."""
+    """Return a wheel's name in words."""
     return wheel.replace("_", " ")
 
 
 def motor_name(mcu: McuConfig, motor: int) -> str:
-    """`motor d (rear right)`: the letter, and the wheel the configuration gives it."""
+    """Return the letter of a motor and its wheel by the configuration: `motor d (rear right)`."""
     return f"motor {LETTERS[motor]} ({words(wheel_of(mcu, motor)[0])})"
 
 
 def motor_names(mcu: McuConfig, motors: Sequence[int], joint: str = " and ") -> str:
-    """Several of them."""
+    """Return the names of several motors."""
     return joint.join(motor_name(mcu, motor) for motor in motors)

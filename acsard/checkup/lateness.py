@@ -1,8 +1,8 @@
-"""How late this computer was meanwhile, and what that leaves of a finding.
+"""Measures the lateness of this computer, and decides which findings it spoils.
 
-A computer with more to do than it can is late to ask and late to hear, and finds faults that the
-board does not have. Where the board is a program of this computer, too, that one's wait counts as
-well. What was found in such a time is looked at again (`procedure.py`), and never blamed on it.
+An overloaded computer asks late and receives late, and so finds faults that the board does not
+have. If the board is itself a program on this computer, its waiting time counts as well. A step
+that ran at such a time is repeated (`procedure.py`), and its finding is never blamed on the board.
 """
 
 from __future__ import annotations
@@ -14,53 +14,58 @@ from acsard.checkup.findings import Finding
 from acsard.checkup.manual import Unsure
 
 LEAST_S = 0.005
-"""What is not worth remembering: every computer is as late now and then."""
+"""Lateness below which nothing is recorded, s: every computer has as much now and then."""
 
 SPOILS_S = limits.PERIOD_S
-"""From here on a fault may be this computer's: a whole line was late."""
+"""Lateness from which on a fault may be this computer's, s: a whole line was late."""
 
 PAUSE_S = limits.WATCHDOG_LEAST_S
-"""From here on even what looks right may be, since the motors may have stopped meanwhile."""
+"""Lateness from which on even a good result is doubtful, s.
+
+The motors may have stopped meanwhile by the MCU's watchdog.
+"""
 
 
 LATE = "late: not judged"
-"""The outcome of a step that this computer was too late for."""
+"""The outcome of a step for which this computer was too late."""
 
 
 class Lateness:
-    """What was late, and when; times are s."""
+    """Delays of this computer and their times, in s."""
 
     def __init__(self) -> None:
         self._seen: list[tuple[float, float]] = []
 
     def look(self, late_s: float, now_s: float) -> None:
-        """Something was so late now."""
+        """Record a delay that ends now."""
         if late_s >= LEAST_S:
             self._seen.append((now_s, late_s))
 
     def since(self, began_s: float) -> float:
-        """The most since then."""
+        """Return the largest delay since then, s."""
         return max((late_s for at_s, late_s in self._seen if at_s >= began_s), default=0.0)
 
 
 def spoilt(found: Unsure, late_s: float) -> bool:
-    """Whether so late a computer may have made this finding: it can have been so late twice in what
-    was measured, where that began and where it ended."""
+    """Return whether a computer that was this late may have caused the finding.
+
+    It may have been late twice within a measurement: where that began and where it ended.
+    """
     least_s = PAUSE_S if found.verdict == "PASS" else SPOILS_S
     return late_s >= max(least_s, found.margin_s / 2)
 
 
 def finding(name: str, late_s: float) -> Finding:
-    """Nothing is known of this step, whatever was seen."""
+    """Return the finding that a step was not judged."""
     return manual.find(LATE, name=name, late=late_s * 1000)
 
 
 def judged(found: Finding) -> bool:
-    """It says something of the board."""
+    """Return whether the finding says anything about the board."""
     return found.figure != manual.MANUAL[LATE].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:
-    """The names that no finding says anything of; a later one may have."""
+    """Return the names that no finding judges. The last finding of each name counts."""
     last = {found.name: found for found in findings}
     return [name for name, found in last.items() if not judged(found)]

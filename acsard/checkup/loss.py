@@ -1,7 +1,7 @@
-"""How many lines are lost or damaged on the way, and how long the board is silent at a time.
+"""Counts lines that are lost or damaged, and finds long silences of the board.
 
-A line that comes damaged was damaged on its way back. One that stays unanswered may have been lost
-on either: which one, `lost_where.py` finds out with the motors.
+A line that arrives damaged was damaged on the way back. An unanswered line may have been lost in
+either direction; `lost_where.py` determines the direction with the motors.
 """
 
 from __future__ import annotations
@@ -21,23 +21,26 @@ from acsard.mcu.hearing import printable
 from acsard.mcu.session import IDENTITY
 
 MOST = 0.02
-"""Share of the lines that may be lost; a sound link loses none."""
+"""Largest fraction of lines that may be lost. A sound link loses none."""
 
 FEW = 2
-"""A single lost line is chance."""
+"""Number of lost lines from which on the loss is not a coincidence."""
 
 LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
-"""So many lines show a loss of 2 %; within these times, where the wire is slow or none is lost."""
+"""Number of lines that show a loss of 2 %, and shortest and longest duration of the count, s.
+
+The count ends early if no line is lost, and takes longer on a slow wire.
+"""
 
 OWN_PACE = 1.5
-"""Answers so many periods apart are not one to each line: the board has a pace of its own."""
+"""Gap between answers, in periods, above which the board answers at its own, slower pace."""
 
 SILENT = 2.0
-"""Times the usual: a longer time between two answers is a silence."""
+"""Multiple of the usual gap above which a gap between two answers counts as a silence."""
 
 
 class Count(Struct, frozen=True):
-    """Of so many lines; those `damaged` on the way back are among the `lost`."""
+    """Counts of lines. The `damaged` ones, which arrived damaged, are among the `lost` ones."""
 
     lines: int
     lost: int
@@ -45,20 +48,19 @@ class Count(Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Of the lines, 0 where no more are lost than by chance."""
+        """Fraction of lost lines; 0 if the loss may be a coincidence."""
         return self.lost / self.lines if self.lost >= FEW else 0.0
 
 
 def finding(board: Board) -> Finding:
-    """Send zeros at the host's pace, and judge what comes back; sets `board.lost`.
+    """Send zeros at the host's rate, judge the replies, and set `board.lost`.
 
-    Ends the check where plain lines come damaged: the ones on the way there may be, too, and a
-    damaged one can tell a motor any speed. What is lost cannot be told of a board whose pace nobody
-    knows.
+    Ends the check if plain lines arrive damaged: lines to the board may then be damaged too, and
+    could tell a motor any speed. The loss cannot be determined if the board's pace is unknown.
     """
     if not board.paced:
         return lateness.finding("lost lines", board.lateness.since(0.0))
-    board.listen(limits.GLANCE_S)  # what comes later answers what goes out now
+    board.listen(limits.GLANCE_S)  # later replies answer the lines that are sent now
     began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
     board.drive(ZERO, LEAST_S, _period_s(board))
     silent_s = _silence_s(board, motion.since(board.replies, began_s))
@@ -91,7 +93,7 @@ def _sound(count: Count, silent_s: float) -> Finding:
 
 
 def _period_s(board: Board) -> float:
-    """The host's, or the board's own pace if it answers less often."""
+    """Return the host's period, or a longer one if the board answers less often."""
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
     if not board.own_clock and board.gap_s > OWN_PACE * period_s:
@@ -113,8 +115,11 @@ def _gaps(replies: Sequence[Reply]) -> list[float]:
 
 
 def _left_out(replies: Sequence[Reply]) -> int:
-    """How many are missing among others that come evenly: in all of the time, since one that is
-    heard late makes one gap longer and the next one shorter."""
+    """Return the number of missing replies among evenly spaced ones.
+
+    It is computed over the whole time: a reply that is received late makes one gap longer and the
+    next one shorter.
+    """
     gaps = _gaps(replies)
     usual = median(gaps) if gaps else 0.0
     alike = [gap for gap in gaps if abs(gap - usual) < usual / 2]
@@ -122,7 +127,7 @@ def _left_out(replies: Sequence[Reply]) -> int:
 
 
 def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
-    """The longest time without an answer that the host would take for a lost link, else 0."""
+    """Return the longest gap that the host would take for a lost link, s, or 0 if there is none."""
     longest = max(_gaps(replies), default=0.0)
     quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
     return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0

@@ -1,7 +1,7 @@
-"""On which way lines are lost: to the board, or back.
+"""Finds the direction in which lines are lost: to the board, or back.
 
-Motors that stand are turned for a moment by a single line, again and again. One that was obeyed has
-arrived, so it was the answer that got lost.
+Single lines turn standing motors for a moment, again and again. A line that the motors obeyed has
+arrived, so its answer was the one that got lost.
 """
 
 from __future__ import annotations
@@ -19,30 +19,38 @@ from acsard.checkup.motion import ZERO
 from acsard.checkup.outside import Operator
 
 PULSE_S = 0.08
-"""For so long a single line turns the motors: long enough for them, short for the watchdog."""
+"""Time for which a single line turns the motors, s.
+
+It is long enough to see and shorter than the watchdog.
+"""
 
 TOLD, PULSES_S = 8, 20.0
-"""Lost pulses that tell the way, and how long they are waited for."""
+"""Number of unanswered pulses that shows the direction, and longest time to wait for them, s."""
 
 OWN_CLOCK_S = 10.0
-"""How long where nothing answers a line: there, nothing has said yet that any is lost."""
+"""Duration for a board that reports by its own clock, s.
+
+Such a board answers no line, so nothing has shown yet whether any line is lost.
+"""
 
 SPREAD, STRIDE = 12, 5
-"""So many different times lie between the pulses, and not in their order: what is lost at intervals
-would miss them all."""
+"""Number of different pauses between pulses, and the stride by which they are ordered.
+
+With equal pauses, losses at regular intervals could miss every pulse.
+"""
 
 OBEYED = 0.5
-"""Of the angle that a pulse turns the motors by: it has arrived."""
+"""Fraction of the usual angle of a pulse above which the motors obeyed it."""
 
 SEEN, GRAINS = 0.02, 4
-"""rad, and the least that the encoders show: motors that turn by less in a pulse tell nothing."""
+"""Smallest usable angle of a pulse, in rad and in smallest steps of the encoders."""
 
 WHOLE = 1.5
-"""Times the usual time between two reports of a board's own clock: none is missing."""
+"""Multiple of the usual gap between a board's own reports above which one is missing."""
 
 
 class Ways(Struct, frozen=True):
-    """What became of the pulses: lost on the way `there`; obeyed, and the answer lost (`back`)."""
+    """Counts of pulses: lost on the way `there`, and obeyed with the answer lost (`back`)."""
 
     sent: int
     there: int
@@ -50,7 +58,10 @@ class Ways(Struct, frozen=True):
 
 
 def finding(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
-    """By these motors, which turn as told; None where nothing is lost, as far as is known."""
+    """Judge the direction with motors that turn as commanded.
+
+    Returns None if no line is known to be lost.
+    """
     if not (board.own_clock or board.lost > loss.MOST):
         return None
     operator.say("the motors turn for a moment each time, to tell on which way lines are lost")
@@ -67,14 +78,18 @@ def finding(board: Board, operator: Operator, motors: Sequence[int]) -> Finding 
 
 
 def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
-    """Turn these motors, which stand; None when they are too slow to tell."""
+    """Send pulses to these standing motors and count the losses.
+
+    Returns None if the motors are too slow or too coarse to tell.
+    """
     on = motion.each(lambda motor: limits.SPEED if motor in motors else 0.0)
     end_s = board.now_s + (OWN_CLOCK_S if board.own_clock else PULSES_S)
     every: list[float] = []
     unanswered: list[float] = []
     count = 0
     while len(unanswered) < TOLD and board.now_s < end_s:
-        board.listen(limits.GLANCE_S / 4)  # an answer to an earlier line is none to this one
+        # An answer to an earlier line must not count for this one.
+        board.listen(limits.GLANCE_S / 4)
         since_s, coasting = board.now_s, board.replies[-1].motors
         answered = bool(board.drive(on, PULSE_S, PULSE_S))
         board.drive(ZERO, 2 * board.gap_s + (4 + STRIDE * count % SPREAD) * board.period_s)
@@ -99,20 +114,20 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 
 
 def _whole(board: Board, since_s: float) -> bool:
-    """No report of the board's own is missing since then."""
+    """Return whether none of the board's own reports since then is missing."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
     return all(after - before < WHOLE * board.gap_s for before, after in pairwise(times))
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:
-    """rad; the least that these encoders have shown from one reply to the next."""
+    """Return the smallest angle that these encoders showed between two replies, rad."""
     course = motion.steps(board.replies)
     shown = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
     return min((angle for angle in shown if angle), default=0.0)
 
 
 def _stand(board: Board) -> bool:
-    """Wait until they stand; False when they are too slow for pulses."""
+    """Wait until the motors stand. Return False if they are too slow for pulses."""
     began_s = board.now_s
     while board.turning():
         if board.now_s - began_s > limits.MOTOR_S / 2:

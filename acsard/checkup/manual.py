@@ -1,7 +1,6 @@
-"""All that the check can say, as it is printed: what each outcome of a step means, and its mend.
+"""Makes findings from the outcomes in `outcomes.py`, which hold all printed words.
 
-A step looks, and names the outcome with the figures that belong to it; the words are those of
-`outcomes.py`.
+A step names its outcome and gives the measured figures that go into the words.
 """
 
 from __future__ import annotations
@@ -15,16 +14,17 @@ from acsard.checkup.outcomes import OUTCOMES
 
 
 class Unsure(Finding, frozen=True):
-    """A finding that a computer which is late can make, whatever the board does.
+    """A finding that may be caused by the lateness of this computer, whatever the board does.
 
-    `margin_s` is by how much it is beyond its bound: one that is less late cannot have made it.
+    `margin_s` is how far the measurement is beyond its bound. A smaller delay cannot have caused
+    the finding.
     """
 
     margin_s: float = 0.0
 
 
 class Outcome(Struct, frozen=True):
-    """One entry: `figure`, `text` and `mend` take what was seen in braces."""
+    """One outcome. `figure`, `text` and `mend` are templates for the measured values."""
 
     verdict: Verdict
     unsure: bool
@@ -49,8 +49,14 @@ MANUAL = _read(OUTCOMES)
 
 
 def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) -> Finding:
-    """The finding of this outcome, with what was seen; it bears the name of the step, or `name`,
-    and has the margin `margin_s` where a late computer can make it."""
+    """Return the finding of this outcome with the measured values filled in.
+
+    Args:
+        outcome: a key of `MANUAL`; the part before the colon is the finding's name.
+        keys: configuration values that the finding suggests.
+        seen: the measured values. `name` replaces the name; `margin_s` is the margin of an
+            `Unsure`.
+    """
     entry = MANUAL[outcome]
     name = str(seen.get("name", outcome.partition(":")[0]))
     figure, text, mend = (s.format(**seen) for s in (entry.figure, entry.text, entry.mend))
@@ -61,5 +67,5 @@ def find(outcome: str, keys: dict[str, object] | None = None, **seen: object) ->
 
 
 def plain(found: Finding) -> Finding:
-    """As it is told: without what it needs to be doubted."""
+    """Return the finding as it is reported, without its margin."""
     return Finding(*(getattr(found, name) for name in Finding.__struct_fields__))

@@ -1,4 +1,4 @@
-"""What a recording says of the motors' movement: pure functions of replies and their times."""
+"""Evaluates the motors' movement in a recording: pure functions of replies and their times."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from acsard.mcu.codec import Motors
 ZERO: Motors = (0.0, 0.0, 0.0, 0.0)
 
 TREND_S = 0.5
-"""Over so long speeds are compared with those just before."""
+"""Time over which speeds are compared with those just before, s."""
 
 FALLS = 0.97
-"""Below this share of what it was, a speed falls; above its inverse, it rises."""
+"""Ratio to the earlier speed below which a speed falls; it rises above the inverse."""
 
 
 class Reply(Struct, frozen=True):
-    """A good line of the MCU, complete at `at_s`."""
+    """A good line of the MCU that was complete at `at_s`."""
 
     at_s: float
     motors: Motors
@@ -34,8 +34,11 @@ class Reply(Struct, frozen=True):
 
 
 class Step(Struct, frozen=True):
-    """From one reply to the next: how long it took, and the speeds; where the MCU says them, how
-    long it took by its own clock, and by which counts each encoder went on, the short way round."""
+    """The interval between two replies: its duration in s and the speeds in rad/s.
+
+    If the MCU reports them, it also has the duration by the MCU's clock, and by how many counts
+    each encoder moved, wrapped to the shorter way.
+    """
 
     seconds: float
     speeds: Motors
@@ -44,29 +47,29 @@ class Step(Struct, frozen=True):
 
 
 def each(value: Callable[[int], float]) -> Motors:
-    """A value for each motor, by its number."""
+    """Return a value for each motor, by its number."""
     a, b, c, d = (value(motor) for motor in range(4))
     return a, b, c, d
 
 
 def moving(speeds: Motors, least: float = MOVES) -> list[int]:
-    """The motors, or encoders, that move."""
+    """Return the motors, or encoders, that move."""
     return [motor for motor in range(4) if abs(speeds[motor]) >= least]
 
 
 def since(replies: Sequence[Reply], since_s: float, until_s: float = math.inf) -> Sequence[Reply]:
-    """The replies from the one time to the other."""
+    """Return the replies from the first time to the second."""
     first = bisect_left(replies, since_s, key=lambda reply: reply.at_s)
     return replies[first : bisect_right(replies, until_s, key=lambda reply: reply.at_s)]
 
 
 def mean(replies: Sequence[Reply]) -> Motors:
-    """Each encoder's speed over these replies."""
+    """Return each encoder's mean speed over these replies, rad/s."""
     return each(lambda motor: fmean([reply.motors[motor] for reply in replies] or [0.0]))
 
 
 def steps(replies: Sequence[Reply]) -> Iterator[Step]:
-    """From each reply to the next."""
+    """Yield the interval from each reply to the next."""
     for before, after in pairwise(replies):
         seconds, one, other = after.at_s - before.at_s, before.reading, after.reading
         if one is None or other is None:
@@ -79,9 +82,10 @@ def steps(replies: Sequence[Reply]) -> Iterator[Step]:
 
 
 def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> Motors:
-    """By which angle each encoder went on since then, rad.
+    """Return the angle by which each encoder moved since then, rad.
 
-    By the replies' speeds, or by their counts when it is said how many are a turn.
+    It is computed from the counts if `per_turn`, the counts per turn, is given, and otherwise from
+    the speeds.
     """
 
     def angle(step: Step, motor: int) -> float:
@@ -94,7 +98,7 @@ def covered(replies: Sequence[Reply], since_s: float, per_turn: float = 0.0) -> 
 
 
 def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
-    """By which share each motor's speed is of what it was a moment before; 1 where it stands."""
+    """Return the ratio of each motor's speed to that of a moment before; 1 if it stands."""
     span_s = max(TREND_S, 4 * gap_s)
     before = mean(since(replies, now_s - 2 * span_s, now_s - span_s))
     now = mean(since(replies, now_s - span_s, now_s))
@@ -103,22 +107,24 @@ def trend(replies: Sequence[Reply], now_s: float, gap_s: float) -> Motors:
 
 
 def grain_s(steady: Sequence[Reply], motors: Sequence[int]) -> float:
-    """For how long a steady motor turns for what its speeds jump by: whole counts make them jump,
-    by one count in the time of a reply."""
+    """Return how long a steady motor turns for the angle by which its speed readings jump, s.
+
+    Whole encoder counts make the readings jump by one count per reply.
+    """
     if len(steady) < 5:
         return 0.0
     between_s = (steady[-1].at_s - steady[0].at_s) / (len(steady) - 1)
     speeds = [sorted(reply.motors[motor] for reply in steady) for motor in motors]
-    # One that is damaged is no jump.
+    # Ignore the extreme readings: a damaged one is not a jump.
     return max(course[-2] - course[1] for course in speeds) * between_s / SPEED
 
 
 def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
-    """A motor that surely turns faster than `above` rad/s, and its speed.
+    """Return a motor that certainly turns faster than `above` rad/s, and its speed, or None.
 
-    One reading is no proof, as it may be damaged, or one count of a coarse encoder: of the last
-    few steps the one that went farthest does not count. A short time tells a sudden runaway
-    sooner, a longer one tells it by a coarse encoder.
+    One reading proves nothing, because it may be damaged or a single count of a coarse encoder. The
+    largest of the last few steps is therefore ignored. The short interval shows a sudden runaway
+    sooner; the longer one shows it with a coarse encoder.
     """
     for span_s in (GLANCE_S / 2, GLANCE_S) if replies else ():
         near = since(replies, replies[-1].at_s - span_s)
@@ -126,7 +132,8 @@ def fastest(replies: Sequence[Reply], above: float) -> tuple[int, float] | None:
         for motor in range(4):
             pieces = [(min(GLANCE_S, step.seconds), step.speeds[motor]) for step in course]
             sure = sorted(pieces, key=lambda piece: abs(piece[0] * piece[1]))[:-1]
-            # Two quick replies after a silence: one count in so little time is no speed.
+            # After a silence, two replies may come close together: one count in so short a time is
+            # not a speed.
             seconds = max(GLANCE_S / 2, sum(seconds for seconds, _ in sure))
             speed = sum(seconds * speed for seconds, speed in sure) / seconds
             if abs(speed) > above:

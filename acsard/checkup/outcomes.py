@@ -1,14 +1,14 @@
-"""The words of each outcome of a step: its verdict, what it means, and its mend.
+"""The words of each outcome of a step: verdict, meaning and remedy.
 
-What was seen goes in where the braces are; `manual.py` makes the findings of it.
+Measured values replace the braces; `manual.py` makes findings from the text.
 """
 
 from __future__ import annotations
 
 # VERDICT step: outcome | figure
-#     what it means
-#     -> the mend
-# With a ? behind the verdict a computer that is late can make it, whatever the board does.
+#     the meaning
+#     -> the remedy
+# A "?" after the verdict marks an outcome that a late computer can cause, whatever the board does.
 OUTCOMES = """
 PASS baud rate: right | {rate} baud
 FAIL baud rate: other | {rate}, not {configured} baud

@@ -1,4 +1,4 @@
-"""What the check needs from outside: a serial line, and a person at the robot."""
+"""Interfaces that the check needs: a serial line, and an operator at the robot."""
 
 from __future__ import annotations
 
@@ -10,30 +10,35 @@ class Wire(Protocol):
     """A serial line."""
 
     def open(self, baud_rate: int) -> None:
-        """Open the line, or go on at another rate; raises a `MendableError`."""
+        """Open the line, or continue at another rate. Raises a `MendableError`."""
 
     def close(self) -> None:
-        """Let the last bytes out, and close."""
+        """Send the last bytes and close the line."""
 
     def now_ns(self) -> int:
-        """The monotonic time."""
+        """Return the monotonic time, ns."""
 
     def send(self, data: bytes) -> None:
-        """Put bytes on the line now; raises `WireLostError`."""
+        """Send bytes now. Raises `WireLostError`."""
 
     def late_ns(self) -> int:
-        """For how long the board, where it is a program of this computer, has waited for a
-        processor since this was asked last; else 0."""
+        """Return how long the board has waited for a processor since the last call, ns.
+
+        It is 0 unless the board is a program on this computer.
+        """
 
     def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
-        """Wait until then; what came, in pieces with their times. Raises `WireLostError`."""
+        """Wait until this time and return the received pieces with their times, ns.
+
+        Raises `WireLostError`.
+        """
 
 
 class Operator(Protocol):
-    """The person at the robot."""
+    """The operator at the robot."""
 
     def say(self, text: str) -> None:
-        """Tell what happens now."""
+        """Show a message about the present action."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """One of the answers; None when nobody is there who sees it."""
+        """Return one of the answers, or None if no person watches the robot."""

@@ -1,4 +1,4 @@
-"""How often the microcontroller answers while lines go out, of itself, and how soon."""
+"""Measures how often the microcontroller answers, whether by its own clock, and how soon."""
 
 from __future__ import annotations
 
@@ -13,24 +13,26 @@ from acsard.checkup.motion import ZERO
 from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 
 ENOUGH = 10
-"""Replies for a figure."""
+"""Number of replies that is enough for a rate."""
 
 ANSWERED = 0.8
-"""Share of the lines; where less come back, some are lost or not answered."""
+"""Fraction of answered lines below which lines are lost or remain unanswered."""
 
 SLOW_S = 0.008
-"""A round trip longer than the lines' time on the wire and this holds the control loop's news
-back; an MCU takes 1 to 5 ms."""
+"""Round trip in addition to the lines' time on the wire that delays the control loop, s.
+
+An MCU usually takes 1 to 5 ms.
+"""
 
 TRIPS = 10
 
 
 def rate(board: Board) -> Finding:
-    """How often it answers at the host's pace, and whether by itself."""
+    """Measure how often the board answers at the host's rate, and whether it reports unasked."""
     board.paced = True
     board.listen(GLANCE_S / 4)
     unasked = board.listen(CUT_S)
-    # What had been held up, here or at the board, comes all at once.
+    # Lines that were delayed here or at the board all arrive at once, so they span no time.
     board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > GLANCE_S
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
@@ -42,7 +44,7 @@ def rate(board: Board) -> Finding:
     gaps = [after.at_s - one.at_s for one, after in pairwise(got)]
     board.gap_s = gap_s = fmean(gaps)
     configured, answered = board.mcu.reply_period, len(got) / (board.sent_lines - before)
-    unset_s = max(0.1, 4 * period_s)  # what the host waits for when nothing is configured
+    unset_s = max(0.1, 4 * period_s)  # the silence that the host allows by default
     quiet_s = max(unset_s, 3 * configured)
     slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < ANSWERED
     most_s = board.longest_reply_s
@@ -64,7 +66,7 @@ def rate(board: Board) -> Finding:
 
 
 def trip(board: Board) -> Finding:
-    """How soon a line is answered."""
+    """Measure how soon a line is answered."""
     if not board.paced:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:

@@ -1,5 +1,4 @@
-"""The check from the first zero to the last: the order of the steps, what is tried again, and how
-it ends early."""
+"""The check from the first zero to the last: order of steps, repetitions and early ends."""
 
 from __future__ import annotations
 
@@ -45,7 +44,7 @@ STEPS = (
     "lost lines", "motors", "trailing comma", "wheel map", "encoder counts", "watchdog",
     "damaged lines",
 )  # fmt: skip
-"""In this order; what the check does not come to is said to be skipped, in one row."""
+"""Steps in their order. Those that an early end leaves out are listed in one row."""
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
@@ -57,31 +56,32 @@ SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("asking for the check", dialect.check),
     ("counting lost lines, 3 s and more", loss.finding),
 )
-"""What is looked at with zeros and questions alone, and what the person is told meanwhile."""
+"""Steps that send only zeros and questions, with the message that the operator sees meanwhile."""
 
 Tell = Callable[[Finding], None]
 Step = Callable[[], Finding | None]
 
 LATE_AGAIN, LATE_MOST = 2, 8
-"""A step for which this computer was late is tried again so often; so many times in all, since a
-check that takes four minutes is none."""
+"""Repetitions of a step for which this computer was late, and of all such steps together.
+
+The total is limited because a check must not take four minutes.
+"""
 
 AGAIN, MOST = 1, 5
-"""A step in which the board starts anew is tried again so often, and so many new starts in all end
-the check."""
+"""Repetitions of a step in which the board restarts, and number of restarts that ends the check."""
 
 
 def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
-    """Check one microcontroller and `tell` each finding as it is made.
+    """Check one microcontroller and call `tell` with each finding as it is made.
 
-    Nothing but zeros goes out before the operator has confirmed that the wheels are lifted.
-    Whatever happens, the last lines are zeros in both forms, then silence: the wire is closed.
+    Only zeros are sent before the operator has confirmed that the wheels are lifted. Whatever
+    happens, the last lines are zeros in both forms, and then the wire is closed.
     """
     told: set[str] = set()
     unjudged: set[str] = set()
 
     def once(finding: Finding | None) -> None:
-        """What several steps can find is told by the first of them that could judge it."""
+        """Report a finding unless one of the same name was reported and judged already."""
         if finding is None:
             return
         judged = lateness.judged(finding)
@@ -113,7 +113,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
 
 
 class _Steps:
-    """One after the other; one in which the board starts anew, once more when it is back."""
+    """Runner of the steps. It repeats a step in which the board restarted."""
 
     def __init__(
         self,
@@ -124,12 +124,12 @@ class _Steps:
     ) -> None:
         self._board, self._operator, self._tell = board, operator, tell
         self._seen = seen
-        """The board's new starts; whoever gave it looks when all has ended."""
+        """Restarts of the board. The caller owns the list and reads it at the end."""
         self._channels: list[Channel] = []
         self._late_left = LATE_MOST
 
     def all(self) -> None:
-        """From the first line to the last."""
+        """Run all steps."""
         board, operator = self._board, self._operator
         for doing, step in SILENT:
             self._measure(doing, partial(step, board))
@@ -152,7 +152,7 @@ class _Steps:
         self._board.armed = True
 
     def _turn(self, motor: int) -> Finding:
-        """One motor; the person is asked only what it was in time."""
+        """Test one motor. The operator is asked only if this computer was in time."""
         board, operator, channels = self._board, self._operator, self._channels
         operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
 
@@ -168,11 +168,14 @@ class _Steps:
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:
-        """A step that is worth nothing where this computer was late."""
+        """Run a step whose result is worthless if this computer was late."""
         self._take(doing, partial(self._in_time, step))
 
     def _in_time(self, step: Step) -> Finding | None:
-        """What a step finds while this computer is in time, or that it never was."""
+        """Return the finding of a step, repeated while this computer is late.
+
+        If it is always late, return the finding that the step was not judged.
+        """
         board, known, late_s = self._board, self._board.known, 0.0
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
@@ -183,8 +186,8 @@ class _Steps:
                     board.rest()
             began_s = board.now_s
             found, ends = _ended(step)
-            # A board that is a program here says that it was late when it runs again; one that does
-            # not answer is silent, whatever this computer does.
+            # If the board is a program on this computer, its lateness is known only when it runs
+            # again. A board that never answers is silent, whatever this computer does.
             if board.fled or not isinstance(found, Unsure):
                 break
             if found.verdict != "PASS" and not board.wakes(BOOT_S):
@@ -195,7 +198,7 @@ class _Steps:
             late_s = max(late_s, meanwhile_s)
             told = lateness.finding(found.name, late_s)
             if ends and board.armed:
-                # Of this computer's making or not: nobody turns a motor again behind that.
+                # No motor may be turned again after an early end, even if this computer caused it.
                 found, board.known = told, known
                 break
         else:
@@ -205,7 +208,7 @@ class _Steps:
         return found
 
     def _take(self, doing: str, step: Step) -> None:
-        """A step and what it found."""
+        """Run a step and report its finding. Repeat it if the board restarts."""
         board, again = self._board, 0
         known = board.known
         while True:
@@ -224,7 +227,10 @@ class _Steps:
                 board.known = known
 
     def _tried(self, step: Step) -> Finding | None:
-        """What a step finds; a board that is silent then may have started anew, and says so."""
+        """Return the finding of a step.
+
+        If the board is silent then, wait for it to report a restart.
+        """
         try:
             finding = step()
         except StoppedError:
@@ -235,13 +241,13 @@ class _Steps:
         return finding
 
     def _await_return(self, silent_s: float) -> None:
-        """Zeros until a board that has been silent for so long answers, or has had time to."""
+        """Send zeros to a board silent for `silent_s` until it answers or had time to boot."""
         board = self._board
         if board.silent_s > max(silent_s, 4 * board.gap_s):
             board.wakes(BOOT_S)
 
     def _come_back(self) -> None:
-        """Zeros until a board that has started anew answers, and its motors stand."""
+        """Send zeros until a restarted board answers and its motors stand."""
         board = self._board
         board.forget()
         self._operator.say("the board started anew; once more, when it answers")
@@ -254,7 +260,7 @@ class _Steps:
 
 
 def _ended(step: Step) -> tuple[Finding | None, bool]:
-    """What a step finds, and whether the check must end with it."""
+    """Return the finding of a step, and whether the check must end with it."""
     try:
         return step(), False
     except StoppedError as error:

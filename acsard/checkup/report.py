@@ -1,4 +1,4 @@
-"""What the findings are together, as lines for people and as one object for programs."""
+"""The result of all findings, as text and as an object for programs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ COLOURS = {"PASS": 32, "WARN": 33, "FAIL": 31, "SKIPPED": 90}
 
 
 class Report(Struct, frozen=True):
-    """A check that has ended; `written` is the file that has the changes, `error` what went wrong
-    besides the board."""
+    """A check that has ended.
+
+    `written` is the file that the changes were written to, and `error` a failure that is not about
+    the board.
+    """
 
     port: str
     passed: bool
@@ -26,7 +29,7 @@ class Report(Struct, frozen=True):
     written: str | None = None
     error: str | None = None
     withheld: str | None = None
-    """Why there is nothing for the file, whatever was found."""
+    """Why no finding applies to the configuration file, or None."""
 
 
 def report(
@@ -37,8 +40,11 @@ def report(
     error: str,
     withheld: str = "",
 ) -> Report:
-    """Put together; a board that never answered has not passed, nor one that was not looked at
-    to the end, or while this computer was late."""
+    """Return the report of a check.
+
+    A check has passed only if the board answered, every step was reached and judged, and none
+    failed.
+    """
     ended = not any(finding.name == REST for finding in findings)
     judged = ended and not lateness.unjudged(findings)
     passed = advice.answered(findings) and judged and not failed(findings)
@@ -56,12 +62,12 @@ def report(
 
 
 def failed(findings: Sequence[Finding]) -> bool:
-    """Something did."""
+    """Return whether any finding failed."""
     return any(finding.verdict == "FAIL" for finding in findings)
 
 
 def row(finding: Finding, colours: bool) -> str:
-    """A finding for people: verdict, name and figure, then what it means and the mend."""
+    """Return a finding as text: verdict, name and figure, then its meaning and its remedy."""
     mark = f"{finding.verdict:<7}"
     if colours:
         mark = f"\033[{COLOURS[finding.verdict]}m{mark}\033[0m"
@@ -73,7 +79,7 @@ def row(finding: Finding, colours: bool) -> str:
 
 
 def summary(found: Report, where: str) -> str:
-    """How many of each verdict, how many were not judged, and the lines for `where`."""
+    """Return the number of each verdict and of unjudged findings, and the lines for `where`."""
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in COLOURS if v in verdicts)
     if late := lateness.unjudged(found.findings):

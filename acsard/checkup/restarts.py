@@ -1,7 +1,8 @@
-"""Whether the board has started anew in the middle of the check, by what it says.
+"""Detects from the board's lines that it restarted during the check.
 
-Every figure of a step in which it did is wrong, and blames something else: cable, motor, watchdog.
-So the step is tried again (`procedure.py`), and what started the board anew is told at the end.
+A restart makes every figure of its step wrong and puts the blame elsewhere: on the cable, a motor
+or the watchdog. The step is therefore repeated (`procedure.py`), and the probable cause of the
+restarts is reported at the end.
 """
 
 from __future__ import annotations
@@ -22,45 +23,50 @@ from acsard.mcu.session import IDENTITY
 from acsard.values import AcsardError
 
 ASKED_S = 1.0
-"""So long after the question an identification is its answer."""
+"""Time after the question within which an identification is its answer, s."""
 
 UNANSWERED = 5
-"""Lines in a row without an answer, before a text is more than a debug print."""
+"""Number of unanswered lines in a row after which a text is more than a debug print."""
 
 AHEAD_S = 2.0
-"""The board's clock may run on by so much more than ours between two replies: lines that were held
-up on the way."""
+"""Time by which the board's clock may advance more than ours between two replies, s.
+
+Lines that were delayed on their way cause such differences.
+"""
 
 CLOCK = 65536
-"""ms after which the board's clock begins again."""
+"""Period of the board's clock, ms."""
 
 SILENT_S = 0.25
-"""A silence of ours that a watchdog may have taken for the host's end."""
+"""Silence of this host that a watchdog may take for the host's end, s."""
 
 CAUSES = {"power": "supply", "brown-out": "supply", "watchdog": "watchdog", "pin": "pin"}
-"""What our firmware says that it booted for -> the outcome; "unknown" is none."""
+"""Outcome for each cause that the reference firmware names after booting.
+
+"unknown" is not among them.
+"""
 
 _WORD = re.compile(rb"[a-z]{3}|[G-Z]{3}")
-"""In no reply, whole or damaged."""
+"""Pattern of a printed text. It occurs in no reply, whether whole or damaged."""
 
 _CAUSE = re.compile(rb" reset=([a-z-]{1,20})")
 
 
 class Restart(Struct, frozen=True):
-    """One new start of the board."""
+    """One restart of the board."""
 
     sign: str
-    """By what it was seen."""
+    """The observation that revealed the restart, in words."""
     turned: Motors = ZERO
-    """What the motors were told when it was heard last."""
+    """Speeds that the motors were told around the last reply before it, rad/s."""
     silent_s: float = 0.0
-    """For how long at the most this host had sent nothing since then."""
+    """Longest time since that reply for which this host had sent nothing, s."""
     cause: str = ""
-    """What the board says that it booted for, "" where it says nothing."""
+    """Cause of the restart as the board names it, or ""."""
 
 
 class RestartedError(AcsardError):
-    """The board has started anew: what was being measured is worth nothing."""
+    """Restart of the board, which makes the present measurement worthless."""
 
     def __init__(self, restart: Restart) -> None:
         super().__init__(restart.sign)
@@ -68,36 +74,42 @@ class RestartedError(AcsardError):
 
 
 class Restarts:
-    """Follows one opening of the line; times are s."""
+    """Detector of restarts since the port was opened. Times are in s."""
 
     def __init__(self) -> None:
         self.watched = True
-        """Someone wants to know."""
+        """Whether restarts are reported."""
         self._asked_s = self._turned_s = float("-inf")
         self._turned: Motors = ZERO
-        """The last speeds that were no zeros."""
+        """Last speeds that were not all zero, rad/s."""
         self._sent_s: float | None = None
         self._silent_s = 0.0
-        """The longest time between two lines of ours since it answered last."""
+        """Longest time between two of our lines since the last reply, s."""
         self._unanswered = 0
         self._replied_s: float | None = None
-        """None until it answers: what it says when it boots at the opening is no news."""
+        """Time of the last reply, s, or None before the first one.
+
+        Text that the board prints because opening the port reset it is not a restart.
+        """
         self._clock: tuple[int, float] | None = None
-        """Of the last reply that told it, ms, and when that came."""
+        """Clock of the last reply that contained it, ms, and the time when that arrived, s."""
 
     def asked(self, at_s: float) -> None:
-        """It is asked who it is."""
+        """Note that the identification was asked for."""
         self._asked_s = at_s
 
     def sent(self, motors: Motors, at_s: float) -> None:
-        """A line that says these speeds went out."""
+        """Note that a line with these speeds was sent."""
         self._unanswered += 1
         self._silent_s, self._sent_s = self._silence_s(at_s), at_s
         if any(motors):
             self._turned, self._turned_s = motors, at_s
 
     def look(self, line: bytes, at_s: float, reply: Reply | None) -> Restart | None:
-        """The new start that a line that came, a reply or none, shows; None where it shows none."""
+        """Return the restart that a received line shows, or None.
+
+        `reply` is its decoded form, or None.
+        """
         sign = ""
         if reply is not None:
             sign = self._clock_sign(reply)
@@ -129,20 +141,23 @@ class Restarts:
         if before is None:
             return ""
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
-        # Beyond half a minute without a reply it may have come round.
+        # If more than half a minute passed without a reply, the clock may have wrapped round.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
             return "its clock and its counts began again"
         return ""
 
 
 def cause(lines: Sequence[bytes]) -> str:
-    """What the board says in these that it booted for, "" where it does not; our firmware does."""
+    """Return the cause of a restart that these lines name, or "".
+
+    The reference firmware names it.
+    """
     said = [match[1].decode() for line in lines if (match := _CAUSE.search(line))]
     return said[-1] if said else ""
 
 
 def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> Finding:
-    """What started it anew, as far as these tell, which are not none; it is `back`, or not yet."""
+    """Return the finding for at least one restart. `back` says whether the board answers again."""
     each = Counter(_told(mcu, one) for one in restarts)
     seen: dict[str, object] = {
         "times": f"started anew{_times(len(restarts))}",
@@ -165,12 +180,12 @@ def _outcome(restarts: Sequence[Restart]) -> str:
 
 
 def _silent(restarts: Sequence[Restart]) -> bool:
-    """Each after a silence of ours: it takes more than one to tell."""
+    """Return whether each restart came after a silence of this host. One alone proves nothing."""
     return len(restarts) > 1 and all(one.silent_s >= SILENT_S for one in restarts)
 
 
 def _told(mcu: McuConfig, restart: Restart) -> tuple[str, str]:
-    """When it was, and by what it was seen."""
+    """Return when the restart happened and the observation that revealed it."""
     turned = [motor for motor in range(4) if restart.turned[motor]]
     when = f"{motor_names(mcu, turned, ', ')} turned" if turned else "everything stood"
     return when, restart.sign + (f" (reset={restart.cause})" if restart.cause else "")

@@ -1,6 +1,6 @@
-"""One motor at a time, forth and back, and the person at the robot asked what it was.
+"""Turns one motor at a time forth and back, and asks the operator which wheel turned.
 
-What it means is `wheels.py`'s.
+`wheels.py` judges the result.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from acsard.checkup.wheels import OFF, TOLERANCE, Channel
 from acsard.mcu.codec import LETTERS, Motors
 
 NEAR = 0.8
-"""Of what is off: a first look is no surer."""
+"""Fraction of `OFF` above which a speed is measured again.
+
+A first measurement is no more accurate.
+"""
 
 LOOK_S = 0.75 * limits.MOTOR_S
-"""Over so long the speed of a motor is taken that is off at first."""
+"""Time over which the speed is measured again, s."""
 
 LOOKS = 8
-"""Over so many looks the speed of an encoder is taken that is not steady before."""
+"""Number of measurements that are averaged at most while an encoder is not steady."""
 
 ANSWERS = {
     "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
@@ -31,19 +34,20 @@ ANSWERS = {
 
 
 def one(motor: int, speed: float) -> Motors:
-    """The command that turns one motor only."""
+    """Return the command that turns only this motor."""
     return motion.each(lambda index: speed if index == motor else 0.0)
 
 
 def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
     """Bring a motor to speed.
 
-    Each encoder's speed by then, and by which share this motor's may err: whole counts tell it.
+    Returns each encoder's speed, rad/s, and the fraction by which the measured speed may err
+    because encoder counts are whole numbers.
     """
     means = run_up(board, one(motor, speed))
     unsure = _unsure(board, motor, 2 * _look_s(board))
     if NEAR * OFF + unsure < abs(means[motor] / speed - 1) <= TOLERANCE:
-        # Weak, or a heavy one that is not there yet: a longer look tells.
+        # The motor is weak, or heavy and not yet at its speed. A longer measurement decides.
         board.drive(one(motor, speed), limits.MOTOR_S)
         means = motion.mean(motion.since(board.replies, board.now_s - LOOK_S))
         unsure = _unsure(board, motor, LOOK_S)
@@ -60,7 +64,7 @@ def _look_s(board: Board) -> float:
 
 
 def run_up(board: Board, motors: Motors) -> Motors:
-    """Ramp up and hold until the encoders show a steady speed; what they show."""
+    """Ramp up and hold until the encoders show a steady speed, which is returned in rad/s."""
     steps = max(1, int(limits.GLANCE_S / board.period_s))
     for step in range(1, steps + 1):
         a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
@@ -71,25 +75,25 @@ def run_up(board: Board, motors: Motors) -> Motors:
     while steady < 2 and board.now_s - began_s < _patience_s(board, told):
         board.drive(motors, look_s)
         looks += 1
-        # A coarse encoder needs more of them, a quick one is seen to be steady before.
+        # A coarse encoder needs more measurements; a fine one is steady sooner.
         last = min(LOOKS, max(1, looks - 1))
         means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
         near = [m for m in moving(means) if abs(abs(means[m]) / limits.SPEED - 1) < 0.4 * TOLERANCE]
         steady = steady + 1 if len(near) >= len(told) else 0
         if looks * look_s >= limits.CUT_S and not moving(means, limits.STANDING):
-            break  # not held for longer: a control loop without its encoder may be winding up
+            break  # do not hold it longer: a control loop without an encoder may be winding up
     return means
 
 
 def _patience_s(board: Board, told: list[int]) -> float:
-    """For how long motors are held: longer while one of them still speeds up."""
+    """Return how long motors are held, s: longer while one of them still speeds up."""
     shares = motion.trend(board.replies, board.now_s, board.gap_s)
     rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
     return limits.PATIENCE_S if rises else limits.MOTOR_S
 
 
 def channel(board: Board, motor: int) -> Channel:
-    """Turn one forth and back."""
+    """Turn a motor forth and back."""
     found = _both_ways(board, motor)
     if motor == 3 and found.kind == "dead" and not board.latched:
         found = _with_other_comma(board, found)
@@ -97,7 +101,10 @@ def channel(board: Board, motor: int) -> Channel:
 
 
 def _both_ways(board: Board, motor: int) -> Channel:
-    """What a motor does, turned no further than its own encoder follows; it stands afterwards."""
+    """Return the movement of a motor, which turns only as far as its own encoder follows.
+
+    It stands afterwards.
+    """
     shown = probe(board, motor)
     if shown is not None:
         return Channel(motor, shown, ZERO, probed=True)
@@ -113,18 +120,20 @@ def _both_ways(board: Board, motor: int) -> Channel:
 
 
 def probe(board: Board, motor: int) -> Motors | None:
-    """Turn a motor slowly and shortly; None when its own encoder follows, and it turns on.
+    """Turn a motor slowly and briefly.
 
-    Else what the encoders showed of it, in rad/s. It is so short that a motor without a working
-    encoder, which the firmware may drive up to full speed, does not get far. A second try is for
-    coarse encoders: they may need more to show anything, and one count back is nothing yet.
+    Returns None if its own encoder follows; the motor then keeps turning. Otherwise returns the
+    speeds that the encoders showed, rad/s. The probe is so short that a motor without a working
+    encoder, which the firmware may drive to full speed, does not get far. A second try is for
+    coarse encoders: they may need more movement to show anything, and a single count backwards
+    proves nothing.
     """
     began_s = board.now_s
     shown = _probe(board, motor, limits.SPEED / 2)
     own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
     seen = [speed for speed in own if speed]
     if shown is None or (len(seen) >= 3 and max(seen) < 0):
-        return shown  # no need to drive a reversed one away twice
+        return shown  # a reversed motor need not run away twice
     if not moving(shown, limits.PROBE_MOVES):
         return _probe(board, motor, limits.SPEED)
     again = _probe(board, motor, limits.SPEED / 2)
@@ -136,7 +145,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
     began_s = board.now_s
 
     def shown() -> Motors:
-        """The angles over the probe's time, without what a wheel may still have coasted."""
+        """Return each angle, less the possible coasting, divided by the probe's time, rad/s."""
         seconds = board.now_s - began_s
         ran = motion.covered(board.replies, began_s)
         sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
@@ -148,8 +157,8 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
         own = shown()[motor]
     if own >= limits.PROBE_MOVES:
         return None
-    # The firmware may regulate zeros into a runaway, and its watchdog cuts the motor; one that was
-    # seen to turn must stand before the next zeros are regulated.
+    # The firmware may drive a motor to full speed on zeros until its watchdog cuts it. A motor that
+    # was seen to turn must stand before the next zeros are sent.
     moved = moving(shown(), limits.PROBE_MOVES)
     board.let_go(limits.STOOD_S if moved else limits.CUT_S)
     board.rest()
@@ -158,7 +167,7 @@ def _probe(board: Board, motor: int, speed: float) -> Motors | None:
 
 
 def _with_other_comma(board: Board, dead: Channel) -> Channel:
-    """The last motor does nothing: does it with the comma at the line's end turned round?"""
+    """Try the other form of the comma at the line's end on a last motor that does nothing."""
     configured, board.comma = board.comma, not board.comma
     channel = _both_ways(board, dead.motor)
     if channel.probed or dead.motor not in moving(channel.forth):
@@ -171,7 +180,7 @@ def _with_other_comma(board: Board, dead: Channel) -> Channel:
 
 
 def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
-    """Ask the person which wheel it was; the wheels stand by now."""
+    """Ask the operator which wheel turned. The wheels stand by now."""
     question = (
         f"which wheel did motor {LETTERS[channel.motor]} turn? front right, front left, "
         "rear left, rear right, none; or show it again"

@@ -1,11 +1,13 @@
-"""The microcontroller's own last safety: does it stop the motors when the host falls silent?
+"""Tests whether the microcontroller stops the motors by itself when the host falls silent.
 
-And when what it hears is no line: a watchdog that any byte feeds is none on a half-broken cable.
+It must also stop them if it receives only damaged lines: a watchdog that any byte feeds is useless
+with a half-broken cable.
 
-One experiment finds it out: motors at speed, silence (or broken lines) for so long, then zeros.
-How far they ran on, less what they run out after an ordinary stop, is the watchdog's time; the
-replies' speeds and counts tell it. Firmware that answers when spoken to, with speeds of the moment,
-does not say how far: it is asked after silences of different lengths whether it was still turning.
+There is one experiment: motors at speed, then silence (or damaged lines) for some time, then zeros.
+The watchdog's time is how far the motors ran on, minus how far they run after an ordinary stop. The
+speeds and counts in the replies show the distance. Firmware that answers only when asked, with
+momentary speeds, does not show it. It is asked after silences of different lengths whether the
+motors were still turning.
 """
 
 from __future__ import annotations
@@ -25,46 +27,60 @@ from acsard.config.wire_time import FIELD
 from acsard.mcu.codec import LETTERS, Motors
 
 FED = 0.75
-"""Of the full speed, over all of that time: a watchdog that is right leaves less."""
+"""Fraction of the travel at full speed from which on damaged lines feed the watchdog.
+
+With a correct watchdog, the motors travel less in the same time.
+"""
 
 FEEDING = ("a wrong letter", "neither p nor n", "cut short")
-"""Broken lines that a watchdog may be fed by."""
+"""Kinds of damaged lines that may feed a watchdog."""
 
 FINE_S = 0.03
-"""How finely it is found by asking."""
+"""Resolution of the search by asking, s."""
 
 MOST_ASKED = 8
-"""How often; each halves what is left, unless the host pauses."""
+"""Largest number of questions. Each one halves the interval, unless the host pauses."""
 
 TURNING, STOPPED = 0.9, 0.1
-"""Shares of the full speed: from here on it has not slowed down; below, it stands."""
+"""Fractions of full speed.
+
+From `TURNING` on the motors have not slowed down, and below `STOPPED` they stand.
+"""
 
 UNKNOWN = math.inf
 
 Between = tuple[float, float]
-"""How long the motors ran on after the last line, s: at the least and at the most."""
+"""Time for which the motors ran on after the last line, s: lower and upper bound."""
 
 
 class Run(Struct, frozen=True):
-    """What was seen of the motors from the last line that told them to turn, or from the zeros
-    where these came at once; in s at full speed, and in shares of it."""
+    """The motors' behaviour after the last line that turned them, or after a plain stop.
+
+    Distances are in s at full speed, and speeds are fractions of full speed.
+    """
 
     silent_s: float
     ran_s: float
-    """The one that ran the longest, its run-out with it."""
+    """Distance of the motor that ran on the longest, including its run-out, s at full speed."""
     slow_s: float
-    """When they had nearly stopped."""
+    """Time until the motors had nearly stopped, s."""
     first: float
-    """Of the first reply after the silence: of all of it where the firmware takes speeds from one
-    line to the next; of the moment where it measures by its own clock."""
+    """Speed in the first reply after the silence, as a fraction.
+
+    It is the mean over the silence if the firmware computes speeds from line to line, and the
+    momentary speed if it measures by its own clock.
+    """
     second: float
-    """Of the moment after; a quick motor has obeyed the first zero by then."""
+    """Speed in the reply after that, as a fraction.
+
+    A quick motor has obeyed the first zero by then.
+    """
     grain_s: float
-    """How long a motor takes for what its speeds jump by: it cannot be told finer."""
+    """Resolution, s: the time in which a motor turns by one jump of its readings."""
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:
-    """Measure it with these motors, which turn as told; they stand again afterwards."""
+    """Measure the watchdog with motors that turn as commanded. They stand again afterwards."""
     if not motors:
         return manual.find("watchdog: untested")
     stop = run(board, motors, 0.0)
@@ -76,7 +92,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(limits.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= FED * fed.silent_s:
-        beyond_s = fed.ran_s - stop.ran_s - most_s  # one that is not fed had cut them by then
+        # A watchdog that was not fed had cut them by then.
+        beyond_s = fed.ran_s - stop.ran_s - most_s
         return manual.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
 
@@ -86,7 +103,8 @@ def _judged(least_s: float, most_s: float) -> Finding:
         return manual.find("watchdog: none", seconds=least_s)
     middle_s, half_s = (least_s + most_s) / 2, (most_s - least_s) / 2
     figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
-    least_s, most_s = round(least_s, 2), round(most_s, 2)  # it is measured no finer
+    # The measurement is no more accurate than this.
+    least_s, most_s = round(least_s, 2), round(most_s, 2)
     if least_s > limits.WATCHDOG_MOST_S:
         outcome = "late"
     elif most_s < limits.WATCHDOG_LEAST_S:
@@ -100,7 +118,7 @@ def _judged(least_s: float, most_s: float) -> Finding:
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
-    """How long these motors, which turn as told and `stop` so, run on in a silence."""
+    """Return how long these motors run on in a silence. `stop` is their ordinary stop."""
     least_s = 0.0
     for length_s in (limits.CUT_S + stop.slow_s, limits.STOOD_S + stop.slow_s):
         found = run(board, motors, length_s)
@@ -118,7 +136,7 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 
 
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
-    """Between two silences: one that they turn through, and one that they do not."""
+    """Narrow the bounds between a silence that the motors turn through and one that they do not."""
     least_s, most_s = between
     for _ in range(MOST_ASKED):
         if most_s - least_s <= max(FINE_S, 0.1 * most_s):
@@ -128,14 +146,17 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
             least_s = max(least_s, answer.silent_s)
         else:
             most_s = min(most_s, answer.silent_s)
-    # The reply that tells is of a moment after the silence, as the ordinary stop's is.
+    # The deciding reply describes a moment after the silence, as that of the ordinary stop does.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
     most_s -= stop.slow_s - board.period_s - limits.PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
 
 
 def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[bytes] = ()) -> Run:
-    """Bring the motors to speed, say nothing for so long (or something else instead), and stop."""
+    """Bring the motors to speed, be silent for `length_s` s, and stop them.
+
+    During that time, the lines `instead` are sent if there are any.
+    """
     began_s = board.now_s
     full = run_up(board, command(motors))
     if max(abs(full[motor]) for motor in motors) < limits.SPEED / 2:
@@ -158,7 +179,7 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     slow_s = next(
         (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), limits.PATIENCE_S
     )
-    # The reply to the last line has what was measured when it took effect.
+    # The reply to the last line contains a measurement from the time when that line took effect.
     answered = not board.own_clock and course[0].at_s < told_s + limits.PERIOD_S + 2 * board.gap_s
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
@@ -167,17 +188,20 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
 
 
 def command(motors: Sequence[int]) -> Motors:
-    """All of these at once."""
+    """Return the command that turns all of these motors."""
     return motion.each(lambda motor: limits.SPEED if motor in motors else 0.0)
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
-    """Counts that tell how far they ran; 0 where they stand, or can wrap in the longest silence."""
+    """Return the counts per turn that can be used for distances.
+
+    Returns 0 if the counts stand, or if they can wrap round during the longest silence.
+    """
     per_turn = counts.per_turn(board.replies, motors) or 0.0
     wraps = per_turn * limits.RUNAWAY / math.tau * limits.STOOD_S >= FIELD / 2
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 
 def _share(reply: Reply, motors: Sequence[int]) -> float:
-    """The fastest of these motors, as a share of the speed they were told."""
+    """Return the speed of the fastest of these motors as a fraction of the commanded speed."""
     return max(abs(reply.motors[motor]) for motor in motors) / limits.SPEED

@@ -1,6 +1,6 @@
-"""What the motors did, judged: each channel's motor and encoder, and which wheel it is.
+"""Judges the motors' behaviour: motor and encoder of each channel, and its wheel.
 
-Plain functions of what was seen; `turning.py` does the turning.
+These are plain functions of the measurements; `turning.py` turns the motors.
 """
 
 from __future__ import annotations
@@ -19,41 +19,47 @@ from acsard.mcu.codec import LETTERS, Motors
 from acsard.values import WHEELS
 
 TOLERANCE = 0.25
-"""By which share the encoder's speed may differ from the command, and pass for this motor's."""
+"""Largest relative error of an encoder's speed that still belongs to the motor."""
 
 OFF = 0.05
-"""By which share it may differ on a sound robot."""
+"""Largest relative error of the speed on a sound robot."""
 
 Kind = Literal["right", "reversed", "dead", "other", "several", "one way", "size", "off", "late"]
 
 
 class Channel(Struct, frozen=True):
-    """What motor `motor` did: each encoder's speed while told forth (p) and back (n)."""
+    """Behaviour of one motor: each encoder's speed while told forth (p) and back (n), rad/s."""
 
     motor: int
     forth: Motors
     back: Motors
     wheel: str | None = None
-    """Which wheel a person saw turn, "" for none; None: nobody looked."""
+    """Wheel that the operator saw turn, "" for none, or None if no person watched."""
     forward: bool = True
-    """It turned forward first, as seen by a person."""
+    """Whether the operator saw the wheel turn forward first."""
     probed: bool = False
-    """Its own encoder did not follow a short probe: it was not turned further, and not back."""
+    """Whether its own encoder did not follow a short probe.
+
+    The motor was then not turned further.
+    """
     unsure: float = 0.0
-    """By which share the speeds may err: counts of a coarse encoder."""
+    """Fraction by which the speeds may err because of a coarse encoder."""
     judged: bool = True
-    """This computer was in time; else nothing here is the motor's doing for certain."""
+    """Whether this computer was in time.
+
+    If not, nothing here is certain to be the motor's behaviour.
+    """
 
     @property
     def moved(self) -> list[int]:
-        """The encoders that moved."""
+        """Encoders that moved."""
         if not self.probed:
             return moving(self.forth) or moving(self.back)
         return moving(self.forth, max(PROBE_MOVES, max(map(abs, self.forth)) / 4))
 
     @property
     def kind(self) -> Kind:
-        """What the encoders say."""
+        """Judgement that the encoders allow."""
         if not self.judged:
             return "late"
         moved, own = self.moved, self.motor
@@ -73,17 +79,18 @@ class Channel(Struct, frozen=True):
 
     @property
     def error(self) -> float:
-        """By which share of its command the own encoder's speed is off, the worse of both ways."""
+        """Fraction by which its own encoder's speed is off the command, in the worse direction."""
         own = self.motor
         return max(abs(self.forth[own] / SPEED - 1), abs(self.back[own] / SPEED + 1))
 
 
 def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
-    """What motor and encoder of one channel say of each other."""
+    """Judge motor and encoder of one channel."""
     motor, moved = channel.motor, channel.moved
     forth, back = channel.forth[motor], channel.back[motor]
     there = moved[0] if moved else motor
-    # As if it had stood while this computer was late, in half of the looks.
+    # Lateness that would explain the error: the motor would have seemed to stand meanwhile, in half
+    # of the measurements.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
     return manual.find(
         f"motor: {channel.kind}{_whose(mcu, channel)}",
@@ -103,7 +110,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
 
 
 def _whose(mcu: McuConfig, channel: Channel) -> str:
-    """Whose fault it is, as the one who saw the wheel can tell."""
+    """Return the part that is at fault, as far as the operator's observation shows it."""
     wheel, sign = wheel_of(mcu, channel.motor)
     seen = channel.wheel
     match channel.kind:
@@ -122,7 +129,10 @@ def _whose(mcu: McuConfig, channel: Channel) -> str:
 
 
 def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
-    """`[mcu.wheels]` as a person saw it; channels to be mended first keep their entry."""
+    """Judge `[mcu.wheels]` by the operator's observations.
+
+    Channels that have to be repaired first keep their configured entry.
+    """
     if any(channel.wheel is None for channel in found):
         return manual.find("wheel map: not seen")
     entries: dict[str, str] = {}

@@ -1,6 +1,7 @@
-"""The command line: one verb per file, each with `add` (its options) and `main` (its work).
+"""The command line: one module per verb, each with `add` (its options) and `main` (its work).
 
-Only the verb that is called is imported, and what is heavy inside its `main`.
+The parser imports only the module of the verb that is called. Each `main` imports heavy libraries
+itself, so that `--help` stays fast.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ VERBS = (
     "service",
     "completion",
 )
-"""Each is the module of its name in here, in the order of the help."""
+"""The verbs in the order of the help text. Each one is the name of a module of this package."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable, 75 port,
@@ -67,7 +68,7 @@ try:  acsard run                (the robot, on the built-in simulator)
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what was probably meant, for verbs and all that is one of a few."""
+    """An argument parser that suggests the nearest known word for a misspelt verb or choice."""
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
         try:
@@ -80,7 +81,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parser(names: Sequence[str] = VERBS) -> argparse.ArgumentParser:
-    """These verbs with their options."""
+    """Return the parser of the `acsard` command with these verbs."""
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot: serial "
@@ -96,7 +97,7 @@ def parser(names: Sequence[str] = VERBS) -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point of the `acsard` command; returns the exit code."""
+    """Run the `acsard` command and return its exit code."""
     words = [_decimal(word) for word in (sys.argv[1:] if argv is None else argv)]
     known = {"-h", "--help", "--version"}
     if not words or (words[0].startswith("-") and words[0] not in known):
@@ -113,7 +114,8 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         if not isinstance(error, BrokenPipeError) and error.errno != errno.ENOSPC:
             raise
-        # The reader (head, less) has left, or there is no room: nobody to tell.
+        # The program that reads our output (head, less) has ended, or the disk is full, so a
+        # message could not be printed either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
@@ -121,7 +123,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _needed(word: str) -> Sequence[str]:
-    """The verbs to import for this first word: for a verb only itself."""
+    """Return the verbs to import for this first word: only the verb itself if it is a verb."""
     if word == "--version":
         return ()
     return (word,) if word in VERBS else VERBS
@@ -131,40 +133,43 @@ _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")
 
 
 def _decimal(word: str) -> str:
-    """A negative number without its exponent, with which argparse takes it for an option."""
+    """Rewrite a negative number without its exponent: argparse takes `-1e-3` for an option."""
     return f"{Decimal(word):f}" if _EXPONENT.fullmatch(word) else word
 
 
 def entry() -> NoReturn:
-    """What the `acsard` script runs: `main`, and an end that nothing can hold up.
+    """Run `main` and end the process at once: the entry point of the `acsard` script.
 
-    Zenoh's threads may still be calling into Python while the interpreter takes itself apart,
-    which aborts the process; all that matters has been closed and flushed by now.
+    The process ends with `os._exit`. Zenoh's threads may still call into Python while the
+    interpreter shuts down, which would abort the process. Everything that matters has been closed
+    and flushed by then.
     """
     _fill_closed_streams()
     try:
         code = main()
-    except SystemExit as end:  # argparse: --help, --version, usage
+    except SystemExit as end:  # argparse ends this way after --help, --version and usage errors
         code = end.code if isinstance(end.code, int) else int(Exit.FAILURE)
-    except BaseException:  # noqa: BLE001 - what Python would do with it, then the same end
+    except BaseException:  # noqa: BLE001 - print the traceback as Python would, then end in the same way
         traceback.print_exc()
         code = int(Exit.FAILURE)
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except (OSError, ValueError):
-            pass  # closed, or full
+            pass  # the stream is closed, or its disk is full
     os._exit(code)
 
 
 def _fill_closed_streams() -> None:
-    """Open /dev/null where a standard stream is closed, or the serial port would take its number.
+    """Open /dev/null in the place of each standard stream that is closed.
 
-    Then whatever prints would write to the motors.
+    Without this, the serial port would get the number of the closed stream, and printed text would
+    go to the motors.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # the lowest free number, which is this one
+            # The kernel gives the lowest free number, which is this one.
+            os.open(os.devnull, os.O_RDWR)
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))

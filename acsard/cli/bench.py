@@ -1,4 +1,4 @@
-"""`acsard bench`: how fast is it on this machine?"""
+"""`acsard bench`: measure how fast the daemon is on this machine."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ daemon first.
 """
 
 LONGEST_S = 600.0
-"""Every sample is kept to the end: at 100 Hz 60 MB of them in this time."""
+"""Longest measurement, s. Every sample stays in memory to the end: 60 MB at 100 Hz in this time."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "bench",
         help="measure how fast it is on this machine",
@@ -56,7 +56,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def duration(text: str) -> float:
-    """An argparse type: seconds, at least one, and not more than memory holds the samples of."""
+    """Return the number of seconds: an argparse type.
+
+    Raises `ArgumentTypeError` below 1 s, and above the time whose samples fit into memory.
+    """
     value = float(text)
     if not 1.0 <= value <= LONGEST_S:
         raise argparse.ArgumentTypeError(f"{text} is not from 1 to {LONGEST_S:g} s")
@@ -64,7 +67,7 @@ def duration(text: str) -> float:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Measure and print."""
+    """Run the measurement and print its figures."""
     import signal
 
     import msgspec
@@ -79,7 +82,7 @@ def main(args: argparse.Namespace) -> int:
         require(port)
     given: Overrides = {"control": {"rate": args.rate}} if args.rate is not None else {}
     _, config = load(args.config, given)
-    # Whoever ends us, the daemon and the far end must not stay behind.
+    # However this process is ended, the daemon and the far end of the port must end with it.
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     result = measure(bench_config(config, simulated=not port), port, args.seconds)

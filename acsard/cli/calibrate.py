@@ -1,6 +1,6 @@
-"""`acsard calibrate`: wheel radii and effective track, from a guided drive or a recorded one.
+"""`acsard calibrate`: find wheel radii and effective track from a guided or a recorded drive.
 
-How they are found is `calibration/`'s; the guided drive is in `calibrate_drive.py`.
+The package `calibration` computes them; `calibrate_drive.py` runs the guided drive.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ more. Exit 0 when something was found, 1 when not, with what to do instead.
 """
 
 DRIVEN = "the drive"
-"""What a guided drive is called where a log has its name."""
+"""The name of a guided drive in messages and reports, where a log has its file name."""
 
 MOST_BYTES = 1 << 30
-"""Of a log: it is read into memory."""
+"""Largest log in bytes. The whole log is read into memory."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "calibrate",
         help="wheel radii and effective track, by a guided drive or from a recorded one",
@@ -76,7 +76,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Calibrate and tell."""
+    """Run the calibration and print its result."""
     if not args.json_lines or args.log:
         return _calibrate(args, None)
     if args.yes:
@@ -126,7 +126,10 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
 
 
 def _only_log(args: argparse.Namespace) -> Path:
-    """The log; raises `UsageError` for what only a drive takes."""
+    """Return the log's path.
+
+    Raises `UsageError` if an option was given that only a guided drive takes.
+    """
     for name in DRIVE_OPTIONS:
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
@@ -171,7 +174,10 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
 
 
 def _measured(log: Path) -> bytes:
-    """The table of a recording of ours; raises `LogError` for what is none, or has no gyro."""
+    """Return the measurements of a black-box recording as a CSV table.
+
+    Raises `LogError` if the file is not a recording or if the recording has no gyro.
+    """
     from acsard.calibration.table import AS_CSV, LogError
     from acsard.host.errors import RecordingError
     from acsard.record.export import measured

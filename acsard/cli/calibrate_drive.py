@@ -1,4 +1,4 @@
-"""`acsard calibrate` without a log: a guided drive, from the first question to the result."""
+"""`acsard calibrate` without a log: the guided drive, from the first question to the result."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
 
 IMU = "imu"
-"""The gyro's key where none is given."""
+"""The gyro's key if the command line names none."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """What only a guided drive takes."""
+    """Add the options that only a guided drive takes."""
     parser.add_argument(
         "--way",
         choices=tuple(NEEDS),
@@ -64,8 +64,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def guided(
     args: argparse.Namespace, config: Config, where: str, lines: JsonAttendant | None
 ) -> tuple[Calibration, Config]:
-    """What was found, and the configuration of the robot it was found for. Raises `GuideError`,
-    `LogError` and `RefusedError`; a key and Ctrl-C end it with zeros."""
+    """Drive the robot and return the calibration with the configuration that the robot runs with.
+
+    A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
+    `RefusedError`.
+    """
     from acsard.bus.address import address_of
     from acsard.calibration.guided.setup import setup
     from acsard.calibration.guided.steps import GuideError
@@ -121,7 +124,10 @@ def _usable(args: argparse.Namespace, odometry: str) -> None:
 
 
 def _may(args: argparse.Namespace, *, simulated: bool) -> None:
-    """Nothing real moves without a person."""
+    """Raise `UsageError` if `--yes` is given for a real robot.
+
+    A person must stand beside a real robot and start each leg.
+    """
     if args.yes and not simulated:
         raise UsageError(
             "--yes is for the built-in simulator: this robot is real, and somebody has to stand "
@@ -130,7 +136,10 @@ def _may(args: argparse.Namespace, *, simulated: bool) -> None:
 
 
 def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Config:
-    """The configuration the daemon runs with."""
+    """Return the configuration that the daemon runs with.
+
+    Raises `GuideError` if the result is to be written to a file that differs from it.
+    """
     import msgspec
 
     from acsard.calibration.guided.steps import GuideError
@@ -143,8 +152,12 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
 
 
 def differing(config: Config, mine: Config, where: str) -> str:
-    """Why what is found with this configuration does not belong into the file `where`, which says
-    `mine`; "" when it does."""
+    """Return why a result for `config` does not belong into the file `where`, or "" if it does.
+
+    Args:
+        config: the configuration that the daemon runs with.
+        mine: the configuration in the file `where`.
+    """
     same = config.drive.wheel_radius, config.drive.wheel_separation
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
         return ""
@@ -184,7 +197,7 @@ def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterato
 
 
 def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Session | None:
-    """A session of its own for positions that the daemon does not have."""
+    """Return a separate session for positions that the daemon does not publish, or None."""
     if not args.positions_at:
         return None
     from acsard.bus.session import client_session

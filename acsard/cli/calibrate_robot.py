@@ -1,6 +1,6 @@
-"""The robot on the bus while it is calibrated: a leg is driven, and what was told of it recorded.
+"""The robot on the bus during a calibration: it drives legs, and its messages are recorded.
 
-What is decided on the way is `calibration/guided/riding.py`'s.
+`calibration/guided/riding.py` decides which command to send.
 """
 
 from __future__ import annotations
@@ -27,25 +27,34 @@ from acsard.messages.topics import by_key
 SOURCE = "app"
 
 LOOK_S = 0.005
-"""Between two looks at keys and messages: so late a key stops it at most."""
+"""Period in which keys and messages are polled, s.
+
+A key press stops the robot at most this much later.
+"""
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Zeros come closer at first: the daemon learns by them how late we are."""
+"""Duration of the opening and the period of its zeros, s.
+
+The daemon measures the delay of this sender with the zeros.
+"""
 
 ZEROS = 3
 SHOWN_S = 0.2
 
 FIRST_S = 3.0
-"""For the first sample of a sensor."""
+"""Time allowed for the first sample of a sensor, s."""
 
 POSITIONS = (Odometry, PoseStamped)
-"""In this order: CDR says no type, and what is too short for odometry is a pose."""
+"""Types of a position message, in the order of decoding attempts.
+
+CDR does not name its type, and a payload that is too short for odometry is a pose.
+"""
 
 Take = Callable[[Any, float], object]
 
 
 class Sensor:
-    """What one key says, decoded as the first type that fits."""
+    """The messages of one key, decoded as the first of `types` that fits."""
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
@@ -53,7 +62,10 @@ class Sensor:
         self._decoders: list[Decoder[Any]] = [Decoder(one) for one in types]
 
     def hear(self, take: Take, now: float) -> int:
-        """Hand over what has come; how many samples. Raises `GuideError` for what is none."""
+        """Pass every message that has arrived to `take` and return their number.
+
+        Raises `GuideError` if a message cannot be decoded.
+        """
         count = 0
         while (sample := self._samples.try_recv()) is not None:
             take(self._decoded(sample), now)
@@ -61,7 +73,7 @@ class Sensor:
         return count
 
     def await_first(self, what: str) -> None:
-        """Raises `GuideError` when nothing comes."""
+        """Wait for the first message. Raises `GuideError` if none arrives within `FIRST_S`."""
         end = time.monotonic() + FIRST_S
         while not self.hear(lambda message, now: None, 0.0):
             if time.monotonic() > end:
@@ -82,7 +94,7 @@ class Sensor:
 
 
 class Robot:
-    """A robot that drives legs."""
+    """The robot on the bus: sends the commands of a leg and records the sensors meanwhile."""
 
     def __init__(self, client: Client, config: Config, attendant: Attendant) -> None:
         self._client, self._attendant = client, attendant
@@ -92,19 +104,22 @@ class Robot:
         self._states = self._own("state", RobotState)
 
     def gyro(self, key: str) -> None:
-        """Record turn rates of a key; raises `GuideError` when none come."""
+        """Record turn rates from a key. Raises `GuideError` if none arrive."""
         sensor = Sensor(self._client.session, self._full(key), (Imu,))
         sensor.await_first("a gyro's turn rate")
         self._sensors.append((sensor, "gyro"))
 
     def positions(self, key: str, session: zenoh.Session | None) -> None:
-        """The same for positions."""
+        """Record positions from a key, by `session` if it is given.
+
+        Raises `GuideError` if none arrive.
+        """
         sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
         sensor.await_first("a position (PoseStamped or Odometry)")
         self._sensors.append((sensor, "place"))
 
     def ride(self, leg: Leg) -> Run:
-        """Drive it; raises `GuideError` when it ends before its end."""
+        """Drive a leg and return its recording. Raises `GuideError` if the leg is cut short."""
         recorder = Recorder(self._joints)
         self._drain()
         sender = self._client.sender
@@ -147,7 +162,7 @@ class Robot:
             sensor.hear(getattr(recorder, name), now)
 
     def _drain(self) -> None:
-        """What came before is of no leg."""
+        """Discard the messages that arrived before the leg."""
         for sensor in (self._wheels, self._states, *(one for one, _ in self._sensors)):
             sensor.hear(lambda message, now: None, 0.0)
 
@@ -155,5 +170,5 @@ class Robot:
         return Sensor(self._client.session, self._client.key(name), (cls,))
 
     def _full(self, key: str) -> str:
-        """A key of the table is this robot's; any other is as it is written."""
+        """Return a key of the table below this robot's id, and any other key as it is written."""
         return self._client.key(key) if by_key(key) is not None else key

@@ -1,4 +1,4 @@
-"""`acsard call <service>`: stop, clear, activate, …"""
+"""`acsard call <service>`: call a service of the robot, such as stop, clear or activate."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ from acsard.messages.topics import SERVICES
 if TYPE_CHECKING:
     from acsard.client import Client
 CALLED = tuple(service for service in SERVICES if service != "set")
-"""`acsard set` calls that one, and knows what can be set."""
+"""The services of this verb.
+
+`set` is missing because `acsard set` calls it and knows the settings.
+"""
 
 
 MOST_AT_ONCE = 32
-"""Robots that are waited for at the same time."""
+"""Number of robots that are called at the same time."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "call",
         help="call a service: " + ", ".join(CALLED),
@@ -31,7 +34,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument(
         "service",
-        type=lambda word: word.removeprefix("srv/"),  # as `state` and the key table name it
+        # Accept `srv/stop` too, as `state` and the key table write it.
+        type=lambda word: word.removeprefix("srv/"),
         choices=CALLED,
         metavar="SERVICE",
         help=", ".join(CALLED),
@@ -45,7 +49,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Call and print."""
+    """Call the service and print its answer."""
     from acsard.client import connect
     from acsard.host.errors import UsageError
     from acsard.messages.encodings import encode
@@ -67,7 +71,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
-    """Why a service does not go to these robots at once, and what to type instead."""
+    """Return why a service cannot go to several robots at once, and what to type instead."""
     typed = " ".join(["acsard call", service, *(f"{value:g}" for value in values), "--id"])
     each = [one for one in ids if one != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
@@ -78,7 +82,10 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
 
 
 def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bool) -> int:
-    """Stop them all at once, by their exact keys; say who answered what, and who did not."""
+    """Stop all these robots at once by their exact keys, and print each robot's answer.
+
+    Returns the exit code: `UNREACHABLE` if any robot did not answer.
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from acsard.bus import fleet
@@ -88,14 +95,14 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     from acsard.messages.schema import ServiceReply
     from acsard.values import AcsardError
 
-    # Who is named is told to stop, there or not: nobody waits to find that out first.
+    # Send the stop to every named robot first. Finding out which robots are present would delay it.
     fleet.stop(robot.session, ids, robot.caller)
     wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
 
     def stop(one: str) -> ServiceReply | AcsardError:
         try:
             return robot.like(one).call("stop")
-        except AcsardError as error:  # or it has answered what nobody understands
+        except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
             return error
 
     with ThreadPoolExecutor(min(len(wanted), MOST_AT_ONCE)) as calls:

@@ -1,4 +1,4 @@
-"""`acsard check`: the effective configuration, or everything that is wrong with it."""
+"""`acsard check`: print the effective configuration, or every problem in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from acsard.cli.common import add_config, load
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "check",
         help="check the configuration and print the effective one",
@@ -22,7 +22,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Check and print."""
+    """Check the configuration and print it."""
     import msgspec
 
     from acsard.config.contradictions import warnings

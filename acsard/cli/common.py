@@ -1,4 +1,4 @@
-"""What several verbs share: reading the configuration, and the options of the bus tools."""
+"""Shared by the verbs: loading the configuration, and the options of tools that use the bus."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Overrides = dict[str, dict[str, object]]
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
-    """The option every verb has."""
+    """Add `--config`, which nearly every verb takes."""
     parser.add_argument(
         "--config",
         metavar="FILE",
@@ -40,7 +40,12 @@ MANY = "; several with commas, or '*' for all there are"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """The options of the tools that talk to a running daemon; `more` on `--id`."""
+    """Add the options of the tools that talk to a running daemon.
+
+    Args:
+        parser: the parser of the verb.
+        more: text that is appended to the help of `--id`.
+    """
     add_config(parser)
     parser.add_argument(
         "--connect", metavar="ENDPOINT", help="where the daemon listens, e.g. tcp/127.0.0.1:7448"
@@ -54,7 +59,7 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
 
 
 def count(text: str) -> int:
-    """An argparse type: a whole number of at least 1."""
+    """Return a whole number of at least 1: an argparse type."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
@@ -62,12 +67,18 @@ def count(text: str) -> int:
 
 
 def by_environment() -> Overrides:
-    """What the environment says of it: where systemd puts the credentials of a service, say."""
+    """Return the configuration keys that the environment sets.
+
+    `ACSARD_TLS` sets `bus.tls`: for example, systemd puts a service's credentials there.
+    """
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
 
 def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
-    """Where the configuration is and the configuration; raises `ExitError` with every problem."""
+    """Return the path of the configuration and the configuration itself.
+
+    Prints every problem in it and raises `ExitError` if there are any.
+    """
     where, text = find(path)
     given = dict(overrides or {})
     given["bus"] = {**by_environment().get("bus", {}), **given.get("bus", {})}
@@ -83,9 +94,10 @@ def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Con
 
 
 def recorded(config: Config) -> Config:
-    """Where nothing else says where it is recorded, the environment does: the service's units.
+    """Fill in the recording directory from the environment if the configuration names none.
 
-    The whole path: who reads it on the bus may stand elsewhere.
+    The units of the service set this variable. The path is made absolute, because a client that
+    reads it on the bus may run in another directory.
     """
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""
@@ -93,9 +105,9 @@ def recorded(config: Config) -> Config:
 
 
 def robot_address(args: argparse.Namespace) -> Address:
-    """Where the robot is that a tool talks to: the options, else the configuration.
+    """Return the address of one robot from the options, or else from the configuration.
 
-    Raises `UsageError` for an `--id` that names many.
+    Raises `UsageError` if `--id` names several robots.
     """
     require_one(args)
     _, config = load(args.config)
@@ -103,7 +115,7 @@ def robot_address(args: argparse.Namespace) -> Address:
 
 
 def require_one(args: argparse.Namespace) -> None:
-    """Raises `UsageError` for an `--id` that names many."""
+    """Raise `UsageError` if `--id` names several robots."""
     from acsard.bus.fleet import named
 
     if named(args.id or ""):
@@ -114,7 +126,10 @@ def require_one(args: argparse.Namespace) -> None:
 
 
 def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
-    """`robot_address`, and the ids where `--id` names many: `("*",)` for all, () for one robot."""
+    """Return the address as `robot_address` does, and the ids if `--id` names several robots.
+
+    The ids are `("*",)` for all robots and `()` for a single robot.
+    """
     from acsard.bus.fleet import named
 
     many = named(args.id or "")
@@ -123,7 +138,7 @@ def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
 
 
 def require_followed(key: str) -> None:
-    """Raises `UsageError` for a key on which nothing ever comes, with what to type instead."""
+    """Raise `UsageError`, with the command to type instead, if a key never has messages."""
     row = row_of(key)
     if row is None:
         return
@@ -138,15 +153,18 @@ def require_followed(key: str) -> None:
 
 
 def warn_of_unknown(key: str) -> None:
-    """Say when a key is not in the table: waiting for a misspelt one looks like a dead robot."""
+    """Warn if a key is not in the table: waiting on a misspelt key looks like a dead robot."""
     if unknown(key):
         said = f"{key} is not in the topic table ({key_hint(key)}); waiting"
         print(f"acsard: {printable(said)}", file=sys.stderr)
 
 
 def require_asked(key: str) -> None:
-    """Raises `UsageError` for a key that answers no question, does something when asked, or is
-    many: `get` prints one answer."""
+    """Raise `UsageError` if `acsard get` cannot ask this key.
+
+    These are keys that do not answer, services, which would act, and wildcards: `get` prints one
+    answer.
+    """
     if set(key.partition("?")[0]) & set("*$"):
         raise UsageError(f"{key} is many keys: get asks one; `acsard topics` lists them")
     row = row_of(key)

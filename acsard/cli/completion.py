@@ -1,4 +1,4 @@
-"""`acsard completion` and `acsard man`: what a shell and `man` know of the command line."""
+"""`acsard completion` and `acsard man`: shell completion scripts and the man page."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SHELLS = {
     "zsh": "a directory of your $fpath, as _acsard",
     "fish": "~/.config/fish/completions/acsard.fish",
 }
-"""Where each looks for its script."""
+"""Where each shell looks for its completion script."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verbs."""
+    """Declare both verbs and their options."""
     places = "; ".join(f"{shell}: {place}" for shell, place in SHELLS.items())
     completion = verbs.add_parser(
         "completion",
@@ -39,7 +39,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main_completion(args: argparse.Namespace) -> int:
-    """Print the script."""
+    """Print the completion script of a shell."""
     from acsard.cli import parser
     from acsard.cli.values import RECORDING, words
 
@@ -57,7 +57,8 @@ def main_completion(args: argparse.Namespace) -> int:
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
-            action.choices = known[verb, action.dest]  # only offered: these parse nothing
+            # The shell only offers these words; this parser does not parse any.
+            action.choices = known[verb, action.dest]
     script = shtab.complete(whole, args.shell)
     if args.shell == "zsh":
         script = every_word(script)
@@ -66,15 +67,16 @@ def main_completion(args: argparse.Namespace) -> int:
 
 
 def every_word(script: str) -> str:
-    """The library's zsh script with what may be many offered for each of them.
+    """Return the zsh script with completion for every word of a repeated argument.
 
-    It writes `(*)`, which completes the first word and excludes all others; `*` is every word.
+    shtab writes `(*)`, which completes the first word and excludes all others. `*` completes every
+    word.
     """
     return script.replace('  "(*)::', '  "*:').replace('  "(*):', '  "*:')
 
 
 def main_man(args: argparse.Namespace) -> int:
-    """Print the page."""
+    """Print the man page."""
     from acsard import __version__
     from acsard.cli import parser
 
@@ -94,7 +96,7 @@ def _missing(library: str) -> ExitError:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Every option and argument with its verb, also those of `log show` as of `log`."""
+    """Yield every option and argument with its verb. Those of `log show` belong to `log`."""
     for action in parser._actions:
         yield verb, action
         if isinstance(action, argparse._SubParsersAction):

@@ -1,4 +1,4 @@
-"""`acsard doctor`: what is wrong on this machine, and how to mend it."""
+"""`acsard doctor`: find what is wrong on this machine and how to fix it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "doctor",
         help="find out what is wrong on this machine",
@@ -31,7 +31,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Look and tell."""
+    """Examine the machine and print the findings. Return 1 if any of them is a failure."""
     import msgspec
 
     from acsard.bus.address import address_of
@@ -50,7 +50,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def line(finding: Finding, colours: bool) -> str:
-    """A finding for people."""
+    """Return a finding as text for a terminal, with its fix on a second line."""
     mark = {"ok": "ok  ", "warning": "warn", "failure": "FAIL"}[finding.level]
     if colours:
         mark = f"\033[{ {'ok': 32, 'warning': 33, 'failure': 31}[finding.level] }m{mark}\033[0m"

@@ -1,4 +1,4 @@
-"""`acsard door`: lets clients of other machines in by TLS; a process of its own."""
+"""`acsard door`: the TLS gateway, a separate process that admits clients of other machines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from acsard.host.exits import Exit, ExitError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "door",
         help="let clients of other machines in by TLS, beside the daemon",
@@ -28,7 +28,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Be open until a signal, or until it has to be opened anew."""
+    """Run the gateway until a signal ends it or until it must be restarted."""
     import os
 
     from acsard.bus.session import log_from_environment

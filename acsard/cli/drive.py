@@ -1,7 +1,7 @@
-"""`acsard drive`: the keyboard drives the robot, with teleop_twist_keyboard's keys.
+"""`acsard drive`: drive the robot from the keyboard with the keys of teleop_twist_keyboard.
 
-A terminal tells when a key goes down but never when it is let go: each press drives for
-`HOLD_S`, repeats extend it, and the end is three zeros and then silence.
+A terminal reports a key press but never its release. Each press therefore drives for `HOLD_S`, and
+key repeats extend it. After that the tool sends three zeros and then nothing.
 """
 
 from __future__ import annotations
@@ -27,22 +27,35 @@ if TYPE_CHECKING:
     from acsard.top.teleop import Teleop as Seen
 
 HOLD_S = 0.6
-"""Longer than a keyboard's delay before its first repeat (0.25 to 0.5 s), or it would stutter."""
+"""Time that one key press drives, s.
+
+It is longer than a keyboard's delay before the first repeat (0.25 to 0.5 s); otherwise the robot
+would stutter.
+"""
 
 ZEROS = 3
 PERIOD_S = 0.05
 
 OBJECTS_S = 0.5
-"""A key that does not drive for so long is worth a word: the first 0.25 s never count."""
+"""Time for which keys have no effect before the reason is shown, s.
+
+The daemon ignores the first 0.25 s (one timeout of the source) of every new sender.
+"""
 
 ASK_S = 0.5
-"""Without a state for so long it is asked for: it may be published seldom."""
+"""Silence on `state` after which it is queried, s.
+
+A robot may be configured to publish it rarely.
+"""
 
 NEWS_S, SAME_S, QUIET_S = 0.5, 1.0, 10.0
-"""Without a screen: news at most so often, while it moves, and while nothing happens."""
+"""Shortest time between two reports without a screen, s.
+
+In this order, they apply after a change, while the robot moves, and while nothing happens.
+"""
 
 PART_S = 2.0
-"""A robot stands within, by the ramp of its own."""
+"""Time within which a robot usually stands after its own ramp, s."""
 
 NO_END = 10**9
 
@@ -60,7 +73,7 @@ HELP = "\n".join(TELEOP_HELP)
 
 
 class Teleop:
-    """What the keys pressed so far ask of the robot; pure."""
+    """The command that the keys pressed so far ask for. The class is pure."""
 
     def __init__(self, linear: float, angular: float) -> None:
         self.linear, self.angular = linear, angular
@@ -70,20 +83,21 @@ class Teleop:
         self._lead = False
 
     def press(self, key: str, now: float) -> None:
-        """A key (or an arrow's escape sequence) was pressed at `now` s."""
+        """Handle a key, or an arrow's escape sequence, that was pressed at `now` s."""
         if key in _SPEEDS:
             self.linear *= _SPEEDS[key][0]
             self.angular *= _SPEEDS[key][1]
         elif key in _MOVES:
-            # After a silence the robot may want neutral first (it was stopped and cleared, say).
+            # Send a zero first after a silence: the robot may require a return to neutral, for
+            # example because it was stopped and cleared meanwhile.
             self._lead = self._lead or (now >= self._until and not self._zeros)
             self._move, self._until, self._zeros = _MOVES[key], now + HOLD_S, ZEROS
         else:
-            # Like the tool people know: any other key stops.
+            # Any other key stops the robot, as in teleop_twist_keyboard.
             self._move, self._until, self._zeros = (0, 0), now, ZEROS
 
     def send(self, now: float) -> Twist | None:
-        """The command to send at `now`, or None for silence."""
+        """Return the command to send at `now` s, or None if nothing is to be sent."""
         if self._lead:
             self._lead = False
             return REST
@@ -96,7 +110,7 @@ class Teleop:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "drive",
         help="drive by keyboard",
@@ -133,19 +147,19 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _show(ride: Ride) -> None:
-    """On a screen of its own where there is one."""
+    """Run full-screen if the terminal can do it, else line by line."""
     dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
     if dumb or not sys.stdout.isatty():
         return _plain(ride)
     try:
         from acsard.top.terminal import drive
-    except ImportError:  # no rich, and so no colours
+    except ImportError:  # without the library rich the screen has no colours
         from acsard.top.bare import drive
     return drive(ride.step, ride.seen)
 
 
 def _plain(ride: Ride) -> None:
-    """Some lines when there is news, and now and then."""
+    """Print some lines after each change, and at intervals."""
     from acsard.top.keys import keys, until_told
     from acsard.top.teleop import news
 
@@ -159,7 +173,11 @@ def _plain(ride: Ride) -> None:
 
 
 def _part(ride: Ride) -> None:
-    """The last word, to who is still there: not that it drives, when it stands a moment later."""
+    """Print a last report when the robot stands, or after `PART_S`.
+
+    Without the wait, the last line would say that the robot drives although it stands a moment
+    later.
+    """
     from acsard.top.teleop import moves, parting
 
     left = time.monotonic()
@@ -174,7 +192,7 @@ def _part(ride: Ride) -> None:
 
 
 def _width() -> int:
-    """Of the terminal that is written to; of a file there is none."""
+    """Return the terminal's width in columns. A file's width is unlimited."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_END
 
 
@@ -183,14 +201,14 @@ def _height() -> int:
 
 
 class News:
-    """What is worth some lines where there is no screen; pure."""
+    """Throttle for reports on a terminal that cannot show a screen. The class is pure."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
         self._at = -QUIET_S
 
     def tell(self, seen: Seen, now: float) -> bool:
-        """At `now` s it is."""
+        """Return whether a report is due at `now` s, and remember it as printed."""
         from acsard.top.teleop import SILENT_S
 
         state = seen.state
@@ -205,14 +223,14 @@ class News:
 
 
 class Page:
-    """Where there is no screen, the help comes again before it is out of sight; pure."""
+    """Reports with the help, repeated before it scrolls out of sight. The class is pure."""
 
     def __init__(self) -> None:
         self._shown = NO_END
-        """Lines since the help began."""
+        """Lines printed since the help began."""
 
     def with_help(self, told: list[str], height: int) -> list[str]:
-        """These lines, below the help where they are the first or would shove it out."""
+        """Return these lines, below the help if they are the first or would scroll it away."""
         self._shown += len(told)
         if self._shown < height:
             return told
@@ -221,7 +239,7 @@ class Page:
 
 
 class Ride:
-    """Between the keys and the robot."""
+    """The connection between the keys and the robot: sends commands and receives `state`."""
 
     def __init__(self, robot: Client, teleop: Teleop, robot_id: str, endpoint: str) -> None:
         from acsard.client.driving import Answers
@@ -232,13 +250,13 @@ class Ride:
         self._names = robot_id, endpoint
         self._decoder, self._states = Decoder(RobotState), robot.subscribe("state")
         self._answers: deque[zenoh.Sample] = deque()
-        """Left here by a thread of Zenoh's."""
+        """Answers to queries, appended by a thread of Zenoh."""
         self._answered = Answers()
         self._state: RobotState | None = None
         self._heard = self._fine = self._asked = time.monotonic()
 
     def step(self, typed: str) -> None:
-        """These keys were pressed; send what is to be sent, take what has come."""
+        """Handle these key presses, send the command that is due, and take new messages."""
         now = time.monotonic()
         for key in split(typed):
             self._teleop.press(key, now)
@@ -250,8 +268,8 @@ class Ride:
         self.take()
 
     def take(self) -> None:
-        """Take what has come; ask when nothing does."""
-        while self._answers:  # first: what comes by itself is later
+        """Take the messages that have arrived, and query `state` if it is silent."""
+        while self._answers:  # answers first: a message that the robot published by itself is newer
             self._take(self._answers.popleft(), asked=True)
         while (sample := self._states.try_recv()) is not None:
             self._take(sample, asked=False)
@@ -264,15 +282,16 @@ class Ride:
         from acsard.bus.subscription import encoded
         from acsard.messages.encodings import DecodeError
 
-        with suppress(DecodeError):  # a stranger's
+        with suppress(DecodeError):  # the message of another program on this key cannot be decoded
             state = self._decoder.decode(*encoded(sample))
             if asked and not self._answered.news(state, self._state):
-                self._state = self._state or state  # the first may be a storage's: no news yet
+                # The first answer may be a storage's, which does not prove that the robot lives.
+                self._state = self._state or state
                 return
             self._state, self._heard = state, time.monotonic()
 
     def seen(self) -> Seen:
-        """What there is to show."""
+        """Return the values to show now."""
         from acsard.client.driving import objection
         from acsard.top.teleop import Teleop as Seen
 
@@ -287,7 +306,7 @@ class Ride:
 
 
 def split(text: str) -> list[str]:
-    """What one read of the terminal gave, as keys; an arrow is three characters."""
+    """Split the text of one terminal read into keys. An arrow key is three characters."""
     keys, at = [], 0
     while at < len(text):
         size = 3 if text.startswith("\x1b[", at) else 1

@@ -1,4 +1,4 @@
-"""`acsard echo <topic>`: what is on a key, as JSON lines or, with --short, as lines for people."""
+"""`acsard echo <topic>`: print the messages of a key as JSON lines, or with --short as text."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "echo",
         help="print the messages on a key as JSON lines",
@@ -59,7 +59,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print until told otherwise."""
+    """Print messages until Ctrl-C, a count or a timeout ends it."""
     from acsard.bus.fleet import follow
     from acsard.cli.waiting import QUIET_S, explained, lost_by, nothing, waits_for
     from acsard.client import connect
@@ -91,7 +91,7 @@ def main(args: argparse.Namespace) -> int:
             look = nothing
         elif tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
-            look = nothing  # it has been told already
+            look = nothing  # the reason for the silence has just been printed
         with explained(look, QUIET_S, lost_by(robot, where)) as heard:
             return _print(samples, decoder, args.n, bool(many), heard)
 
@@ -103,7 +103,15 @@ def _print(
     of_many: bool,
     heard: Callable[[], None],
 ) -> int:
-    """A line each as they come, until Ctrl-C, so many, or a silence."""
+    """Print a line per message until Ctrl-C, `most` messages, or the end of `samples`.
+
+    Args:
+        samples: the messages; the iterator ends after a silence of the timeout.
+        decoder: decodes messages for their short form; None prints JSON.
+        most: number of messages after which it returns, or None.
+        of_many: whether each line names its robot.
+        heard: called for each message.
+    """
     from acsard.bus.fleet import robot_of
     from acsard.bus.subscription import encoded
 
@@ -120,7 +128,7 @@ def _print(
 
 
 def _shortened(key: str) -> Decoder[Any]:
-    """The decoder of a key that has a short form."""
+    """Return the decoder of a key that has a short form. Raises `ExitError` for any other key."""
     from acsard.messages.encodings import Decoder
     from acsard.messages.schema import MESSAGES
     from acsard.messages.short import SHORT
@@ -135,7 +143,7 @@ def _shortened(key: str) -> Decoder[Any]:
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
-    """A message as it is printed; what cannot be read is always JSON."""
+    """Return a message as a printable line. A message that cannot be decoded is printed as JSON."""
     from acsard.messages.encodings import DecodeError
     from acsard.messages.short import short
 
@@ -157,7 +165,7 @@ def _record(
     timeout: float | None,
     heard: Callable[[], None],
 ) -> int:
-    """Rows of all keys as they come, until Ctrl-C, so many, or a silence."""
+    """Print rows of all keys until Ctrl-C, until `most` rows, or after `timeout` s of silence."""
     import time
 
     from acsard.bus.subscription import encoded
@@ -191,7 +199,7 @@ def _record(
 
 
 def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
-    """Who is there now: silence looks the same as nobody."""
+    """Print which robots are present now, because a silent robot looks like a missing one."""
     from acsard.bus.fleet import ALL, present
     from acsard.host.errors import NoAnswerError
 
@@ -206,7 +214,7 @@ def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
 
 
 def of_robot(whose: str, line: str) -> str:
-    """A line of JSON with whose it is."""
+    """Return a JSON line that names the robot and contains its message."""
     import msgspec
 
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
@@ -214,7 +222,10 @@ def of_robot(whose: str, line: str) -> str:
 
 
 def json_line(encoding: str, payload: bytes) -> str:
-    """A payload of any encoding as one line of JSON; bytes that are none of ours as a text."""
+    """Return a payload of any encoding as one line of JSON.
+
+    Bytes that cannot be decoded become the text `{"undecodable": ...}`.
+    """
     import msgspec
 
     from acsard.messages.encodings import DecodeError, detect

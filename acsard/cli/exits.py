@@ -1,4 +1,4 @@
-"""**The** table of what an error means to the shell that started us."""
+"""The one table from an error to the exit code of the process."""
 
 from __future__ import annotations
 
@@ -34,5 +34,5 @@ CODES: dict[type[MendableError], Exit] = {
 
 
 def code_of(error: MendableError) -> Exit:
-    """What the program ends with for this error."""
+    """Return the exit code of the process for this error."""
     return error.code if isinstance(error, ExitError) else CODES[type(error)]

@@ -1,4 +1,4 @@
-"""`acsard fleet`: a line for each robot, live."""
+"""`acsard fleet`: show one live line per robot."""
 
 from __future__ import annotations
 
@@ -20,14 +20,17 @@ if TYPE_CHECKING:
     from acsard.top.roster import Row
 
 GATHER_S = 1.5
-"""All who are there have said so by then."""
+"""Time within which every robot that is present has answered, s."""
 
 NOBODY_S = 3.0
-"""Before it is said that nobody is there: on a busy computer the first is heard late."""
+"""Time before the tool reports that no robot is there, s.
+
+On a busy computer the first answer arrives late.
+"""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "fleet",
         help="a line for each robot, live",
@@ -42,7 +45,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show until told otherwise."""
+    """Show the robots until the operator leaves, or print one table."""
     from acsard.bus.fleet import ALL
     from acsard.client import connect
     from acsard.top.fleet import Fleet
@@ -65,7 +68,13 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _once(fleet: Fleet, asked: Client | None) -> int:
-    """One table; exit 69 when nobody is there: who is `asked` then, whether we may see any."""
+    """Print one table. Raises `ExitError` with code 69 if no robot is present.
+
+    Args:
+        fleet: the robots that are followed.
+        asked: a client that asks, if no robot is present, whether our certificate may see any; None
+            without TLS.
+    """
     from acsard.top.roster import table
 
     began, rows = time.monotonic(), fleet.rows()
@@ -77,7 +86,7 @@ def _once(fleet: Fleet, asked: Client | None) -> int:
         silence = "" if asked is None else asked.whoami().silence
         raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), silence))))
     width = shutil.get_terminal_size((160, 24)).columns
-    # Now, not when we end: nothing on our way down can keep it back.
+    # Flush now: nothing that delays our exit may hold back the table.
     print("\n".join(table(rows, width)), flush=True)
     for told in filter(None, (fleet.seen, fleet.more)):
         print(f"acsard: {told}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""`acsard foxglove`: the robot live in Foxglove and Lichtblick."""
+"""`acsard foxglove`: show the robot live in Foxglove and Lichtblick."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFAULT = "127.0.0.1:8765"
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "foxglove",
         help="the robot live in Foxglove and Lichtblick",
@@ -41,7 +41,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show it until told otherwise."""
+    """Serve Foxglove until a signal ends it."""
     try:
         from acsard.foxglove.bridge import Bridge
     except ImportError:

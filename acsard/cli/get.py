@@ -1,4 +1,4 @@
-"""`acsard get KEY`: what a key answers now, as JSON."""
+"""`acsard get KEY`: query a key once and print its answer as JSON."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from acsard.values import AcsardError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "get",
         help="ask a key once and print its answer as JSON",
@@ -27,7 +27,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Ask and print."""
+    """Query the key and print its answer, or one answer per robot."""
 
     from acsard.bus.fleet import present
     from acsard.cli.echo import json_line, of_robot

@@ -1,4 +1,4 @@
-"""`acsard hz <topic>`: how often messages come, and how evenly."""
+"""`acsard hz <topic>`: measure the rate of a key and how even its gaps are."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "hz",
         help="measure the rate of a key",
@@ -28,7 +28,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Measure until told otherwise."""
+    """Print a line every second until Ctrl-C or until `-n` lines."""
     from collections import deque
 
     import msgspec
@@ -68,7 +68,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def rate(times: list[float]) -> dict[str, float]:
-    """Rate in Hz and the gaps between arrivals in ms, over arrival times in s."""
+    """Return the rate in Hz and the gaps between arrivals in ms, for arrival times in s."""
     import numpy as np
 
     if len(times) < 2 or times[-1] <= times[0]:

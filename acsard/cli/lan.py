@@ -1,4 +1,4 @@
-"""`acsard lan init | add | renew | router`: certificates for a bus that leaves the machine."""
+"""`acsard lan init | add | renew | router`: make certificates for a bus that leaves the machine."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb, its actions and their options."""
     parser = verbs.add_parser(
         "lan",
         help="make certificates, so that other machines may join",
@@ -96,7 +96,7 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 
 def _add_common(action: argparse.ArgumentParser) -> None:
-    """Where the certificates are, how long they hold and for which addresses."""
+    """Add the options for the directory, the validity and the addresses of certificates."""
     action.add_argument(
         "--directory", type=Path, default=Path(TLS), metavar="DIR", help=f"default {TLS}"
     )
@@ -114,7 +114,7 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 
 def main_init(args: argparse.Namespace) -> int:
-    """Make everything a first robot needs."""
+    """Make the authority, the robot's certificate and one client certificate per role."""
     from acsard.host.files import require_changeable, require_tomlkit
 
     directory = args.directory.resolve()
@@ -153,7 +153,8 @@ def main_add(args: argparse.Namespace) -> int:
         there = getattr(config.access, listed)
         return {f"access.{listed}": list(dict.fromkeys([*there, args.name]))}
 
-    where, config = load(args.config)  # before anything is made
+    # Load the configuration before any file is written, so that an error leaves no files.
+    where, config = load(args.config)
     if args.write:
         if not args.role:
             raise UsageError("--write puts the name into a role's list: say which, --role operator")
@@ -184,7 +185,7 @@ def main_renew(args: argparse.Namespace) -> int:
 
 
 def main_router(args: argparse.Namespace) -> int:
-    """Print what the router is to let through."""
+    """Print the configuration of a fleet's router."""
     from acsard.bus.address import require_id
     from acsard.host.service import source
     from acsard.lan.router_file import router_file
@@ -202,7 +203,7 @@ def _certified(names: list[str]) -> str:
 
 
 def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
-    """Set the bus's keys in a configuration, its comments kept."""
+    """Set the keys of the bus in a configuration file and keep its comments."""
     from acsard.host.files import change
 
     changed = change(file, keys, new=True)
@@ -210,7 +211,11 @@ def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
 
 
 def _admit_service(directory: Path) -> None:
-    """The door of the installed service opens by a drop-in: with networks and certificates."""
+    """Let the installed service's TLS gateway use these certificates.
+
+    It writes a systemd drop-in with the permitted networks and the certificates, and does nothing
+    without an installed service.
+    """
     from acsard.host import service
 
     step = service.admitting(directory)
@@ -222,7 +227,7 @@ def _admit_service(directory: Path) -> None:
 
 
 def _name(text: str) -> str:
-    # As `access` wants it: the name is a part of keys, and a directory here.
+    # `access` has the same rule: the name becomes a part of keys, and a directory name here.
     if not NAME.fullmatch(text) or text in (".", ".."):
         raise argparse.ArgumentTypeError(
             f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "

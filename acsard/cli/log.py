@@ -1,4 +1,4 @@
-"""`acsard log`: what the black box has recorded, and what happened in it."""
+"""`acsard log`: list, show, replay and export the recordings of the black box."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from acsard.record.story import Told
 
 SERVICE = Path("/var/lib/acsard/record")
-"""Where the service records."""
+"""The directory in which the service records."""
 
 DESCRIPTION = """\
 What the daemon has recorded. Without a verb: the recordings, oldest first, and what happened in
@@ -31,7 +31,7 @@ each. FILE is a recording, or its number in that list; without it the newest.
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb, its actions and their options."""
     parser = verbs.add_parser("log", help="what was recorded, told or lived again",
                               description=DESCRIPTION)  # fmt: skip
     _directory(parser, None)
@@ -105,7 +105,7 @@ def _row(path: Path, last: Closing) -> str:
 
 
 def _row_of_all(recording: Recording) -> str:
-    """Of one without an end: all of it has to be read."""
+    """Return the row of a recording without an end. The whole recording must be read for it."""
     from acsard.host.errors import RecordingError
     from acsard.record.file import Gist, event_of
 
@@ -113,7 +113,7 @@ def _row_of_all(recording: Recording) -> str:
     for topic, wall_ns, data in recording.messages():
         gist.message(topic, wall_ns, data)
         if topic == "events":
-            with suppress(RecordingError):  # what it tells is left out, not all of it
+            with suppress(RecordingError):  # omit only the event that cannot be decoded
                 gist.event(event_of(recording, data))
     return _row(recording.path, gist.closing()) + _state(recording)
 
@@ -123,13 +123,13 @@ def _bracketed(text: str) -> str:
 
 
 def _state(recording: Recording) -> str:
-    """What is missing of it, once it has been read."""
+    """Describe the missing parts of a recording, once it has been read completely."""
     damaged = f"{recording.damaged} damaged chunks are left out" if recording.damaged else ""
     return _bracketed("; ".join(filter(None, [damaged, _ending(recording)])))
 
 
 def _ending(recording: Recording) -> str:
-    """Why it does not end as the daemon was told to."""
+    """Return why the recording ended other than by a normal end of the daemon, or ""."""
     from acsard.record.closing import how_it_ends
 
     if not recording.ended:
@@ -138,7 +138,7 @@ def _ending(recording: Recording) -> str:
 
 
 def show_one(args: argparse.Namespace) -> int:
-    """Tell its story."""
+    """Print the timeline of a recording."""
     from acsard.record.replayed import steps
     from acsard.record.story import Story, Told
 
@@ -172,7 +172,10 @@ def _tell(one: Told, as_json: bool) -> None:
 
 
 def replay_one(args: argparse.Namespace) -> int:
-    """Live it again; 1 where it does not come out the same."""
+    """Replay a recording and compare the result with the recorded one.
+
+    Returns 1 if they differ; with --config a difference is expected and it returns 0.
+    """
     from acsard.record.replayed import (
         because,
         compared,
@@ -203,7 +206,7 @@ def replay_one(args: argparse.Namespace) -> int:
 
 
 def recover_one(args: argparse.Namespace) -> int:
-    """Write a finished file."""
+    """Rewrite an unfinished or damaged recording as a finished file."""
     from acsard.record.beside import beside
     from acsard.record.file import rewrite
 
@@ -218,7 +221,7 @@ def recover_one(args: argparse.Namespace) -> int:
 
 
 def export_one(args: argparse.Namespace) -> int:
-    """Write it for other programs."""
+    """Export a recording for other programs."""
     recording = _recording(args)
     trouble = log_export.export_one(recording, args)
     note = trouble or _state(recording).strip()
@@ -228,7 +231,7 @@ def export_one(args: argparse.Namespace) -> int:
 
 
 def report_one(args: argparse.Namespace) -> int:
-    """Draw it."""
+    """Draw a recording as an HTML file."""
     plotly = log_report.library()
     recording = _recording(args)
     notes = log_report.report_one(recording, args, plotly, log_report.Words(_clock, _state))

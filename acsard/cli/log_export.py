@@ -1,4 +1,4 @@
-"""`acsard log export`: a recording as files that other programs open."""
+"""`acsard log export`: write a recording as files that other programs open."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ have said with other parameters.
 
 
 def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
-    """Declare the verb."""
+    """Declare the action and its options."""
     parser = inner.add_parser(
         "export",
         help="write it for Foxglove, PlotJuggler, ros2 bag or a table",
@@ -45,7 +45,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
 
 
 def export_one(recording: Recording, args: argparse.Namespace) -> str:
-    """Write it, tell what was written, and return why it ends early, "" if it does not."""
+    """Write the file, print a summary, and return why it ends early, or "" if it is complete."""
     from acsard.record.export import Span, export
 
     kind: Kind = args.kind
@@ -65,7 +65,10 @@ def export_one(recording: Recording, args: argparse.Namespace) -> str:
 
 
 def _name(path: Path, kind: Kind) -> Path:
-    """In the directory where we are: that of the recordings is the service's."""
+    """Return the default name of the file, in the current directory.
+
+    The directory of the recordings belongs to the service.
+    """
     from acsard.record.export import SUFFIX
 
     return Path(path.name.partition(".")[0] + SUFFIX[kind])

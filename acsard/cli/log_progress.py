@@ -1,4 +1,4 @@
-"""How far a verb of `acsard log` that takes minutes has come, told on a terminal."""
+"""Progress of those actions of `acsard log` that take minutes, shown on a terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ if TYPE_CHECKING:
 
 @contextmanager
 def telling(recording: Recording) -> Iterator[Callable[[int], None]]:
-    """Call it with the wall-clock time that was reached, ns; on leaving its line is gone."""
+    """Yield a function that shows the progress; call it with the wall-clock time reached, in ns.
+
+    The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
+    """
     from acsard.record.closing import closing
 
     if not sys.stderr.isatty():

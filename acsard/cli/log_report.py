@@ -1,4 +1,4 @@
-"""`acsard log report`: a recording drawn as one HTML file."""
+"""`acsard log report`: draw a recording as one HTML file."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ tells what to type.
 
 
 class Words(NamedTuple):
-    """How the verbs of `acsard log` read and tell."""
+    """Functions that the actions of `acsard log` share to format times and recordings."""
 
     clock: Callable[[float, bool], str]
     state: Callable[[Recording], str]
-    """What is missing of a recording, once it has been read."""
+    """Function that returns the missing parts of a recording that has been read."""
 
 
 def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.ArgumentParser:
-    """Declare the verb."""
+    """Declare the action and its options."""
     parser = inner.add_parser(
         "report",
         help="draw it: one HTML file with path, speeds, who drove and why, link, events",
@@ -49,7 +49,10 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
 
 
 def library() -> str:
-    """The script that draws; raises `ExitError` with what to type where it is missing."""
+    """Return plotly's script.
+
+    Raises `ExitError` with the command to install it if it is missing.
+    """
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:
@@ -62,7 +65,7 @@ def library() -> str:
 def report_one(
     recording: Recording, args: argparse.Namespace, plotly: str, words: Words
 ) -> list[str]:
-    """Write it, tell what was written, and return what is to be known of it."""
+    """Write the report, print a summary, and return notes about the recording."""
     from acsard.record.beside import beside
 
     if args.held:
@@ -82,7 +85,10 @@ def report_one(
 
 
 def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Words) -> list[str]:
-    """For the page's server: to standard output, and how far it is, in percent, to the other."""
+    """Write the report to standard output for the page's server.
+
+    The progress in percent goes to standard error.
+    """
     from acsard.host.parent import end_with_parent
     from acsard.record.closing import closing
 
@@ -110,7 +116,10 @@ def _drawn(
     words: Words,
     tell: Callable[[int], None],
 ) -> tuple[str, list[str]]:
-    """The file, and what is to be known of it; `tell` hears the wall-clock time it has come to."""
+    """Return the HTML text and notes about the recording.
+
+    `tell` is called with the wall-clock time reached, in ns.
+    """
     from acsard.record.replayed import EVERY, Onlooker, verdict
     from acsard.report.account import Origin, notes
     from acsard.report.course import Course
@@ -124,7 +133,8 @@ def _drawn(
             tell(step.inputs.now.wall_ns)
         course.step(step, outputs, robot)
         if course.over:
-            deque(recording.messages(), maxlen=0)  # only what is missing of it
+            # Read the rest, so that the notes count every damaged chunk.
+            deque(recording.messages(), maxlen=0)
             break
     if course.began is None:
         message = f"{recording.path} has no step of that time to draw"

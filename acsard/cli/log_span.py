@@ -1,7 +1,8 @@
-"""`--from` and `--to` of `acsard log`: a part of a recording, by seconds or by the time of day.
+"""`--from` and `--to` of `acsard log`: a part of a recording, in seconds or by the time of day.
 
-A recording may go over midnight, and its clock may be set in the middle of it: the time of day is
-looked for wherever the clock went on by itself. What comes of it are seconds from the beginning.
+A recording may cross midnight, and its clock may be set in the middle of it. The time of day is
+therefore looked up in every stretch between two clock steps. The result is in seconds from the
+beginning of the recording.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ if TYPE_CHECKING:
     from acsard.record.file import Recording
 
 SET_NS = 5 * NS_PER_S
-"""A clock that goes so far from the other one was set."""
+"""Difference between wall clock and monotonic clock that counts as a clock step, ns."""
 
 
 class Stretch(NamedTuple):
-    """A part in which the clock went on by itself."""
+    """A part of the recording in which the wall clock was not set."""
 
     at: float
-    """s after the beginning of the recording."""
+    """Start of the stretch, s after the beginning of the recording."""
     begin: float
     end: float
-    """s since 1970."""
+    """End of the stretch, s since 1970, as is `begin`."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
-    """Declare both."""
+    """Add `--from` and `--to`."""
     when = "seconds after the beginning, or the time of day: HH:MM, HH:MM:SS"
     parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
     parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
@@ -46,7 +47,10 @@ def _when(text: str) -> str:
 
 
 def span(args: argparse.Namespace, recording: Recording) -> tuple[float, float]:
-    """From when to when, s after its beginning."""
+    """Return the begin and the end of the part, s after the beginning of the recording.
+
+    An end that was not given is infinite.
+    """
     texts = (args.begin, args.end)
     found = stretches(recording) if any(":" in text for text in texts if text) else []
     begin, end = (None if text is None else _seconds(text, found) for text in texts)
@@ -71,14 +75,17 @@ def _seconds(text: str, found: list[Stretch]) -> float:
 
 
 def _on(near: float, day: int, hours: int, minutes: int, seconds: float) -> float:
-    """That time of day, so many days after that of `near`, s since 1970."""
+    """Return a time of day, s since 1970, `day` days after the date of `near`."""
     told = time.localtime(near)
     whole = (told.tm_year, told.tm_mon, told.tm_mday + day, hours, minutes, 0, 0, 0, -1)
     return time.mktime(whole) + seconds
 
 
 def stretches(recording: Recording) -> list[Stretch]:
-    """Where its clock went on by itself, in order; one, where nobody has set it."""
+    """Return the stretches between clock steps, in order.
+
+    There is one if the clock was never set.
+    """
     found: list[Stretch] = []
     last_ns, before = 0, b""
     for topic, wall_ns, data in recording.messages():
@@ -105,7 +112,7 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 
 def _instants(recording: Recording, data: bytes) -> list[Instant]:
-    """When each step of a message was."""
+    """Return the time of each step in a message."""
     from acsard.record.batch import BatchError, decode
 
     try:

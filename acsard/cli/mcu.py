@@ -1,6 +1,7 @@
-"""`acsard mcu check`: prove the microcontroller's side on one's own robot, wheels lifted.
+"""`acsard mcu check`: test the microcontroller on the real robot with its wheels lifted.
 
-What is looked at, and in which order, is `checkup/procedure.py`'s; who answers is `person.py`'s.
+`checkup/procedure.py` decides what is tested and in which order. `asking/person.py` asks the
+operator.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ ended early, or when this computer was too late to judge a row: try again when i
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb, its action and their options."""
     parser = verbs.add_parser(
         "mcu",
         help="prove the microcontroller's side on your own robot, wheels lifted",
@@ -74,7 +75,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Check and tell."""
+    """Run the check and print its result."""
     from acsard.checkup.advice import withheld
 
     given: Overrides = {}
@@ -113,7 +114,7 @@ def _checked(
     except MendableError as error:
         if not args.json:
             raise
-        trouble = error  # programs get their object all the same
+        trouble = error  # with --json, print the report before the error
     named = args.port if args.write or (args.json_lines and not simulated) else ""
     withheld = advice.withheld(simulated, configured)
     changes = {} if withheld else advice.changes(findings, configured, named)
@@ -122,7 +123,7 @@ def _checked(
         try:
             change(Path(where), changes)
             written = where
-        except MendableError as error:  # a minute's findings are told first
+        except MendableError as error:  # print the findings of a whole minute before the error
             trouble = error
     found = report(port, findings, changes, written, str(trouble or ""), withheld)
     person.result(found, where)
@@ -134,7 +135,7 @@ def _checked(
 
 
 def _wire(config: Config) -> Wire:
-    """The port, or the simulator in virtual time: nobody waits for what does not turn."""
+    """Return the port, or the simulator in virtual time, with which no check has to wait."""
     if config.mcu.port == SIMULATOR:
         from acsard.sim.fake_mcu import FakeMcu
         from acsard.sim.virtual_wire import VirtualWire

@@ -1,6 +1,6 @@
-"""`acsard odom`: what makes odometry wrong now, and what to do about it.
+"""`acsard odom`: show what makes odometry wrong now, and how to improve it.
 
-How that is found is `error_budget/budget.py`'s.
+`error_budget/budget.py` computes it.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ settings tell.
 """
 
 FIRST_S = 3.0
-"""How long the first line is waited for."""
+"""Time allowed for the first feedback line, s."""
 
 LOOK_S = 0.05
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "odom", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
     )
@@ -53,7 +53,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Look and tell."""
+    """Follow the robot and print its error budget."""
     from acsard.client import connect
     from acsard.error_budget.budget import budget
     from acsard.error_budget.feed import KEYS, Feed
@@ -83,7 +83,10 @@ def _seconds(text: str) -> float:
 
 
 def _config(robot: Client, path: str | None) -> Config:
-    """The daemon's, which only maintainers may ask a robot on the network for; else the file's."""
+    """Return the daemon's configuration, or the local file's if the robot does not give it.
+
+    Over the network only a maintainer may query the configuration.
+    """
     import msgspec
 
     from acsard.config.settings import Config
@@ -100,7 +103,10 @@ def _config(robot: Client, path: str | None) -> Config:
 
 
 def _await_line(robot: Client, lines: Subscription) -> None:
-    """From the first line on all keys come; raises `ExitError` when there is none."""
+    """Wait for the first feedback line, after which all keys are published.
+
+    Raises `ExitError` with the robot's reason if none arrives within `FIRST_S`.
+    """
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:
@@ -110,7 +116,7 @@ def _await_line(robot: Client, lines: Subscription) -> None:
 
 
 def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None:
-    """Hand over all that comes."""
+    """Pass all messages of the next `seconds` s to `feed`."""
     from acsard.bus.subscription import encoded
     from acsard.messages.encodings import DecodeError, Decoder
     from acsard.messages.schema import MESSAGES

@@ -1,4 +1,4 @@
-"""`acsard ports`: the serial ports of this machine, and which looks like the microcontroller."""
+"""`acsard ports`: list the serial ports and which of them looks like the microcontroller."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "ports",
         help="list the serial ports, who holds them, and which looks like the MCU",

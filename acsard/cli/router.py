@@ -1,4 +1,4 @@
-"""`acsard router`: the router of a fleet, which notices when somebody holds it up."""
+"""`acsard router`: a fleet's Zenoh router, restarted when a client blocks it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "router",
         help="a fleet's Zenoh router, watched and opened anew when it is held up",
@@ -22,13 +22,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "connected takes all its time or memory. Without plugins: storages are zenohd's.",
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="Zenoh's configuration (JSON5)")
-    # So it starts itself: be the router, and end with standard input.
+    # The verb starts itself with this option: the child is the router and ends with its standard
+    # input.
     parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Route until a signal."""
+    """Supervise a router until a signal, or be the supervised router (`--held`)."""
     import os
 
     from acsard.bus.session import log_from_environment
@@ -50,7 +51,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 async def _kept(file: str, log: Log) -> int:
-    """One router after the other, until a signal or an end that is final."""
+    """Run one router process after the other, until a signal or an exit code that is final."""
     import signal
 
     from acsard.runtime.doorkeeper import ROUTER, keep_door
@@ -61,4 +62,4 @@ async def _kept(file: str, log: Log) -> int:
     try:
         return await keeper
     except asyncio.CancelledError:
-        return 0  # asked to go; the process below has been let go of
+        return 0  # a signal asked us to end; the router process has been released

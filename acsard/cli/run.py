@@ -1,4 +1,4 @@
-"""`acsard run`: the daemon."""
+"""`acsard run`: run the daemon."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _PAGE = "  page    {where}, for a browser; a line below says when it is open\n"
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "run",
         help="run the daemon (the default verb)",
@@ -66,7 +66,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def overrides(args: argparse.Namespace) -> Overrides:
-    """The configuration keys given on the command line."""
+    """Return the configuration keys given on the command line."""
     given: Overrides = {}
     for section, key, value in (
         ("mcu", "port", args.port),
@@ -83,7 +83,7 @@ def overrides(args: argparse.Namespace) -> Overrides:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run until a signal."""
+    """Run the daemon until a signal."""
     import asyncio
     import faulthandler
 
@@ -99,8 +99,8 @@ def main(args: argparse.Namespace) -> int:
 
     def announce(device: str, trouble: str) -> None:
         simulated = config.mcu.simulated
-        if "INVOCATION_ID" not in os.environ:  # systemd: the log line below says the same
-            # Not print: a full pipe that nobody reads would hold up the robot.
+        if "INVOCATION_ID" not in os.environ:  # under systemd, the log line below says the same
+            # Do not use print: a full pipe that nobody reads would block the control loop.
             told = banner(config, where, device, trouble, reach(args), served=served is not None)
             screen.write(told + "\n")
         log.info(
@@ -118,8 +118,9 @@ def main(args: argparse.Namespace) -> int:
 
     door = ["door", *(("--config", where) if config.bus.outside else ()), "--id", config.robot.id]
     door += ["--namespace", config.ros.namespace]
-    # The watchdog ends a daemon that hangs by SIGABRT: where it hung goes to standard error.
-    if sys.stderr is not None:  # None when it was closed before the start
+    # The systemd watchdog ends a hanging daemon with SIGABRT. The traceback of the hang then goes
+    # to standard error.
+    if sys.stderr is not None:  # it is None if standard error was closed before the start
         faulthandler.enable()
     try:
         asyncio.run(daemon.run(config, log, announce, None if args.no_door else door, served))
@@ -130,7 +131,11 @@ def main(args: argparse.Namespace) -> int:
 
 
 def page(config: Config, where: str) -> list[str] | None:
-    """The words for an `acsard web`, where a person looks on and the extra is there."""
+    """Return the arguments of `acsard web`, or None if the page is not to be started.
+
+    The page is started if `web.page` is set, standard output is a terminal, and the extra `web` is
+    installed.
+    """
     looked_at = sys.stdout is not None and sys.stdout.isatty() and "INVOCATION_ID" not in os.environ
     there = find_spec("aiohttp") and find_spec("segno")
     if not (config.web.page and looked_at and there):
@@ -148,7 +153,7 @@ def page(config: Config, where: str) -> list[str] | None:
 
 
 def _bus(config: Config) -> str:
-    """Where the bus is: what the daemon listens at, or as a client connects to."""
+    """Return the daemon's bus endpoints, or those that it connects to as a client."""
     bus = config.bus
     if bus.mode == "client":
         return f"client of {', '.join(bus.connect)}"
@@ -156,7 +161,7 @@ def _bus(config: Config) -> str:
 
 
 def reach(args: argparse.Namespace) -> str:
-    """The options by which the tools find this daemon, where they must be told."""
+    """Return the options that other tools need to find this daemon, as text for the banner."""
     from acsard.bus.session import reachable
 
     listens = args.listen and reachable(args.listen)
@@ -173,7 +178,16 @@ def banner(
     *,
     served: bool = False,
 ) -> str:
-    """What a person sees first; `reach` is how the tools find it, `served` whether the page is."""
+    """Return the banner that the daemon prints at its start.
+
+    Args:
+        config: the configuration in force.
+        where: the path of the configuration.
+        device: the serial device.
+        trouble: why the device cannot be opened yet, or "".
+        reach: the options with which other tools find this daemon.
+        served: whether the page is served.
+    """
     from acsard import __version__
     from acsard.values import ROOT
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb, its actions and their options."""
     parser = verbs.add_parser(
         "service",
         help="install acsard as a system service, remove it, or see how it is",
@@ -48,7 +48,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main_install(args: argparse.Namespace) -> int:
-    """Write, reload, enable, start."""
+    """Write the files, reload systemd, and enable and start the service."""
     from acsard.host import service
     from acsard.host.placement import misplaced
 
@@ -67,7 +67,7 @@ def main_install(args: argparse.Namespace) -> int:
 
 
 def main_uninstall(args: argparse.Namespace) -> int:
-    """Stop, disable, remove."""
+    """Stop and disable the service and remove its files."""
     from acsard.host import service
 
     _ready(args)
@@ -86,7 +86,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 
 def main_status(args: argparse.Namespace) -> int:
-    """Tell; 0 when the service runs."""
+    """Print the state of files and units. Return 0 if the daemon's unit is active."""
     from acsard.host import service
 
     for file in service.files():

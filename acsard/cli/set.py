@@ -1,4 +1,4 @@
-"""`acsard set limits.linear_speed 0.8`: a setting of the robot that runs."""
+"""`acsard set limits.linear_speed 0.8`: change a setting of the running robot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ those that there are. Exit 1 when it is refused.
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "set",
         help="change a setting of the running robot, or list those that can be",
@@ -50,7 +50,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Set, or list."""
+    """Set the settings, or list them if none is given."""
     from acsard.client import connect
     from acsard.config.lowered import stays
     from acsard.host.errors import MendableError
@@ -84,7 +84,10 @@ def main(args: argparse.Namespace) -> int:
 
 
 def pairs(words: Sequence[str]) -> dict[str, Plain]:
-    """KEY VALUE KEY VALUE ... as settings; a value as TOML has it, a bare word as a text."""
+    """Return the settings from the words KEY VALUE KEY VALUE ...
+
+    A value is read as TOML; a bare word is a string. Raises `UsageError` if a value is missing.
+    """
     from acsard.host.errors import UsageError
 
     if len(words) % 2:
@@ -105,7 +108,7 @@ def _value(word: str) -> Plain:
 
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
-    """What --write is to change; said before anything is set."""
+    """Return the file that --write is to change. Raises `UsageError` before anything is set."""
     from acsard.host.errors import UsageError
 
     if not settings:
@@ -120,7 +123,7 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
 
 
 def _tell(config: object, as_json: bool) -> None:
-    """The settings that there are, with what they are now."""
+    """Print the settings that can be changed, with their present values."""
     import msgspec
 
     from acsard.config.live import flat, live

@@ -1,4 +1,4 @@
-"""`acsard sim`: the simulated microcontroller on a pty of its own."""
+"""`acsard sim`: the simulated microcontroller on its own pty."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acsard.sim.fake_mcu import FakeMcu
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "sim",
         help="a simulated microcontroller on a pty, for a separate `acsard run --port …`",
@@ -38,7 +38,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def fault(text: str) -> NamedFault:
-    """An argparse type: a fault by its name, with motors or numbers."""
+    """Return the fault of this name, with motors or numbers: an argparse type."""
     try:
         return named(text)
     except ValueError as error:
@@ -46,7 +46,7 @@ def fault(text: str) -> NamedFault:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Play the MCU until a signal."""
+    """Simulate the microcontroller until a signal."""
     import asyncio
 
     _, config = load(args.config)
@@ -54,7 +54,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _make_link(link: Path, device: str) -> None:
-    """A symbolic link to the device; an older link is replaced, nothing else is."""
+    """Make a symbolic link to the device. It may replace an older link but no other file."""
     try:
         if link.is_symlink():
             link.unlink()

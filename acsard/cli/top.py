@@ -1,4 +1,4 @@
-"""`acsard top`: the robot on one screen, live."""
+"""`acsard top`: show the robot live on one screen."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acsard.host.extras import install
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "top",
         help="the robot on one screen, live",
@@ -26,7 +26,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show until told otherwise."""
+    """Show the robot until the operator leaves, or print one screen."""
     try:
         from acsard.top import terminal
     except ImportError:

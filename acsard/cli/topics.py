@@ -1,4 +1,4 @@
-"""`acsard topics`: the table of keys."""
+"""`acsard topics`: print the table of keys."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "topics",
         help="list the keys on the bus: direction, type, rate, meaning",
@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def ros_table(config: Config) -> Topics:
-    """The ROS topics and services, each with the native key it stands for."""
+    """Return the ROS topics and services, each with the native key that it stands for."""
     from acsard.messages.schema import TopicInfo, Topics
     from acsard.messages.topics import by_key
     from acsard.ros.names import full_name

@@ -1,4 +1,4 @@
-"""What a shell offers where a value goes: words that are known without asking a robot."""
+"""The words that a shell offers for values. They are known without asking a robot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
 
 NUMBERS = "acsard log 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
-"""The recordings by their numbers; the files here are offered beside them."""
+"""Shell command that lists the recordings by number. The shell offers local files as well."""
 
 RECORDING: dict[str, str | dict[str, str]] = {
     "bash": "_acsard_recordings",
@@ -32,11 +32,14 @@ _acsard_recordings() {{
 }}""",
     },
 }
-"""In the words of shtab."""
+"""Completion of a recording for each shell, in the form that shtab expects."""
 
 
 def words() -> Mapping[tuple[str, str], list[str]]:
-    """By verb and argument; the names of sources are those of the defaults."""
+    """Return the words for each (verb, argument).
+
+    The names of sources are those of the defaults.
+    """
     config = Config()
     sources = [source.name for source in config.commands.sources]
     published = [topic.key for topic in PUBLISHED]

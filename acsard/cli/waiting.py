@@ -1,4 +1,4 @@
-"""Says why a tool waits: one that is silent looks like a robot that is dead."""
+"""Explanations of why a tool waits: without one, a silent tool looks like a dead robot."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ if TYPE_CHECKING:
     from acsard.client import Client
 
 QUIET_S = 2.0
-"""Of silence before it is told: whatever is published comes sooner, or tells that it is late."""
+"""Silence before it is explained, s.
+
+Published keys come sooner, or the daemon reports them as late.
+"""
 
 
 def nothing() -> str:
-    """There is nothing to say."""
+    """Return "": there is nothing to explain."""
     return ""
 
 
@@ -27,9 +30,16 @@ def nothing() -> str:
 def explained(
     look: Callable[[], str], after_s: float = QUIET_S, ceased: Callable[[], str] | None = None
 ) -> Iterator[Callable[[], None]]:
-    """Yields what is to be called when something has come: after so long without, what `look` finds
-    is told in one line on standard error; later, once for each silence as long, what `ceased`
-    finds. It looks in a thread of its own: nobody waits for it."""
+    """Yield a function that the caller calls for each message, and explain silences.
+
+    A separate thread prints the explanations on standard error, so that the caller never waits for
+    them.
+
+    Args:
+        look: explains why nothing has arrived for `after_s` s, in one line; "" prints nothing.
+        after_s: silence before it is explained, s.
+        ceased: explains each later silence of `after_s` s, once for each.
+    """
     come, end = Event(), Event()
 
     def say(found: str) -> bool:
@@ -55,7 +65,7 @@ def explained(
 
 
 def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
-    """What there is to say of a key on which nothing has come."""
+    """Return a function that explains why nothing has arrived on a key."""
 
     def look() -> str:
         from acsard.bus.fleet import around
@@ -72,7 +82,10 @@ def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
 
 
 def lost_by(robot: Client, where: Address) -> Callable[[], str]:
-    """What there is to say once what came has ceased: nothing while we are connected."""
+    """Return a function that explains why messages ceased.
+
+    It returns "" while the session is connected.
+    """
 
     def look() -> str:
         import zenoh
@@ -83,7 +96,7 @@ def lost_by(robot: Client, where: Address) -> Callable[[], str]:
             if robot.session.info.links():
                 return ""
         except zenoh.ZError:
-            return ""  # it is being closed
+            return ""  # the session is being closed
         gone = Around(linked=False, here=False)
         return of_link(where) or why("", where.robot_id, where.endpoint, gone)
 
@@ -91,7 +104,10 @@ def lost_by(robot: Client, where: Address) -> Callable[[], str]:
 
 
 def of_link(where: Address) -> str:
-    """What is wrong with the way there: by TLS a certificate may have ended while we followed."""
+    """Return what is wrong with the TLS connection, or "".
+
+    A certificate may have expired while the tool followed the robot.
+    """
     from acsard.bus.tls_trouble import trouble
     from acsard.config.settings import TLS
 

@@ -1,4 +1,4 @@
-"""`acsard web`: the robot's page, for browsers and programs; and who may come to it."""
+"""`acsard web`: serve the robot's page to browsers and programs, and manage access to it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "web",
         help="the robot's page: see it, stop it, drive it in a browser",
@@ -68,7 +68,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Serve, or see to the tokens."""
+    """Serve the page, or manage its tokens."""
     try:
         import aiohttp  # noqa: F401
         import segno  # noqa: F401
@@ -131,7 +131,10 @@ def _listen(args: argparse.Namespace, config: Config) -> tuple[Listen, ...]:
 
 
 def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
-    """A new token, shown once; `where` the configuration is."""
+    """Make a token and print its link once.
+
+    `where` is the path of the configuration, for messages.
+    """
     import segno
 
     from acsard.web.listen import invitations, require_certificate
@@ -161,7 +164,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
 
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:
-    """The tokens of the robot that is meant."""
+    """Return the tokens of the robot that the options name."""
     from acsard.bus.address import address_of
     from acsard.web.tokens import Vault, place
 
@@ -190,7 +193,7 @@ def _revoke(vault: Vault, name: str) -> int:
 
 
 def lasts(seconds: float) -> str:
-    """For how long, in words, rounded."""
+    """Return a duration in words, rounded to minutes, hours or days."""
     count, unit = round(seconds / 60), "minute"
     if count >= 60:
         count, unit = round(seconds / 3600), "hour"

@@ -1,4 +1,4 @@
-"""`acsard whoami`: what we may do on this bus, and by which certificate."""
+"""`acsard whoami`: show the role that this bus gives us, and the certificate it goes by."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from acsard.host.exits import Exit
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb."""
+    """Declare the verb and its options."""
     parser = verbs.add_parser(
         "whoami",
         help="what you may do there: role, certificate, sender",
@@ -23,7 +23,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Ask and print."""
+    """Ask the robot for our role and print it. Return `NO_PERMISSION` without a role."""
     import msgspec
 
     from acsard.client import connect

@@ -160,10 +160,11 @@ class Client:
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`.
 
-        `clear` releases the stop or fault that `state` shows now. Pass `latch=state.latch` of the
-        state that a person has looked at, and the daemon refuses if a stop came since.
+        `clear` releases the stop or fault that `state` shows now, and `activate` switches on a
+        robot that `state` shows as switched off now. Pass `latch=state.latch` of the state that a
+        person has looked at, and the daemon refuses if a stop or a `deactivate` came since.
         """
-        if service == "clear" and "latch" not in fields:
+        if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 

@@ -1,1 +1,1 @@
-"""Shell: `acsard doctor`: what is wrong on this machine, and how to mend it."""
+"""`acsard doctor`: diagnoses this machine and suggests fixes. The package does I/O."""

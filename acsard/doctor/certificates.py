@@ -1,4 +1,4 @@
-"""The files of bus.tls or --tls: are they there, private and in date?"""
+"""Examines the certificate files of bus.tls or --tls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from acsard.messages.expiry import expiry
 
 
 def certificates(tls: str) -> Iterator[Finding]:
-    """Are the files of this directory there, private and in date? Nothing of none, ""."""
+    """Yield findings about these files: whether they exist, are private and have not expired.
+
+    Yields nothing if `tls` is "".
+    """
     if not tls:
         return
     directory = Path(tls)

@@ -1,4 +1,4 @@
-"""The daemon: who hears it, does it run, and what does it say of itself?"""
+"""Examines the daemon: whether it can be reached, whether it runs, and its own reports."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from acsard.messages.schema import DiagnosticStatus
 from acsard.values import NS_PER_S, AcsardError
 
 APART_S = 0.4
-"""From 0.5 s on Zenoh replaces the stamps of the one that is ahead."""
+"""Clock difference that is reported, s.
+
+From 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
+"""
 
 GYRO_MENDS = {
     "used": "",
@@ -26,7 +29,7 @@ GYRO_MENDS = {
     "disagrees": "slower turns, other ground; if it stays so: its z must point up, in rad/s",
     "not believed": "its z must point up, in rad/s; then `acsard calibrate` finds the track",
 }
-"""By what `state` says of the gyro; nothing where all is well."""
+"""Remedy for each gyro status in `state`; "" if the status is good."""
 
 START = (
     "systemctl status acsard; or start it: acsard run; one that was started with --listen is asked "
@@ -40,7 +43,7 @@ ANOTHER = (
 
 ROUTER = "acsard: router"
 LOOP = "acsard: control loop"
-"""Rows of its diagnostics."""
+"""Names of rows in the daemon's diagnostics."""
 
 SIGN = "commands signed as the README says need no common clock"
 
@@ -55,7 +58,7 @@ PUT_ROUTER = (
 
 
 def routers(config: Config) -> Iterator[Finding]:
-    """Are they there, and whom does it lend its rights to?"""
+    """Yield findings about the routers: whether they listen, and which rights they pass on."""
     for endpoint in config.bus.connect:
         if not answers(endpoint):
             yield Finding("router", "warning", f"nobody listens at {endpoint}", START_ROUTER)
@@ -66,9 +69,9 @@ def routers(config: Config) -> Iterator[Finding]:
 
 
 def found(config: Config, address: Address) -> Running | Finding:
-    """The daemon that runs there, asked; else what is wrong with that.
+    """Return the daemon that was reached and asked, or the finding that explains the failure.
 
-    Raises `UsageError` for what is no endpoint.
+    Raises `UsageError` if the address is not an endpoint.
     """
     endpoint = address.endpoint
     if not answers(endpoint):
@@ -86,7 +89,7 @@ def found(config: Config, address: Address) -> Running | Finding:
 
 
 def daemon(running: Running) -> Iterator[Finding]:
-    """What does it say?"""
+    """Yield the findings of the daemon's reports."""
     state = running.state
     level: Level = "failure" if state.mode == "fault" else "ok"
     mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
@@ -111,7 +114,10 @@ def latch_file(trouble: str) -> Iterator[Finding]:
 
 
 def late(running: Running) -> Iterator[Finding]:
-    """Does it keep its periods, since its start or, as its diagnostics say, of late?"""
+    """Yield a warning if the daemon misses control periods, over its whole run or recently.
+
+    Its counters show the whole run, and its diagnostics the recent time.
+    """
     counters = running.state.counters
     missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
     told = [row.message for row in running.rows if row.name == LOOP and row.level]
@@ -123,9 +129,10 @@ def late(running: Running) -> Iterator[Finding]:
 
 
 def clocks(running: Running) -> Iterator[Finding]:
-    """Can stamps be compared, and were some replaced?
+    """Yield warnings if clocks differ, or if stamps were replaced.
 
-    The daemon said its time at some moment of the round trip; on this machine it has our clock.
+    The daemon's time was taken at some moment of the round trip. A daemon on this machine shares
+    our clock.
     """
     its_ns, counters = running.state.stamp.to_ns(), running.state.counters
     apart = (its_ns - running.looked_ns) / NS_PER_S
@@ -140,7 +147,7 @@ def clocks(running: Running) -> Iterator[Finding]:
 
 
 def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
-    """What does the gyro do, as `state` has it, and are its samples taken?"""
+    """Yield findings about the gyro's status in `state` and about refused samples."""
     words = next((text for name, text in WORDS.items() if name == does), does)
     if does != "off":
         mend = GYRO_MENDS.get(does, "is the daemon of another version?")
@@ -154,7 +161,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
 
 
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
-    """Is it connected to its routers, as its diagnostics say? Nothing where it has none."""
+    """Yield a finding about the daemon's connection to its routers, if any are configured."""
     row = rows.get(ROUTER)
     if row is not None:
         mend = START_ROUTER if row.level else ""
@@ -164,7 +171,7 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
 
 
 def door(config: Config) -> Iterator[Finding]:
-    """Is the door to the network open?"""
+    """Yield a finding for each endpoint of the TLS gateway."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
             yield Finding("door", "ok", f"open at {endpoint}")

@@ -1,8 +1,8 @@
-"""Everything the doctor looks at, in order: from the configuration to a robot that drives.
+"""All examinations in their order, from the configuration to a moving robot.
 
-It opens no port and sends nothing to a robot. Where a daemon runs, what it runs with is looked at:
-the file may say something else by now, or options did. Of one on another machine only what it says
-of itself: its port, files and door are there.
+The doctor opens no port and sends nothing to a robot. If a daemon runs, its own configuration is
+examined, because the file may have changed since and options may override it. For a daemon on
+another machine, only its own reports are examined: its port, files and gateway are there.
 """
 
 from __future__ import annotations
@@ -27,10 +27,15 @@ def examine(
     given: dict[str, dict[str, object]],
     told: Callable[[Config], Address] = address_of,
 ) -> Iterator[Finding]:
-    """Everything there is to find; `where` is the configuration's place, `text` what it says.
+    """Yield all findings.
 
-    `given` is what goes before the file, `told` where a file has its daemon. Raises `UsageError`
-    for what is no such place.
+    Args:
+        where: the path of the configuration, for messages.
+        text: the content of the configuration file.
+        given: values that override the file.
+        told: returns the daemon's address for a configuration.
+
+    Raises `UsageError` if that address is not an endpoint.
     """
     try:
         config = parse(text, given)
@@ -58,7 +63,8 @@ def examine(
     yield from scheduling(
         config.control.real_time, running.info.pid if isinstance(running, Running) else None
     )
-    # The service has copies of its own, as they were: a file that is gone is missed in its place.
+    # The service has copies of the certificates from its start. A file that has since been deleted
+    # is reported at its original place.
     for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
         yield from certificates(directory)
     yield from routers(config)

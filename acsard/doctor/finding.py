@@ -1,4 +1,4 @@
-"""What the doctor says of one thing."""
+"""A finding of the doctor."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from msgspec import Struct
 
 Level = Literal["ok", "warning", "failure"]
 LEVELS: tuple[Level, ...] = ("ok", "warning", "failure")
-"""As diagnostics number them."""
+"""Levels in the order of the numbers in ROS diagnostics."""
 
 
 class Finding(Struct, frozen=True):
-    """One thing that was looked at; `mend` is what to do, or can be done where it is ok."""
+    """The result for one subject. `mend` is the remedy, or advice if the level is ok."""
 
     subject: str
     level: Level

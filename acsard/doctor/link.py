@@ -1,4 +1,4 @@
-"""The link to the microcontroller, by two looks at the daemon's state: is it there, is it whole?"""
+"""Examines the link to the microcontroller by comparing two states of the daemon."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from acsard.doctor.running import Running
 from acsard.mcu.whose_silence import BUSY, is_ours
 
 LOST = 0.02
-"""Share of the lines; a sound link loses none."""
+"""Largest fraction of lines that may be lost. A sound link loses none."""
 
 DAY_S = 86400.0
 
 ENOUGH = 40
-"""Lines sent between the looks from which on their share is no chance."""
+"""Number of lines sent between both states from which on the fraction of losses is meaningful."""
 
 
 def link(running: Running) -> Iterator[Finding]:
-    """What is wrong with it, by the counters and words of the daemon."""
+    """Yield findings about the link, by the counters and reports of the daemon."""
     config, state = running.config, running.state
     mend = check(running)
     if state.link != "up":
@@ -33,9 +33,10 @@ def link(running: Running) -> Iterator[Finding]:
     passed = {
         key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
     }
-    # Once a day, since months, is its story; what happens more often is a warning.
+    # A fault that occurs at most once a day on average is history. One that is more frequent is a
+    # warning.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
-    # The built-in simulator is late with the daemon, and never unplugged.
+    # The built-in simulator is late whenever the daemon is, and it is never unplugged.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_late'}", 0):
         text = f"lost {late} times since the daemon's start because this computer did not run"
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
@@ -52,7 +53,7 @@ def link(running: Running) -> Iterator[Finding]:
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
-    """Of lines that were sent and came between two looks: is there one to each?"""
+    """Yield a warning if too few of the lines sent between the two states were answered."""
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
     if config.mcu.reply_period or sent < ENOUGH or came >= (1 - LOST) * sent - 1:
         return
@@ -63,7 +64,7 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
 
 
 def refused(counters: Mapping[str, int]) -> list[str]:
-    """Lines that did not count, if they are too many."""
+    """Return a warning about refused lines if there are too many of them."""
     kinds = {
         name.removeprefix("line_"): count
         for name, count in counters.items()
@@ -76,7 +77,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
-    """A link that was there and went, and how often."""
+    """Return the number of lost links that this computer did not cause, with a description."""
     times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
     text = (
         f"it was lost {times} times since the daemon's start: the board starts anew, is silent "
@@ -86,7 +87,7 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
 
 
 def check(running: Running) -> str:
-    """What looks closer at the board, and what it needs."""
+    """Return the command that examines the board more closely, and its preconditions."""
     port = running.config.mcu.port
     return (
         f"`acsard mcu check --port {port}` finds out why, wheels lifted; stop the daemon first: "

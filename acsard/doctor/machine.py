@@ -1,4 +1,4 @@
-"""The machine: programs that meddle, a clock that was set, real-time scheduling."""
+"""Examines the machine: programs that take serial ports, the clock, and real-time scheduling."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from acsard.values import NS_PER_S
 REAL = "run it as the service (deploy/systemd), which has it; without, load adds lateness"
 
 LEAST_YEAR = 2026
-"""A clock before this was never set: boards without a battery start in the past."""
+"""Year before which a clock was never set. Boards without a battery start in the past."""
 
 
 def meddlers() -> Iterator[Finding]:
-    """Programs that take serial ports for something else."""
+    """Yield findings about programs that take or disturb serial ports."""
     if running("brltty"):
         mend = "sudo apt remove brltty, unless you read Braille: it takes CH340 and FTDI ports"
         yield Finding("brltty", "failure", "runs", mend)
@@ -28,7 +28,7 @@ def meddlers() -> Iterator[Finding]:
 
 
 def clock_set() -> Iterator[Finding]:
-    """Stamps need a clock that was set."""
+    """Yield a finding about the wall clock, which the stamps depend on."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < LEAST_YEAR:
         mend = "set it (timedatectl), or let chrony do; odometry stamps are wall-clock times"
@@ -38,8 +38,13 @@ def clock_set() -> Iterator[Finding]:
 
 
 def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
-    """The loop likes to be real-time: has the daemon of this process got it, if one runs here, or
-    may we ask for it? `wanted` is control.real_time."""
+    """Yield a finding about real-time scheduling.
+
+    Args:
+        wanted: the setting control.real_time.
+        pid: the process of the daemon on this machine; without one, the rights of this process
+            count.
+    """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
         yield Finding("real time", "ok", "is not asked for (control.real_time = false)")

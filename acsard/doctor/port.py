@@ -1,4 +1,4 @@
-"""The serial port: is it there, may we use it, who else does? It is not opened."""
+"""Examines the serial port without opening it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from acsard.host.processes import holders
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
-    """Is it there, may we use it, does somebody else?"""
+    """Yield findings about the port: existence, permissions, and other programs that use it."""
     path = config.mcu.port
     if path == "sim":
         mend = '`acsard ports` lists the ports; write mcu.port = "/dev/acsar", say'
@@ -39,7 +39,7 @@ def serial_port(config: Config) -> Iterator[Finding]:
 
 
 def _hardware(name: str) -> Iterator[Finding]:
-    """Is it a usual board, does its chip hold bytes back?"""
+    """Yield warnings about an unknown board, and about a USB chip that delays bytes."""
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))

@@ -1,4 +1,4 @@
-"""The daemon that runs, asked: with what it was started, and how it is a second later."""
+"""Asks the running daemon for its configuration, and for its state twice, a second apart."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from acsard.messages.schema import DiagnosticStatus, Info, RobotState
 from acsard.values import AcsardError
 
 WATCHED_S = 1.0
-"""Over so long lines are counted: a hundred of them."""
+"""Time over which lines are counted, s: about a hundred lines."""
 
 SHOWN = 6
-"""Keys that are named one by one; more are another file."""
+"""Number of differing keys that are named one by one. More mean another file."""
 
 
 OPTIONS = (
     "mcu.port", "mcu.baud_rate", "robot.id", "bus.listen", "bus.connect", "record.directory",
     "ros.namespace",
 )  # fmt: skip
-"""What `acsard run` takes as options: whoever gave one meant it."""
+"""Keys that `acsard run` takes as options, so that a different value is intended."""
 
 WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
     (
@@ -56,29 +56,34 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         "its next start has the file's; `acsard set KEY VALUE --write` puts one into the file",
     ),
 )
-"""How a value can be another than the file's, by its key, and what to do."""
+"""Reasons for a value that differs from the file's, by its key, and the remedy."""
 
 
 class Running(Struct, frozen=True):
-    """What a daemon says: who it is, its configuration, and two looks at its state."""
+    """Reports of a daemon: its identity, its configuration, and two of its states."""
 
     info: Info
     config: Config
     before: RobotState
     state: RobotState
     looked_ns: int
-    """The middle of the time from asking for that to its answer, by this machine's wall clock."""
+    """Middle of the query of `state`, from request to answer, by this machine's wall clock, ns."""
     trip_ns: int = 0
-    """How long that took."""
+    """Duration of that request, ns."""
     rows: tuple[DiagnosticStatus, ...] = ()
-    """Its diagnostics."""
+    """Rows of the daemon's diagnostics."""
     here: bool = True
-    """On this machine, as far as its processes may be seen: a tunnel or a router may stand
-    between."""
+    """Whether the daemon runs on this machine, as far as its processes can be seen.
+
+    A tunnel or a router may stand between.
+    """
 
 
 def asked(config: Config, address: Address) -> Running:
-    """The daemon that is there; raises an `AcsardError`. `config` is what the file says."""
+    """Ask the daemon at this address. `config` is the configuration in the file.
+
+    Raises an `AcsardError` if it cannot be asked.
+    """
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
@@ -93,28 +98,31 @@ def asked(config: Config, address: Address) -> Running:
 
 
 def _configuration(robot: Client, info: Info, file: Config) -> Config:
-    """What it was started with; what `info` has of it, for those who may not ask for the rest."""
+    """Return the daemon's configuration.
+
+    A client that may not query it gets the file's, with the values that `info` contains.
+    """
     try:
         return from_builtins(robot.get("config"))
-    except (AcsardError, msgspec.ValidationError):  # not permitted, or another version's
+    except (AcsardError, msgspec.ValidationError):  # not permitted, or a daemon of another version
         mcu = replace(file.mcu, port=SIMULATOR if info.simulated else info.port)
         bus = replace(file.bus, listen=tuple(info.listen), connect=tuple(info.connect))
         return replace(file, robot=replace(file.robot, id=info.id), mcu=mcu, bus=bus)
 
 
 class Difference(Struct, frozen=True):
-    """A value of the daemon's and the file's."""
+    """The daemon's and the file's value of a key."""
 
     its: object
     ours: object
 
     def words(self, key: str) -> str:
-        """Both."""
+        """Return both values in words."""
         return f"{key} = {_text(self.its)}, not {_text(self.ours)}"
 
 
 def differences(runs: Config, file: Config) -> dict[str, Difference]:
-    """Each key that the daemon has otherwise than the file, with both values."""
+    """Return each key whose value differs between the daemon and the file, with both values."""
     its, ours = dict(flat(effective(runs))), dict(flat(effective(file)))
     return {
         key: Difference(its.get(key), ours.get(key))
@@ -124,7 +132,7 @@ def differences(runs: Config, file: Config) -> dict[str, Difference]:
 
 
 def compared(running: Running, file: Config) -> Iterator[Finding]:
-    """Does it run with what the file says?"""
+    """Yield findings about the agreement of the daemon's configuration with the file."""
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
@@ -143,13 +151,16 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
 
 
 def _tables(its: Mapping[str, Difference]) -> str:
-    """The daemon's values as lines of the file."""
+    """Return the daemon's values as lines of the file."""
     parts = [(key.rpartition("."), write(one.its)) for key, one in its.items()]
     return "; ".join(f"[{table}] {name} = {value}" for (table, _, name), value in parts)
 
 
 def answers(endpoint: str) -> bool:
-    """Somebody listens there; raises `UsageError` for what is no endpoint."""
+    """Return whether a program listens at the endpoint.
+
+    Raises `UsageError` if it is not an endpoint.
+    """
     host, _, port = reachable(endpoint).partition("/")[2].rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 65536):
         raise no_endpoint(endpoint)

@@ -1,11 +1,14 @@
-"""Many commanders -> one command: which source, and which sender of it.
+"""Chooses one command among many commanders: first the source, then the sender of that source.
 
-The rules (SAFETY): the live source of the highest priority is heard; among equals the one who
-came first keeps the robot until it falls silent, and so among the senders of one source; a source
-that may not drive yet (`neutral.py`) holds its place with zero, so that nobody below it drives
-past it. So does one that sends zeros, however long: a person who holds the robot still and a
-controller that has failed look the same. But it is told. Every refusal has a name to be counted
-under; `words.py` says it and all else in words. Source, sender, clock: see `values.Command`.
+- The robot follows the live source of the highest priority. Among sources of equal priority the
+  first one keeps the robot until it falls silent. The same holds for the senders of one source.
+- A source that is not armed yet (`neutral.py`) holds its place with zero, so that no source of a
+  lower priority drives past it.
+- A source that sends zeros holds the robot still for any length of time, because an operator who
+  wants that and a controller that has failed look the same. `state` and the log report it.
+
+Each refusal has a name under which it is counted, and `words.py` has the sentences for people.
+`values.Command` explains source, sender and clock.
 """
 
 from __future__ import annotations
@@ -21,19 +24,19 @@ from acsard.drive.neutral import Sender
 from acsard.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
 
 MAX_SENDERS = 16
-"""Senders remembered of one source; nobody pushes out one that is live and may drive."""
+"""Senders remembered per source. A sender that is live and armed is never replaced."""
 
 Objection = Literal["", "unknown_source", "not_finite", "crowded", "unproven", "stale"]
-"""What a command is refused for; "" when it counts."""
+"""The reason to refuse a command, or "" if the command counts."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
-"""s after which it is said that somebody holds the robot still, or waits, for so long."""
+"""Durations, s, after which `state` reports that a sender still sends zeros or still waits."""
 
 NOTHING, COMMAND = Wait("nothing"), Wait("command")
 
 
 class Choice(Struct, frozen=True):
-    """The twist to follow, or None when nobody may drive: then what `source` waits for."""
+    """The twist to follow, or None if no sender may drive; `wait` then has the reason."""
 
     source: str = ""
     twist: Twist | None = None
@@ -52,7 +55,7 @@ class _Source:
         self.use(settings, pause)
 
     def use(self, settings: Source, pause: float) -> None:
-        """Go by this timeout and pause from now on, its senders too."""
+        """Apply this timeout and this pause from now on, also to the senders."""
         self.pause_ns = int(pause * NS_PER_S)
         self.timeout_ns = int(settings.timeout * NS_PER_S)
         self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
@@ -61,7 +64,10 @@ class _Source:
             sender.use(self.timeout_ns, self.pause_ns)
 
     def sender(self, name: str, now_ns: int) -> Sender | None:
-        """The sender of this name, for whom one of less account makes room; None for no room."""
+        """Return the sender of this name, or None if the table is full of senders that drive.
+
+        A new sender replaces the one of the lowest account if the table is full.
+        """
         known = self.senders.get(name)
         if known is None:
             if len(self.senders) >= MAX_SENDERS:
@@ -73,7 +79,7 @@ class _Source:
         return known
 
     def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
-        """Rank a sender: one that may be driving, then one that may drive, then the latest."""
+        """Rank a sender: armed and live before armed, and then by its last message."""
         sender = self.senders[name]
         armed = sender.armed(now_ns)
         return armed and sender.live(now_ns), armed, sender.noticed_ns
@@ -89,14 +95,14 @@ class _Source:
             sender.unlearn()
 
     def live(self, now_ns: int) -> list[Sender]:
-        """The senders that are not silent: the armed ones first, in the order they came."""
+        """Return the live senders: the armed ones first, each group in the order of arrival."""
         live = [sender for sender in self.senders.values() if sender.live(now_ns)]
         if len(live) < 2:
             return live
         return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
 
     def latest_ns(self) -> int | None:
-        """When a command last counted, of whichever sender."""
+        """Return when a command of any sender last counted, None if none ever did."""
         times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
         return max(times, default=None)
 
@@ -106,12 +112,12 @@ class _Source:
             sender.require_neutral()
 
     def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
-        """What a sender that is not armed waits for."""
+        """Return the wait of a sender that is not armed."""
         pause = self.pause_ns / NS_PER_S
         return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
 
     def doubted(self, now_ns: int) -> Wait | None:
-        """What a source waits for whose commands do not count by their stamps, None if they do."""
+        """Return the wait of a source whose stamps are refused, None if they are not."""
         doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
         if not doubtful:
             return None
@@ -122,7 +128,7 @@ class _Source:
 
 
 class Arbiter:
-    """Holds the latest command of each sender and chooses whose is followed."""
+    """Holds the latest command of each sender and chooses the one that the robot follows."""
 
     def __init__(self, commands: CommandsConfig) -> None:
         self._sources = {
@@ -134,9 +140,10 @@ class Arbiter:
         self._freshness = Freshness()
 
     def use(self, commands: CommandsConfig) -> None:
-        """Go by these timeouts and this pause; who was heard and when, and his clock, stays known.
+        """Apply these timeouts and this pause from now on.
 
-        The sources are those that it was made with.
+        The last commands, the arming and the clocks of all senders stay as they are. The names and
+        priorities of the sources must be those that the arbiter was constructed with.
         """
         for settings in commands.sources:
             self._sources[settings.name].use(settings, commands.pause)
@@ -144,8 +151,8 @@ class Arbiter:
     def require_neutral(self, since_ns: int = 0) -> None:
         """Forget all commands and ask each sender for a zero before it drives again.
 
-        Only a zero that arrives at `since_ns` or later counts: one that was under way before the
-        stop was cleared says nothing about now.
+        Only a zero that arrives at `since_ns` or later counts. A zero that was sent before the stop
+        was cleared does not say that its sender stands still now.
         """
         self._since_ns = since_ns
         for source in self._ranking:
@@ -153,7 +160,7 @@ class Arbiter:
         self._holder = None
 
     def accept(self, command: Command) -> Objection:
-        """Take a command, or say what it is refused for."""
+        """Take a command and return "", or return the reason to refuse it."""
         source = self._sources.get(command.source)
         if source is None:
             return "unknown_source"
@@ -170,20 +177,20 @@ class Arbiter:
         if sender is None:
             return "crowded"
         if verdict in ("set", "first"):
-            # A sender has one clock on all its sources: all its zeros are as doubtful.
+            # A sender has one clock on all its sources, so the doubt concerns all its zeros.
             for other in self._ranking:
                 other.doubt(command.sender, verdict == "set")
         sender.take(command, self._since_ns, verdict)
         return "" if verdict in ("fresh", "set") else "unproven"
 
     def notice(self, source: str, sender: str, arrived_ns: int) -> None:
-        """A command that could not even be read: no sender who does that is silent."""
+        """Note a message that could not be decoded: its sender is not silent."""
         known = self._sources.get(source)
         if known is not None and sender in known.senders:
             known.senders[sender].notice(arrived_ns)
 
     def choose(self, now_ns: int) -> Choice:
-        """Whose command counts now, and which."""
+        """Return the command that the robot follows now."""
         heard = [source for source in self._ranking if source.senders]
         live = [(source, found[0]) for source in heard if (found := source.live(now_ns))]
         if not live:
@@ -203,7 +210,7 @@ class Arbiter:
         return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
 
     def _kept(self, holder: _Source, now_ns: int) -> str:
-        """Who sends speeds while the holder sends zeros, "" for nobody."""
+        """Return the name of a sender of speeds that the holder's zeros keep waiting, or ""."""
         for source in self._ranking:
             senders = source.live(now_ns)[source is holder :]
             if any(sender.twist != REST for sender in senders):
@@ -212,11 +219,11 @@ class Arbiter:
 
     @property
     def forgiven_ns(self) -> int:
-        """How much later the clocks of senders became in all, as `Freshness` has it, ns."""
+        """Sum of the delays, ns, that `Freshness` has forgiven foreign clocks."""
         return self._freshness.forgiven_ns
 
     def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
-        """What each source is doing and waiting for, highest priority first."""
+        """Return the status of each source, the highest priority first."""
         return tuple(self._status(source, now_ns) for source in self._ranking)
 
     def _status(self, source: _Source, now_ns: int) -> SourceStatus:
@@ -236,5 +243,5 @@ class Arbiter:
 
 
 def _lasts(ns: int) -> float:
-    """The largest of `LASTING_S` that this is; 0.0 for none."""
+    """Return the largest of `LASTING_S` that this duration has reached, 0.0 if none."""
     return max((seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S), default=0.0)

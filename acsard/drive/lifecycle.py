@@ -1,13 +1,14 @@
 """The latches, the facts beside them, and the mode that follows from both.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
-time, and only `activate` releases `inactive`. A clear must not release a stop that its sender has
-not seen, however late the network delivers it:
+time, and only `activate` releases `inactive`. Neither may release a stop or a `deactivate` that its
+sender has not seen, however late the network delivers it:
 
-- A clear that names a number releases the latch with exactly this number.
-- A clear without a number is refused until `LOOK_FIRST_S` after the last stop. It may release a
-  fault that its sender has not seen, because a fault that persists latches again.
-- A clear that arrived before the latch was set never releases it.
+- A request that names a number releases the latch with exactly this number.
+- A request without a number is refused until `LOOK_FIRST_S` after the last stop or `deactivate`,
+  and after the start. A clear may release a fault that its sender has not seen, because a fault
+  that persists latches again.
+- A request that arrived before the latch was set never releases it.
 
 `modes.py` derives the mode. `robot.py` decides how the wheels follow it.
 """
@@ -23,7 +24,7 @@ from acsard.drive.modes import LEAVING, Mode, RefusedError, mode_of, require_all
 from acsard.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
-"""Seconds after a stop in which `clear` must name it: a sent packet seldom takes longer."""
+"""Seconds in which a request must name the latch: a sent packet seldom takes longer."""
 
 LONG_AGO_NS = -(2**62)
 """Monotonic time before every other one."""
@@ -47,9 +48,18 @@ class Lifecycle:
         """Monotonic time at which a fault over a stop was last cleared."""
         self._stop_asked_ns = LONG_AGO_NS
         """Monotonic time at which the last stop arrived."""
+        self._off_ns = LONG_AGO_NS
+        """Monotonic time at which the robot was last switched off."""
+        self._began_ns: int | None = None
+        """Monotonic time of the first step, None before it."""
         self._derive()
 
     # facts
+
+    def begin(self, now: Instant) -> None:
+        """Note that a step begins; only the first one counts."""
+        if self._began_ns is None:
+            self._began_ns = now.mono_ns
 
     def link(self, up: bool) -> None:
         """Note whether the link to the board is up."""
@@ -103,11 +113,12 @@ class Lifecycle:
         if latch is None:
             return ""
         if number is None:
-            self._require_seen(asked_ns, now)
+            self._require_seen_stop(asked_ns)
             set_ns = max(self._stopped_ns, self._faulted_ns)
         else:
             if number != latch.number:
-                raise RefusedError(self._unseen(number, latch))
+                still = latch.why if latches.fault is None else f"in fault ({latch.why})"
+                raise RefusedError(_not_in_force(number, still, "srv/clear"))
             set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
         if asked_ns <= set_ns or now.mono_ns == set_ns:
             raise RefusedError("a stop or a fault came at the same time or later: call it again")
@@ -120,19 +131,36 @@ class Lifecycle:
             return "cleared; each sender must send a zero before it drives"
         return f"fault cleared; still {latches.stop.why}: call srv/clear again"
 
-    def activate(self) -> bool:
-        """Switch the robot on; return True if it was off."""
+    def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
+        """Switch the robot on; return True if it was off.
+
+        Args:
+            number: The latch that the sender has seen, 0 if `auto_activate` is False and no client
+                has switched the robot off, None if the request names none.
+            asked_ns: Monotonic time at which the request arrived.
+            now: Both clocks at this step.
+        """
         require_allowed(self.mode, "activate")
-        was_off = self._off
+        if not self._off:
+            return False
+        latch = self.latches.inactive
+        if number is not None and number != (0 if latch is None else latch.number):
+            still = "switched off" if latch is None else latch.why
+            raise RefusedError(_not_in_force(number, still, "srv/activate"))
+        if latch is not None:
+            if number is None:
+                self._require_seen(latch, self._off_ns, asked_ns, "srv/activate")
+            if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
+                raise RefusedError(f"{latch.why} at the same time or later: call it again")
         self._dormant = False
         self._latch(inactive=None)
-        return was_off
+        return True
 
     def deactivate(self, by: str, now: Instant) -> str:
-        """Switch the robot off; the first request that did it stays latched."""
+        """Switch the robot off under a new number, also if it is off already."""
         require_allowed(self.mode, "deactivate")
-        if self.latches.inactive is None:
-            self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
+        self._off_ns = now.mono_ns
+        self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
         return "inactive: ramping to zero; srv/activate switches it on"
 
     def lower(self, limits: dict[str, float]) -> None:
@@ -181,8 +209,8 @@ class Lifecycle:
             commanded=self._commanded,
         )
 
-    def _require_seen(self, asked_ns: int, now: Instant) -> None:
-        """Raise `RefusedError` if a stop came so shortly before that the sender may not know it."""
+    def _require_seen_stop(self, asked_ns: int) -> None:
+        """Raise `RefusedError` if the sender of a clear may not know the stop that is latched."""
         stop = self.latches.stop
         if stop is None:
             return
@@ -192,23 +220,31 @@ class Lifecycle:
                 f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
                 f"{stop.why}: look at it, then call srv/clear again"
             )
-        # The monotonic clock says nothing of a stop before the restart.
-        since = (now.wall_ns - stop.at_ns) if stop.kept else asked_ns - self._stopped_ns
-        if 0 <= since < LOOK_FIRST_S * NS_PER_S:
-            age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
-            raise RefusedError(
-                f"a stop by {stop.by or 'request'} came {age_s:.1f} s ago: look at the robot, then "
-                f"call srv/clear again {LOOK_FIRST_S:g} s after it, or with the latch of the state "
-                "that you have looked at"
-            )
+        self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
 
-    def _unseen(self, number: int, latch: Latch) -> str:
-        """Return why a clear that names this number does not release `latch`."""
-        still = f"in fault ({latch.why})" if latch is self.latches.fault else latch.why
-        return (
-            f"latch {number} is not in force; the robot is still {still}: look at it, then call "
-            "srv/clear again"
+    def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
+        """Raise `RefusedError` if this latch is so new that the sender may not know it."""
+        began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
+        since = asked_ns - max(set_ns, began_ns)
+        if since >= LOOK_FIRST_S * NS_PER_S:
+            return
+        age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
+        came = f"the robot was {latch.why} {age_s:.1f} s ago"
+        if set_ns < began_ns:
+            # The monotonic clock does not reach back before the start, and the wall clock may have
+            # been set since.
+            came = f"the daemon started {age_s:.1f} s ago and the robot is still {latch.why}"
+        raise RefusedError(
+            f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, or "
+            "with the latch of the state that you have looked at"
         )
+
+
+def _not_in_force(number: int, still: str, call: str) -> str:
+    return (
+        f"latch {number} is not in force; the robot is still {still}: look at it, then call {call} "
+        "again"
+    )
 
 
 def _when(latch: Latch) -> str:

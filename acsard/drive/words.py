@@ -1,4 +1,4 @@
-"""What the arbiter decides, in words for people: `state`, `diagnostics`, the log."""
+"""Sentences about the arbiter's decisions, for `state`, `diagnostics` and the log."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ ROS_NEVER = (
 
 
 def chosen(choice: Choice) -> str:
-    """Whose command is followed, or why nobody's is."""
+    """Return which source the robot follows, or why it follows none."""
     if choice.wait.what == "command":
         return "waiting for a command: no source has sent one within its timeout"
     return waiting(choice.wait) or f"commanded by {choice.source}"
 
 
 def waiting(wait: Wait) -> str:
-    """What a source waits for; "" for nothing."""
+    """Return the sentence for what a source waits for, "" if it waits for nothing."""
     match wait.what:
         case "nothing":
             return ""
@@ -45,7 +45,8 @@ def waiting(wait: Wait) -> str:
         case "late":
             return (
                 f"commands of {wait.source} come too late, by more than {wait.seconds:g} s: the "
-                "network holds them up, or the sender's clock was set"
+                "network holds them up, or the sender's clock was set; if this goes on, look at "
+                "the network, then restart the sender"
             )
         case "neutral":
             lasts = f"; it has sent speeds for over {_long(wait.lasts)}" if wait.lasts else ""
@@ -67,7 +68,7 @@ def waiting(wait: Wait) -> str:
 
 
 def _long(seconds: float) -> str:
-    """A time to the unit that people would say it in."""
+    """Return a duration in hours, minutes or seconds, in the largest unit that it fills."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= size:
             return f"{seconds / size:g} {unit}"

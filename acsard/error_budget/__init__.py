@@ -1,1 +1,1 @@
-"""`acsard odom`: what makes the odometry of a running robot wrong, cause by cause."""
+"""`acsard odom` shows the error budget of a running robot's odometry, cause by cause."""

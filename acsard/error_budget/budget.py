@@ -1,10 +1,11 @@
-"""What makes odometry wrong now, cause by cause: the error budget of a stretch of driving.
+"""The error budget of a drive: how much each cause contributes to the present odometry error.
 
-Each cause alone goes through the odometry's own model of how errors of a step become errors of the
-pose (`drive/uncertainty.py`), over the same driving again and again: until 100 m are driven, for
-the place, and until 360 deg are turned, all to one side, for the heading. How large it is in each
-step is measured where lines can tell (time, quantisation, gaps, wheels that contradict each other,
-what odometry holds a gyro for), and is otherwise what `[odometry]` declares.
+Each cause is propagated alone through the odometry's own error model (`drive/uncertainty.py`). The
+recorded drive is repeated until 100 m are driven, which gives the position error, and until 360 deg
+are turned to one side, which gives the heading error. The size of a cause in each step is measured
+if the feedback lines show it. This holds for time, quantisation, gaps, wheels that contradict each
+other, and the gyro noise that odometry assumes. All other sizes come from the declarations in
+`[odometry]`.
 """
 
 from __future__ import annotations
@@ -32,72 +33,76 @@ from acsard.values import REST
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""Seen in the lines, declared in `[odometry]`, or nothing is known of it."""
+"""Source of a share: visible in the lines, declared in `[odometry]`, or unknown."""
 
 METRES = 100.0
 
 LEAST_M, LEAST_RAD = 0.2, 0.2
-"""What must be driven or turned to tell anything of 100 m or of a turn."""
+"""Minimum distance (m) and minimum turn (rad) of a drive from which errors can be extrapolated."""
 
 LEAST_LINES = 20
 
 STEP_S = 0.1
 MOST_STEPS = 20_000
-"""Of the way to 100 m; who creeps takes longer steps."""
+"""Maximum number of steps until 100 m are driven. A slow drive gets longer steps."""
 
 STRAIGHT, SPIN = Step(0.05, 0.0), Step(0.0, 0.05)
-"""What is declared is told for, while nothing is driven."""
+"""Steps for which the declared errors are computed while the robot does not drive."""
 
 ZERO = (0.0,) * 6
 
 
 class Share(Struct, frozen=True):
-    """What one cause alone would make of the error; None where this driving does not tell."""
+    """Contribution of one cause alone; None if this drive does not show it."""
 
     cause: Cause
     mm_per_100_m: float | None
-    """Standard deviation of the place after 100 m, mm."""
+    """Standard deviation of the position after 100 m, mm."""
     deg_per_turn: float | None
-    """Of the heading after 360 deg, deg."""
+    """Standard deviation of the heading after a turn of 360 deg, deg."""
     basis: Basis
 
 
 class Budget(Struct, frozen=True):
-    """All causes, and what was driven."""
+    """The contributions of all causes, and facts about the drive."""
 
     seconds: float
     metres: float
     turned: float
-    """deg, to both sides together."""
+    """Sum of the turns to both sides, deg."""
     lines: int
     missing: int
-    """Lines that did not come."""
+    """Number of missing lines."""
     unseen: float
-    """s of driving without lines."""
+    """Driving time without lines, s."""
     lateness: float
-    """s rms by which lines were taken for later or earlier than they were."""
+    """RMS error of the lines' time stamps, s."""
     quantum: float
-    """rad/s: the step between two speeds that lines can tell."""
+    """Quantization step of the wheel speeds in the lines, rad/s."""
     counts: int
-    """Of the encoders per wheel turn, where lines show them or they are configured; else 0."""
+    """Encoder counts per wheel turn, from the lines or the configuration; 0 if unknown."""
     gyro: bool
-    """The heading is a gyro's."""
+    """True if the heading comes from a gyro."""
     still: bool
-    """It hardly moved: only what is configured can be told."""
+    """True if the robot hardly moved, so that only configured errors can be reported."""
     at_rest: tuple[float, float]
-    """m/s and rad/s: what the quantum of two decimals leaves of each report's twist."""
+    """Standard deviations (m/s, rad/s) of each report's twist due to its two decimals."""
     shares: tuple[Share, ...]
     multiplier: float = 1.0
-    """Configured: effective track over wheel separation."""
+    """Configured ratio of effective track to wheel separation."""
     learned: float | None = None
-    """The same as the gyro implies it, on the way; None is not known."""
+    """The same ratio as implied by the gyro, averaged over the drive so far; None if unknown."""
     learned_std: float = 0.0
-    """Its standard deviation."""
+    """Standard deviation of `learned`."""
     learned_used: bool = False
-    """Where the wheels alone tell the turn, it is by that."""
+    """True if odometry uses `learned` when it has only the wheels to measure a turn."""
 
     def largest(self, *bases: Basis) -> Share | None:
-        """Of what is told so, the largest of the place, else of the heading."""
+        """Return the share with the largest position error among these bases, or else heading
+        error.
+
+        Returns None if no share with one of these bases is greater than 0.
+        """
         known = [one for one in self.shares if one.basis in bases]
         for size in (_millimetres, _degrees):
             found = max(known, key=size, default=None)
@@ -106,34 +111,34 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """mm and deg of all causes together: independent of each other."""
+        """Return the combined error of all causes in mm and deg; the causes are independent."""
         return _squares([one.mm_per_100_m for one in self.shares]), _squares(
             [one.deg_per_turn for one in self.shares]
         )
 
 
 class Heard(Struct, frozen=True):
-    """What came from the bus."""
+    """The data that was received from the bus."""
 
     lines: list[Line]
     sent: list[float]
-    """When lines left for the microcontroller, s."""
+    """Times at which lines were sent to the microcontroller, s."""
     whole: bool = True
-    """Every line that the daemon got is among them."""
+    """True if every line that the daemon received is included."""
     counted: bool = False
-    """Lines carry the encoders' counts and the microcontroller's time."""
+    """True if the lines carry encoder counts and the microcontroller's time."""
     gyro: bool = False
-    """The heading is a gyro's."""
+    """True if the heading comes from a gyro."""
     learned: float | None = None
-    """The effective track that a gyro implies, as a share of the configured one,"""
+    """Effective track that the gyro implies, relative to the configured one; None if unknown."""
     deviation: float = 0.0
-    """its standard deviation, as a share of itself,"""
+    """Relative standard deviation of `learned`."""
     used: bool = False
-    """and whether it is in use where the wheels alone tell the turn."""
+    """True if odometry uses `learned` when it has only the wheels to measure a turn."""
 
 
 def budget(heard: Heard, config: Config, metres: float = METRES) -> Budget:
-    """Of a daemon with this configuration; `metres` stands for the 100."""
+    """Return the error budget of a daemon with this configuration; `metres` replaces the 100 m."""
     kinematics = Kinematics(config.drive)
     if len(heard.lines) >= LEAST_LINES:
         moved = motion(heard.lines, np.array(heard.sent), kinematics, heard.whole)
@@ -144,7 +149,7 @@ def budget(heard: Heard, config: Config, metres: float = METRES) -> Budget:
 
 
 def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: float) -> Budget:
-    """What the settings tell."""
+    """Return the budget of a robot that stands, from the settings alone."""
     lines, shares = heard.lines, []
     for cause, kind in _declared(config.odometry, kinematics):
         place = _driven(kind, kinematics, 0, [STRAIGHT], metres)
@@ -165,7 +170,7 @@ def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: floa
 
 
 class _Driven:
-    """The shares of what was driven."""
+    """Computes the shares of a drive."""
 
     def __init__(
         self, heard: Heard, config: Config, kinematics: Kinematics, moved: Motion, metres: float
@@ -194,10 +199,10 @@ class _Driven:
         )  # fmt: skip
 
     def _of_lines(self, driving: Driving, counts: int) -> Iterator[Share]:
-        """Time, quantisation and gaps."""
+        """Yield the shares of time, quantisation and gaps."""
         heard, none = self._heard, _only(self._config.odometry)
         if heard.counted:
-            # Counts are cumulative: when a line came, or whether, does not matter to them.
+            # Counts are cumulative, so late and missing lines cause no error.
             yield self._share("time", "measured", none, [])
             yield self._share("quantisation", "measured", none, driving.plain(), counts)
             yield self._share("gaps", "measured", none, [])
@@ -208,7 +213,7 @@ class _Driven:
         yield self._share("gaps", told, none, driving.missed())
 
     def _of_base(self, driving: Driving) -> Iterator[Share]:
-        """Slip, parameters and the gyro."""
+        """Yield the shares of slip, parameters and the gyro."""
         heard, odometry = self._heard, self._config.odometry
         declared = self._share("slip", "settings", _only(odometry, noise=True), driving.plain())
         seen = self._share("slip", "measured", _only(odometry), driving.contradicted())
@@ -257,9 +262,10 @@ def _driven(
     odometry: OdometryConfig, kinematics: Kinematics, counts: int, steps: Sequence[Step],
     metres: float, turns: float = math.inf, scale: float = 0.0,
 ) -> PoseUncertainty | None:  # fmt: skip
-    """The error after so many m or rad of these steps, again and again; None without steps.
+    """Return the error after `metres` m or `turns` rad of these steps, repeated; None without
+    steps.
 
-    `scale` is what a gyro's is off by.
+    `scale` is the relative standard deviation of the gyro's scale.
     """
     if not steps:
         return None
@@ -282,7 +288,7 @@ def _driven(
 def _only(
     odometry: OdometryConfig, *, noise: bool = False, parameters: bool = False
 ) -> OdometryConfig:
-    """The odometry's model with one kind of error and no other."""
+    """Return the odometry's model with a single kind of error."""
     made = replace(odometry, pose_covariance_diagonal=ZERO)
     if not noise:
         made = replace(

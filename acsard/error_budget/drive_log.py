@@ -1,4 +1,4 @@
-"""A stretch of driving as the bus tells it: what the error budget is made of."""
+"""A drive and its measured errors, reconstructed from feedback lines for the error budget."""
 
 from __future__ import annotations
 
@@ -18,36 +18,40 @@ from acsard.values import Twist, WheelSpeeds
 Floats = npt.NDArray[np.float64]
 
 BLOCK_S = 0.5
-"""Errors of time hang together for as long: the longest stall of a host is 0.3 s."""
+"""Time over which errors of line times are correlated; the longest stall of a host is 0.3 s."""
 
 LEAST_LINES, ALIKE = 20, 0.99
-"""Lines on the way that tell what a gyro's noise costs; and the cosine from which on turning and
-the time that passes are one and the same."""
+"""Limits for the fit of the gyro's noise: minimum number of moving lines, and the cosine from which
+turn and time cannot be told apart."""
 
 LATEST_S = 0.1
-"""A line that is later tells when it was read; its way is looked at as a gap's."""
+"""Lateness in s from which a stamp shows only when the line was read. Its motion is then treated as
+a gap."""
 
 Wheels = tuple[float, float, float, float]
 
 
 class Line(Struct, frozen=True):
-    """A feedback line and what odometry made of it."""
+    """A feedback line and the odometry computed from it."""
 
     at: float
-    """Its stamp, s."""
+    """Stamp, s since the start."""
     speeds: Wheels
-    """rad/s"""
+    """Wheel speeds, rad/s."""
     positions: Wheels
-    """rad that the wheels have turned by then."""
+    """Wheel positions, rad."""
     yaw: float
-    """rad"""
+    """Heading, rad."""
     yaw_variance: float
-    """rad2"""
+    """Variance of the heading, rad2."""
 
 
 class Stood(Struct, frozen=True):
-    """The pose stood while the robot went on by about so much: m, rad, and how well that is known,
-    m2 and rad2."""
+    """Motion of the robot during a gap in which the pose did not change.
+
+    `distance` (m) and `turn` (rad) are the estimated motion; `along` (m2) and `yaw` (rad2) are its
+    variances.
+    """
 
     distance: float = 0.0
     turn: float = 0.0
@@ -56,33 +60,42 @@ class Stood(Struct, frozen=True):
 
 
 class Motion(Struct, frozen=True):
-    """Of each line but the first: what the robot did since the one before, and what of it erred."""
+    """Motion between consecutive lines and its errors.
+
+    The arrays have one entry per line but the first.
+    """
 
     seconds: float
-    """Of all."""
+    """Duration of the drive, s."""
     period: float
     distance: Floats
-    """m, signed."""
+    """Signed distance, m."""
     turn: Floats
-    """rad"""
+    """Turn, rad."""
     yaw_variance: Floats | None
-    """rad2 that odometry itself added with time, None where that cannot be told."""
+    """Variance that odometry added to the heading with time, rad2; None if it cannot be
+    determined."""
     late: Floats
-    """m and rad that each line's time changed: columns of two."""
+    """Errors due to wrong line times, rows of (m, rad)."""
     lateness: float
-    """s rms, of the lines' stamps."""
+    """RMS error of the line times, s."""
     bridged: Floats
-    """m2 and rad2 of lines that are missing, where the pose went on without them."""
+    """Variances due to missing lines across which odometry continued the pose, rows of (m2,
+    rad2)."""
     stood: dict[int, Stood]
-    """By the line at the end of each gap in which it did not."""
+    """Gaps across which odometry did not move the pose, by the index of the line that ends each
+    gap."""
     missing: int
     unseen: float
-    """s of all gaps."""
+    """Total duration of the gaps, s."""
 
 
 def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool) -> Motion:
-    """`sent` is when lines left for the microcontroller, s. `whole` says that every line the daemon
-    got is here: else one that is missing here is none that it missed. Needs 3 lines.
+    """Compute the motion of at least 3 lines.
+
+    `sent` holds the times (s) at which lines were sent to the microcontroller. If `whole` is False,
+    lines may have been lost on the way to this program, so a missing line is not counted as missed
+    by the daemon.
     """
     t = np.array([line.at for line in lines])
     found = places(t, sent)
@@ -107,13 +120,16 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
 
 
 def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Floats | None:
-    """rad2 by which the heading's variance grows in each line with time alone, while wheels turn.
+    """Return the growth of the heading's variance with time alone in each line while wheels turn,
+    rad2.
 
-    What a gyro's scale errs by is squared with all that was turned since the pose was set, so that
-    each line adds 2 S2 A dA more, of A before it: found by least squares with it, and left out.
-    None where turns and time cannot be told apart.
+    The variance also contains the scale error of the gyro, S^2 A^2, where S is the relative
+    standard deviation of the scale and A the turn since the pose was set. A line with the turn dA
+    adds 2 S^2 A dA. The part of A from before the first line is unknown, so a least-squares fit
+    estimates it together with the rate, and discards it. Returns None if turn and time cannot be
+    told apart.
     """
-    # Of a pose that was set anew the variance falls.
+    # The variance falls when the pose is set; such lines are left out.
     dt, moves = np.diff(t), speeds[1:].any(axis=1) & (variances[1:] > variances[:-1] / 2)
     levers, before = 2 * GYRO_SCALE**2 * turns, np.cumsum(turns) - turns / 2
     grown = np.diff(variances) - levers * before
@@ -129,10 +145,15 @@ def _noise(t: Floats, speeds: Floats, turns: Floats, variances: Floats) -> Float
 
 
 def _late(t: Floats, twists: list[Twist], found: Places) -> Floats:
-    """The sum of speed x error of dt, in parts: minus the lateness x the change of speed."""
+    """Return the errors of each line's motion: the sum of speed times time error, rearranged.
+
+    By summation by parts, each line contributes minus its lateness times the following change of
+    speed.
+    """
     speeds = np.array([(one.linear, one.angular) for one in twists])
     near = np.abs(found.late) <= LATEST_S
-    # Being late by the same amount changes nothing: what is left of it would count in every part.
+    # A constant lateness causes no error, so remove its mean, which would otherwise count in every
+    # part.
     late = np.where(near, found.late - found.late[near].mean(), 0.0)
     parts = np.zeros((len(t) - 1, 2))
     parts[:-1] = -late[1:-1, None] * np.diff(speeds[1:], axis=0)
@@ -140,7 +161,7 @@ def _late(t: Floats, twists: list[Twist], found: Places) -> Floats:
 
 
 class _Gaps:
-    """What was missed, by the odometry's own model of what a robot does unseen."""
+    """The gaps of a drive, judged by the odometry's own model of unseen motion."""
 
     def __init__(
         self, t: Floats, twists: list[Twist], rolled: list[Twist], found: Places, whole: bool
@@ -175,8 +196,11 @@ def _bridged(
     seconds: float, moved: Twist, before: Twist, after: Twist, mean: Twist, period: float,
     gaps: Gaps,
 ) -> tuple[float, float]:  # fmt: skip
-    """m2 and rad2: what may have been in between, and what another line across it than the straight
-    one is off."""
+    """Return the variances (m2, rad2) of a gap that odometry filled with a straight line.
+
+    They are the sum of the model's variance for unseen motion and of the square of the deviation
+    from the mean of the two speeds.
+    """
     along, yaw = gaps.unseen(seconds, before, after)
     off = moved.linear - after.linear * period - mean.linear * seconds
     turned = moved.angular - after.angular * period - mean.angular * seconds

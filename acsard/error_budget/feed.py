@@ -1,4 +1,4 @@
-"""Messages of a running daemon -> what its error budget is made of."""
+"""Converts messages of a running daemon to the input of the error budget."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ from acsard.messages.schema import (
 from acsard.values import NS_PER_S
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
-"""What there is to follow."""
+"""Keys to subscribe to."""
 
 MOST = 60_000
-"""Lines that are remembered: ten minutes."""
+"""Maximum number of kept lines: ten minutes at 100 Hz."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Lines of the daemon that may not be here: fewer than both are the ends of what was heard."""
+"""Lines of the daemon that may be missing here, as a number and as a share, the larger counts.
+Fewer are explained by the boundaries of the observed time."""
 
 SAMPLED = "checked with samples"
-"""The check of a link whose lines carry the encoders' counts, as `diagnostics` have it."""
+"""Name of the link check whose lines carry the encoder counts, as in `diagnostics`."""
 
 
 class Feed:
-    """Follows a daemon; `add` each message, then ask what was `heard`."""
+    """Collects a daemon's messages: `add` each one, then call `heard`."""
 
     def __init__(self, config: Config, first: RobotState) -> None:
-        """`first` is the state just before the first message."""
+        """Start the collection; `first` is the state just before the first message."""
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
@@ -45,7 +46,7 @@ class Feed:
         self._count = 0
 
     def add(self, message: Message) -> None:
-        """One of `KEYS`, each in its order."""
+        """Add a message of one of `KEYS`; the messages of each key must be in order."""
         if isinstance(message, TwistStamped):
             self._sent.append(message.header.stamp.to_ns())
         elif isinstance(message, Odometry):
@@ -56,7 +57,7 @@ class Feed:
             self._join(message.header.stamp.to_ns())
 
     def heard(self, last: RobotState, diagnostics: DiagnosticArray) -> Heard:
-        """All so far; both are of now."""
+        """Return all data so far; both arguments must be current."""
         lines, zero = [line for _, line in self._lines], self._start_ns
         learned, deviation, used = _learned(diagnostics)
         return Heard(
@@ -71,11 +72,14 @@ class Feed:
         )
 
     def _join(self, stamp_ns: int) -> None:
-        """A line when both of its messages are here; several of one stamp count as they come."""
+        """Combine the two messages of a line, matched by stamp.
+
+        Messages with the same stamp pair in order.
+        """
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):
-                if len(waiting) > 100:  # the other one was lost
+                if len(waiting) > 100:  # the other message was lost
                     del waiting[next(iter(waiting))]
             return
         del self._odom[stamp_ns], self._wheels[stamp_ns]
@@ -100,13 +104,17 @@ class Feed:
 
 
 def _value(diagnostics: DiagnosticArray, key: str) -> str:
-    """The first value of this name in any row, "" for none."""
+    """Return the first value with this key in any row, or ""."""
     rows = (value for status in diagnostics.status for value in status.values)
     return next((value.value for value in rows if value.key == key), "")
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """The track that a gyro implies, as a share of the configured one, its deviation, its use."""
+    """Return the track implied by the gyro, its deviation, and whether it is used.
+
+    The track is relative to the configured one, and its standard deviation is relative to itself.
+    The track is None if unknown.
+    """
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)
     used = _value(diagnostics, "multiplier_in_use") == learned != configured

@@ -1,9 +1,10 @@
-"""How late each feedback line was held to be made, and how many are missing before it.
+"""Estimates how late the stamp of each feedback line is, and how many lines are missing before it.
 
-A microcontroller makes its lines evenly, or one for each line it is sent. Nothing reaches the host
-before it was made, so of all lines within some time the promptest tells where the others belong;
-once even that one comes a whole place later, a line is missing. What remains between a line's stamp
-and its place is the error of its time.
+A microcontroller sends its lines either at a fixed period or as answers to the host's lines. A line
+cannot arrive before it was made. So the earliest line among its neighbours, relative to the
+expected grid, shows where the grid is. If even the earliest one is a whole place later, a line is
+missing. The remaining difference between a line's stamp and its place on the grid is the error of
+its time.
 """
 
 from __future__ import annotations
@@ -16,31 +17,38 @@ Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.int64]
 
 AHEAD = 30
-"""Lines among which one is prompt: the longest stall of a host is 0.3 s."""
+"""Number of lines of which at least one is not delayed; the longest stall of a host is 0.3 s."""
 
 MISSING = 0.6
-"""Places that even the promptest must come later."""
+"""Delay of the earliest line, in places, from which a line counts as missing."""
 
 FOLLOWED = 0.05
-"""Share of a new difference in where the prompt ones are: the period is known to 1 % at first."""
+"""Share of a new delay that corrects the grid, because the period is known to about 1 % at
+first."""
 
 CLUSTERED, ALIKE = 0.4, 0.25
-"""Lines that come one by one are mostly a period apart, within this share of it."""
+"""Criterion for lines that arrive one by one: this share of the intervals is close to the median,
+within this relative tolerance."""
 
 
 class Places(Struct, frozen=True):
-    """Of each line: `late` s after its place, 0 in the middle, and lines `missing` before it."""
+    """Estimates for each line.
+
+    `late` is its delay in s relative to the median, and `missing` the number of lines missing
+    before it.
+    """
 
     late: Floats
     missing: Counts
     period: float
-    """s between two lines, the mean."""
+    """Mean interval between two lines, s."""
 
 
 def places(t: Floats, sent: Floats) -> Places:
-    """Of lines with stamps `t`, s; `sent` is when lines left that may have asked for them.
+    """Estimate the delays of at least 3 lines with stamps `t` (s).
 
-    Of the two ways to make lines that one is taken that leaves the smaller errors. Needs 3 lines.
+    `sent` holds the times (s) of the host's lines. Both ways to send lines are tried, and the one
+    with the smaller errors is returned.
     """
     even = _even(t)
     asked = _asked(t, sent)
@@ -50,14 +58,14 @@ def places(t: Floats, sent: Floats) -> Places:
 
 
 def _even(t: Floats) -> Places:
-    """Made with an even period."""
+    """Estimate the delays of lines with a fixed period."""
     steps = np.diff(t)
     usual, mean = float(np.median(steps)), float(np.mean(steps))
     alike = np.abs(steps - usual) < ALIKE * usual
     period = usual if np.mean(alike) > CLUSTERED else mean
     missing = _missing((t - t[0]) / period if period > 0.0 else np.arange(len(t), dtype=float))
     number = np.arange(len(t)) + np.cumsum(missing)
-    # Twice: a stall that pulls at the line through all is left out of the second.
+    # Fit twice: the second fit leaves out stalls that distorted the first line.
     among = np.ones(len(t), dtype=bool)
     for _ in range(2):
         slope, start = np.polyfit(number[among], t[among], 1)
@@ -67,7 +75,7 @@ def _even(t: Floats) -> Places:
 
 
 def _asked(t: Floats, sent: Floats) -> Places | None:
-    """Each made for the line that left before it; None when no such lines are known."""
+    """Estimate the delays of lines that answer the host's lines; None if those are unknown."""
     if len(sent) < 3 or sent[0] > t[0] or len(sent) < len(t) / 2:
         return None
     at = np.interp(t, sent, np.arange(len(sent)))
@@ -82,7 +90,10 @@ def _asked(t: Floats, sent: Floats) -> Places | None:
 
 
 def _missing(at: Floats) -> Counts:
-    """How many are missing before each line; `at` is where its stamp says that it belongs."""
+    """Return the number of missing lines before each line.
+
+    `at` is the place on the grid that each line's stamp suggests.
+    """
     count = len(at)
     ahead = at - np.arange(count)
     padded = np.concatenate([ahead, np.full(AHEAD, np.inf)])

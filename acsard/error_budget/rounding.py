@@ -1,13 +1,13 @@
-"""What wheels turned more or less than their lines said, because a line has two decimals.
+"""Estimates the error of wheel positions because a line carries speeds with two decimals.
 
-A value that is rounded anew each time errs by q / sqrt(12), q being the quantum. While a wheel goes
-on at one speed the same error is made again and again, so a run of equal values counts as one error
-as long as the run; not one that the wheel passes through on its way from slower to faster, where
-the errors of its two halves cancel each other.
+Independent rounding has a standard deviation of q / sqrt(12), where q is the quantization step. A
+wheel at a constant speed repeats the same error, so a run of equal values counts as one error of
+the run's length. A run that a wheel passes on its way from slower to faster is different: the
+errors of its two halves cancel.
 
-A firmware that counts its encoder's edges in each period reports multiples of one count's speed.
-What it forgets to count in one period it counts in the next, so all that adds up is the rounding of
-each multiple, and that can be told.
+A firmware that counts encoder edges in each period reports multiples of one count's speed. An edge
+that it misses in one period is counted in the next, so only the rounding of each multiple adds up,
+and that is known.
 """
 
 from __future__ import annotations
@@ -23,35 +23,38 @@ from acsard.drive.twist_uncertainty import DECIMAL
 Floats = npt.NDArray[np.float64]
 
 COARSE = 2.5 * DECIMAL
-"""rad/s; multiples of less cannot be told from any two decimals."""
+"""Smallest step in rad/s between multiples that can be distinguished from arbitrary two-decimal
+values."""
 
 FIT, SHARE = 0.0055, 0.99
-"""rad/s that a rounded multiple may be off, and how many of the values must be no further."""
+"""Largest deviation of a rounded multiple in rad/s, and the share of values that must be within
+it."""
 
 CHANCE = 1e-3
-"""That any speeds would look like multiples of the step between two of them."""
+"""Accepted probability that arbitrary speeds look like multiples of the step between two of
+them."""
 
 TOGETHER = 0.8
-"""Share of the lines from which on two wheels that say the same make the same error."""
+"""Share of lines with equal values from which two wheels are assumed to have the same error."""
 
 
 class Rounding(Struct, frozen=True):
-    """Rows are lines, columns wheels in `values.WHEELS` order."""
+    """Rounding errors; rows are lines, columns are wheels in `values.WHEELS` order."""
 
     variance: Floats
-    """rad2, independent from line to line."""
+    """Variance of each value, rad2; the entries are independent."""
     offset: Floats
-    """rad that are known to be said too much."""
+    """Known excess of each value, rad."""
     alike: Floats
-    """Of each pair of wheels 1 where their errors are one and the same, else 0."""
+    """For each pair of wheels 1 if their errors are the same, otherwise 0."""
     quantum: float
-    """rad/s"""
+    """Quantization step, rad/s."""
     count: float
-    """rad that a wheel turns in a count, 0 where lines do not show it."""
+    """Wheel rotation per encoder count, rad; 0 if the lines do not show it."""
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
-    """Of the wheel speeds in lines, rad/s, each of which stands for `period` s."""
+    """Estimate the rounding errors of wheel speeds in rad/s; each line covers `period` s."""
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
     alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
@@ -65,13 +68,16 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """In q2 / 12: the square of each run's length at its end, 1 for one that is passed through."""
+    """Return the variance of each run at its last line, in units of q^2 / 12.
+
+    It is the square of the run's length, or 1 for a run that is passed through.
+    """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
     starts = np.append(0, ends[:-1] + 1)
     for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
         if values[start] == 0.0:
-            continue  # it stands
+            continue  # the wheel stands still
         length = end - start + 1
         if start > 0 and end + 1 < len(values):
             before, after = values[start - 1] - values[start], values[end + 1] - values[start]
@@ -81,13 +87,13 @@ def _runs(values: Floats) -> Floats:
 
 
 def _lattice(speeds: Floats) -> float:
-    """The speed that all are multiples of, rad/s; 0 when there is none that two decimals show."""
+    """Return the speed in rad/s of which all speeds are multiples, or 0 if there is none."""
     values = np.unique(np.append(np.abs(speeds), 0.0))
     step = float(np.min(np.diff(values), initial=math.inf))
     if not COARSE <= step < math.inf or (2 * FIT / step) ** (len(values) - 2) > CHANCE:
         return 0.0
     apart = np.diff(values)
-    # Most neighbours are a step apart: their mean is good enough to number what is far from 0.
+    # Most neighbours are one step apart. Their mean is precise enough to number the distant values.
     step = float(apart[apart < 1.5 * step].mean())
     for _ in range(2):
         number = np.round(values / step)

@@ -1,7 +1,7 @@
-"""Driving cut into steps, each with what one cause of error does in it.
+"""Divides a drive into steps, each with the errors of one cause.
 
-An error is either independent of all others, a variance, or points the same way again and again
-and adds up: then it is a way that the pose did not go, as in a gap.
+An error is either independent of all others, and then it is a variance. Or it has the same sign in
+each step and adds up. Then it is treated like a motion that the pose missed, as in a gap.
 """
 
 from __future__ import annotations
@@ -22,8 +22,12 @@ NEVER: dict[int, Stood] = {}
 
 
 class Step(Struct, frozen=True):
-    """m and rad driven; `along` m2 and `yaw` rad2 independent of other steps, `stood` the same in
-    all; `by_gyro` rad2 is the variance of the turn where a gyro tells it."""
+    """A step of a drive: distance in m, turn in rad, and its errors.
+
+    `along` (m2) and `yaw` (rad2) are variances that are independent of other steps. `stood` is an
+    error that is common to all steps. `by_gyro` (rad2) is the variance of a turn that a gyro
+    measured, None for a turn by the wheels.
+    """
 
     distance: float
     turn: float
@@ -34,7 +38,7 @@ class Step(Struct, frozen=True):
 
 
 class Driving:
-    """What was driven, as steps of about so many seconds."""
+    """A drive, divided into steps of about `step_s` seconds."""
 
     def __init__(
         self, lines: list[Line], motion: Motion, rounding: Rounding, kinematics: Kinematics,
@@ -44,23 +48,26 @@ class Driving:
         self._each = max(1, round(step_s / motion.period))
         twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
         self._weights = np.array([[one.linear for one in twists], [one.angular for one in twists]])
-        """m and rad that a radian of each wheel moves the robot by."""
+        """Motion of the robot for 1 rad of each wheel: a row of m and a row of rad."""
 
     def plain(self) -> list[Step]:
-        """Without an error of its own."""
+        """Return the steps without an error."""
         return self._steps()
 
     @property
     def tells_gyro(self) -> bool:
-        """What a gyro's noise costs is seen."""
+        """Whether the data shows the noise of the gyro."""
         return self._motion.yaw_variance is not None
 
     def turned_by_gyro(self) -> list[Step]:
-        """What odometry holds its gyro's turns for."""
+        """Return the steps with the gyro noise that odometry assumes."""
         return self._steps(gyro=self._motion.yaw_variance)
 
     def late(self) -> list[Step]:
-        """What hangs together is squared as a whole."""
+        """Return the steps with the errors of late lines.
+
+        Correlated errors are summed before they are squared.
+        """
         late = self._motion.late
         starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
         squares = np.zeros_like(late)
@@ -68,13 +75,16 @@ class Driving:
         return self._steps(squares)
 
     def missed(self) -> list[Step]:
-        """None when nothing was."""
+        """Return the steps with the errors of gaps; empty if there was no gap."""
         moved = self._motion
         seen = not moved.stood and not moved.bridged.any()
         return [] if seen else self._steps(moved.bridged, moved.stood)
 
     def rounded(self) -> list[Step]:
-        """By the lines; a counter's own count is not in it."""
+        """Return the steps with the rounding errors of lines.
+
+        An encoder's own resolution is not included.
+        """
         found = self._rounding
         if found.count:
             return self._steps(stood=_biased(found.offset[1:] @ self._weights.T))
@@ -85,7 +95,12 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> list[Step]:
-        """Front and rear of a side disagree: their mean is off by half of that if one is right."""
+        """Return the steps with the errors that contradicting wheels imply; empty without
+        contradiction.
+
+        If the front and the rear wheel of a side disagree and one is right, their mean is off by
+        half the difference.
+        """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
         right, left = (front_right - rear_right) / 2, (front_left - rear_left) / 2
@@ -96,7 +111,8 @@ class Driving:
         self, variances: Floats | None = None, stood: dict[int, Stood] = NEVER,
         gyro: Floats | None = None,
     ) -> list[Step]:  # fmt: skip
-        """`variances` (rows of m2, rad2), `stood` and `gyro` are of the lines."""
+        """Sum the lines' errors into steps; `variances` has rows of (m2, rad2), one for each
+        line."""
         moved, each = self._motion, self._each
         starts = np.arange(0, len(moved.distance), each)
         distance, turn = (np.add.reduceat(all_, starts) for all_ in (moved.distance, moved.turn))
@@ -112,14 +128,14 @@ class Driving:
             return [
                 Step(d, w, row[0], row[1], lost.get(i)) for i, (d, w, row, _) in enumerate(rows)
             ]
-        # A gyro turns the heading, whatever becomes of the wheels.
+        # The gyro determines the heading, so wheel errors do not affect it.
         for i, one in lost.items():
             lost[i] = replace(one, turn=0.0, yaw=0.0)
         return [Step(d, w, row[0], 0.0, lost.get(i), h) for i, (d, w, row, h) in enumerate(rows)]
 
 
 def mirrored(step: Step) -> Step:
-    """The same, turning left."""
+    """Return the step as a turn to the left."""
     if step.turn >= 0.0:
         return step
     stood = step.stood
@@ -129,7 +145,7 @@ def mirrored(step: Step) -> Step:
 
 
 def _biased(off: Floats) -> dict[int, Stood]:
-    """Rows of m and rad that each line is off, ever the same way."""
+    """Return errors that keep their sign, from rows of (m, rad) for each line."""
     return {k: Stood(*row) for k, row in enumerate(off.tolist()) if any(row)}
 
 

@@ -1,4 +1,4 @@
-"""An error budget in words: a table that a person understands, and what to do about it."""
+"""An error budget as text: a table for people, and advice on the largest error."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ CALIBRATE = (
     "how wrong wheel radii and track are is not known, and on wheels that skid it is mostly the "
     "largest of all: run `acsard calibrate`"
 )
-"""While nobody has calibrated."""
+"""Advice while the robot is not calibrated."""
 
 
 def text(budget: Budget) -> str:
-    """The table, what it was made of, and a sentence on the largest share."""
+    """Return the table, the data that it is based on, and advice on the largest share."""
     return "\n".join(_lines(budget))
 
 
 def advice(budget: Budget) -> str:
-    """One sentence on what to do, for the largest share that is not only declared."""
+    """Return advice on the largest measured share, and on a declared one that is larger."""
     if budget.still:
         return "drive it, also around curves, while this looks: most causes show only then"
     seen, all_ = budget.largest("measured"), budget.largest("measured", "settings")

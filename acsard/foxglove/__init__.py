@@ -1,1 +1,1 @@
-"""`acsard foxglove`: the robot live in Foxglove and Lichtblick, a process of its own."""
+"""`acsard foxglove` shows the robot live in Foxglove and Lichtblick; it is a process of its own."""

@@ -1,4 +1,4 @@
-"""Where the viewers connect to: `HOST:PORT`, on this machine only."""
+"""The address that viewers connect to: `HOST:PORT`, on this machine only."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ import ipaddress
 from acsard.host.errors import UsageError
 
 DEFAULT = "127.0.0.1:8765"
-"""Where Foxglove and Lichtblick look when they are told nothing else."""
+"""The address that Foxglove and Lichtblick try by default."""
 
 
 def loopback(text: str) -> tuple[str, int]:
-    """Host and port; raises `UsageError` for what is none, or is reached from outside."""
+    """Return host and port.
+
+    Raises `UsageError` for a malformed address and for one that other machines can reach.
+    """
     host, _, digits = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)

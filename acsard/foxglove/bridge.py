@@ -1,6 +1,8 @@
-"""A robot live in Foxglove: puts the parts together and goes round, on one thread.
+"""Connects a robot to Foxglove viewers: creates the parts and runs the main loop on one thread.
 
-Round: is the daemon there? who looks at what? pass on what came; tell who drives in vain why.
+Each round of the loop checks whether the daemon is present, updates the subscriptions to the topics
+that viewers look at, forwards new messages, and explains to a viewer why its commands have no
+effect.
 """
 
 from __future__ import annotations
@@ -30,17 +32,18 @@ from acsard.ros.names import full_name
 from acsard.values import NS_PER_S, AcsardError
 
 GATHER_S = 0.015
-"""A screen shows 60 pictures a second: what comes within this goes in one round, which costs a
-third less. Commands do not wait for it."""
+"""Time to gather messages before a round. A screen shows 60 frames a second, and gathering for less
+than one frame makes the rounds a third cheaper. Commands do not wait for it."""
 
 ROUND_S = 0.5
-"""A round at least so often."""
+"""Longest time between two rounds."""
 
 ASK_NS = NS_PER_S // 2
-"""Without a state for so long who drives has one asked for: it may be published seldom."""
+"""Age of the last state at which the bridge asks for a new one while a viewer drives. The daemon
+may be configured to publish its state less often."""
 
 GONE = "daemon"
-"""The name of the status that the daemon is gone."""
+"""Id of the status message that the daemon is gone."""
 
 
 class Bridge:
@@ -70,7 +73,7 @@ class Bridge:
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
         self._deaf = facts.deaf
-        """Why no commander is heard; "" once that is told."""
+        """Reason why no commands can be shown; "" once it is reported."""
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
@@ -83,7 +86,7 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Go round until `end`."""
+        """Run rounds until `end` is called."""
         while not self._ended.is_set():
             self._wake.wait(ROUND_S)
             time.sleep(GATHER_S)
@@ -91,17 +94,17 @@ class Bridge:
             self._round()
 
     def end(self) -> None:
-        """Have `run` return; may be called by a signal."""
+        """Make `run` return; a signal handler may call it."""
         self._ended.set()
         self._wake.set()
 
     def close(self) -> None:
-        """The robot is let go of, then the viewers are."""
+        """Release the robot first, then stop the server."""
         self._drives.end()
         self._server.stop()
 
     def _viewer(self, client: int) -> Client:
-        """The robot as one of the viewers commands it."""
+        """Return a client that sends commands for one viewer, under a sender name of its own."""
         name = self._robot.sender.rpartition("/")[0]
         return self._robot.like(self._id, f"{name}/{client}")
 
@@ -134,7 +137,10 @@ class Bridge:
         return True
 
     def _came_back(self) -> bool:
-        """It may be another, with other sources and settings; False when it cannot be asked yet."""
+        """Learn the facts of a restarted daemon, which may have other sources and settings.
+
+        Returns False if the daemon does not answer yet.
+        """
         try:
             facts = learn(self._robot, self._tls)
         except AcsardError as error:
@@ -151,7 +157,7 @@ class Bridge:
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
 
     def _object(self, driving: dict[int, Client]) -> None:
-        """Tell each who drives in vain why, once, and take it back when it is over."""
+        """Report to each viewer once why its commands do not drive. Withdraw the report later."""
         now_ns = clock.mono_ns()
         if driving and now_ns - self._state_ns > ASK_NS:
             self._state_ns = now_ns

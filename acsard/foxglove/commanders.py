@@ -1,6 +1,8 @@
-"""What a source commands, on whichever key and in whatever encoding, as an export has it; pure.
+"""Commands of a source, from any of its keys and in any encoding, as `acsard log export` writes
+them.
 
-Decoded as the daemon decodes it: what it refuses is not shown, but in its counters.
+This module is pure. It decodes commands exactly as the daemon does. A command that the daemon
+refuses is not shown; it appears in the daemon's counters.
 """
 
 from __future__ import annotations
@@ -19,19 +21,20 @@ from acsard.ros.transports import endpoints
 
 
 class Way(Struct, frozen=True):
-    """A key of the bus as the daemon takes it."""
+    """How the daemon interprets samples on one key of the bus."""
 
     native: str
-    """The key below the robot's id that it stands for; "*" is a certificate's name."""
+    """The native key below the robot's id that the key stands for; "*" is the name of a
+    certificate."""
     encoding: str = ""
-    """Of samples that name none."""
+    """Encoding of samples that do not name one."""
     via: Via = "native"
 
 
 def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
-    """Each key that this source commands on: twists, wheel speeds, and those of the ROS trees.
+    """Return each key on which this source accepts commands: twists, wheel speeds and the ROS keys.
 
-    `key_of` makes the full key of one below the robot's id.
+    `key_of` returns the full key for a key below the robot's id.
     """
     native = source_keys([source])
     found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
@@ -42,13 +45,16 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Commands -> messages of `cmd_vel_in/<source>`, by the robot's configuration."""
+    """Converts commands to messages of `cmd_vel_in/<source>`, by the robot's configuration."""
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._frame = config.odometry.base_frame
 
     def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
-        """What was asked for by what arrived at `wall_ns`; raises `DecodeError`."""
+        """Return the twist of a command that arrived at `wall_ns` (wall clock).
+
+        Raises `DecodeError`.
+        """
         twist = self._receiver.command(arrival).twist
         return asked(twist, Time.from_ns(wall_ns), self._frame)

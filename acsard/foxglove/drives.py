@@ -1,7 +1,8 @@
-"""Driving by a viewer's panel: each viewer is a sender of its own, and goes by the daemon's rules.
+"""Drives the robot from a viewer's panel. Each viewer is a sender of its own, under the daemon's
+rules.
 
-The server's threads hand over what came (`hand.py` keeps the newest); a thread of ours sends it,
-so that none of them waits for the bus.
+The server's threads pass each message to the viewer's `Hand`, which keeps the newest. A separate
+thread sends it, so that no thread of the server waits for the bus.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from acsard.messages.encodings import DecodeError
 from acsard.values import NS_PER_S
 
 CHANNELS = 64
-"""That one viewer may publish on."""
+"""Maximum number of channels on which one viewer may publish."""
 
 END_S = 0.5
-"""The zeros at the end take some ms."""
+"""Time limit for sending the final zeros, which normally takes a few ms."""
 
 TOO_SLOW = (
     "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 Hz "
@@ -35,12 +36,13 @@ LOST = "the bus takes no commands: what a panel publishes is lost until it does"
 
 
 class _Viewer:
-    """One of them, with its name as a sender."""
+    """One viewer with its sender name."""
 
     def __init__(self, robot: Client) -> None:
         self.robot, self.hand = robot, Hand()
         self.channels: dict[int, tuple[str, str]] = {}
-        """For each on which it publishes the Encoding, or why that drives nothing."""
+        """Encoding and problem of each channel. If the problem is not empty, the channel cannot
+        drive."""
 
 
 class Drives:
@@ -58,12 +60,12 @@ class Drives:
         self._thread = Thread(target=self._run, name="drives", daemon=True)
         self._thread.start()
 
-    # the server's threads
+    # Called by the server's threads.
 
     def advertised(
         self, client: int, channel: int, topic: str, encoding: str, schema_name: str
     ) -> None:
-        """A viewer will publish; what drives nothing is told when it does."""
+        """Register a channel. If it cannot drive, the viewer learns why when it publishes."""
         found, problem = "", ""
         if topic != self.topic:
             problem = f"nothing listens on {topic}: drive on {self.topic}"
@@ -80,7 +82,7 @@ class Drives:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
-        """A viewer has published."""
+        """Take a message that a viewer published."""
         now_ns = clock.mono_ns()
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
@@ -103,7 +105,7 @@ class Drives:
             self._notices.say("warning", "drive", TOO_SLOW)
 
     def withdrawn(self, client: int, channel: int) -> None:
-        """A viewer publishes no more there, or has left."""
+        """Release the robot, because the viewer closed this channel or disconnected."""
         with self._news:
             viewer = self._viewers.get(client)
             if viewer is None:
@@ -115,17 +117,17 @@ class Drives:
                 del self._viewers[client]
             self._news.notify()
 
-    # the main thread
+    # Called by the main thread.
 
     def driving(self) -> dict[int, Client]:
-        """Who asks for a speed just now."""
+        """Return the viewers that currently ask for a speed, with their clients."""
         now_ns = clock.mono_ns()
         with self._news:
             viewers = self._viewers.items()
             return {one: viewer.robot for one, viewer in viewers if viewer.hand.drives(now_ns)}
 
     def end(self) -> None:
-        """A zero for everybody who drives, then silence."""
+        """Send one zero for each viewer that drives, then stop the sending thread."""
         with self._news:
             for viewer in self._viewers.values():
                 self._part(viewer)
@@ -134,10 +136,10 @@ class Drives:
             self._news.notify()
         self._thread.join(END_S)
 
-    # ours
+    # Run by the sending thread, or with the lock held.
 
     def _part(self, viewer: _Viewer) -> None:
-        """The viewer lets go; the lock is held."""
+        """Queue a final zero for this viewer; the caller holds the lock."""
         zero = viewer.hand.end(clock.mono_ns())
         if zero is not None:
             self._parting.append((viewer.robot, zero))
@@ -153,7 +155,7 @@ class Drives:
             for robot, zero in parting:
                 self._send(robot, zero)
             for viewer in due:
-                # The bus may have held up the one before: how old it is counts from now.
+                # The bus may have blocked the previous send, so judge the age by the present time.
                 with self._news:
                     wished = viewer.hand.send(clock.mono_ns())
                 if wished is not None:
@@ -167,13 +169,13 @@ class Drives:
             self._notices.say("error", "drive", f"{LOST} ({error})")
 
     def _due(self) -> list[_Viewer]:
-        """Who has something to send."""
+        """Return the viewers with a message that is due."""
         now_ns = clock.mono_ns()
         times = [(viewer, viewer.hand.due_ns()) for viewer in self._viewers.values()]
         return [viewer for viewer, due_ns in times if due_ns is not None and due_ns <= now_ns]
 
     def _left(self) -> float | None:
-        """How long until something is due, s; None for nothing."""
+        """Return the seconds until the next message is due, or None if none is waiting."""
         times = [viewer.hand.due_ns() for viewer in self._viewers.values()]
         known = [one for one in times if one is not None]
         return max(0.0, (min(known) - clock.mono_ns()) / NS_PER_S) if known else None

@@ -1,4 +1,4 @@
-"""What has to be known of a robot before it is shown, and again when its daemon comes back."""
+"""Facts of a robot, read at the start and again after each restart of its daemon."""
 
 from __future__ import annotations
 
@@ -20,19 +20,23 @@ DEAF = (
 
 
 class Facts(Struct, frozen=True):
-    """`config` is the robot's where we may read it, else the defaults."""
+    """The configuration, sources and permissions.
+
+    `config` holds defaults if this program may not read the robot's.
+    """
 
     config: Config
     tables: object
-    """The same as plain tables; None where we may not read it."""
+    """The configuration as plain tables; None if this program may not read it."""
     sources: tuple[str, ...]
     forbidden: str
-    """Why we may not drive, in words; "" when we may."""
+    """Reason why this program may not drive, in words; "" if it may."""
     deaf: str = ""
-    """Why we hear no commander, in words; "" when we do."""
+    """Reason why the sources' commands are invisible to this program, in words; "" if they are
+    visible."""
 
     def rows(self) -> list[tuple[Channel, str]]:
-        """Each channel with its key on the bus; those of the commanders once for each source."""
+        """Return each channel with its source; a commander channel appears once for each source."""
         found = []
         for row in said(left_out(self.config)):
             names = self.sources if row is CMD_VEL_IN else ("",)
@@ -41,12 +45,15 @@ class Facts(Struct, frozen=True):
 
 
 def key_of(row: Channel, source: str) -> str:
-    """The key below the robot's id on which a row is published."""
+    """Return the key below the robot's id on which a channel's messages are published."""
     return row.native.replace(SOURCE, source)
 
 
 def learn(robot: Client, tls: str) -> Facts:
-    """Ask the robot; raises what `Client.get` raises, and `ReplyError` for another version's."""
+    """Query the robot.
+
+    Raises the errors of `Client.get`, and `ReplyError` if its version differs.
+    """
     forbidden, role, deaf = "", "maintainer", ""
     if tls:
         deaf = DEAF

@@ -1,9 +1,10 @@
-"""What one viewer asks for, and which of it goes to the robot when; pure.
+"""Decides which commands of one viewer go to the robot, and when. This module is pure.
 
-A panel repeats what it asks for while a button is held, and falls silent when it is let go. Each
-message goes once: nothing is repeated here. After a silence a zero goes first, as the daemon wants
-of who begins. How late a message with a stamp is, the daemon judges. Few have one, but a heap of
-them after a silence is what a link, or a process that stood, has held back: it is lived by nobody.
+A panel repeats its command while a button is held and is silent after the release. Each message is
+sent at most once; nothing is repeated here. After a silence a zero is sent first, because the
+daemon requires one from a sender that starts. The daemon itself judges how late a message with a
+stamp is, but few messages carry one. Therefore a burst of messages after a silence is discarded: a
+congested link or a stalled process held it back.
 """
 
 from __future__ import annotations
@@ -13,56 +14,57 @@ from msgspec import Struct
 from acsard.values import NS_PER_S, REST, Twist
 
 SILENCE_NS = 3 * NS_PER_S // 10
-"""After so long the robot has begun to brake (a source's timeout is 0.25 s, by default)."""
+"""Silence after which the robot has begun to brake; the default timeout of a source is 0.25 s."""
 
 HEAP_NS = NS_PER_S // 25
-"""What was held back comes out within this: no panel sends twice in it at 20 Hz. Who begins to
-drive waits for it, nobody else."""
+"""Time within which a held-back burst arrives; a panel at 20 Hz does not send twice in it. Only the
+first command after a silence waits this long."""
 
 STALE_NS = NS_PER_S // 10
-"""What could not go for so long is not what the person wants now."""
+"""Age above which a command is discarded, because it no longer shows the operator's intention."""
 
 DRIVES_NS = NS_PER_S // 2
-"""Who asked for a speed so lately drives, or means to."""
+"""Time after the last command with a speed for which a viewer counts as driving."""
 
 LONGEST_NS = 10 * NS_PER_S
-"""No timeout of a source is longer: who was silent for so long drives no more."""
+"""Longest possible timeout of a source. A viewer that was silent for longer does not drive any
+more."""
 
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
-"""Messages that so often come further apart than a silence, and no further than this, are of a
-panel that publishes too seldom."""
+"""Thresholds for a panel that publishes too seldom: this many messages in a row, each later than
+`SILENCE_NS` but not later than `SLOW_NS`."""
 
 
 class Wish(Struct, frozen=True):
-    """A twist, and when it was meant by the clock of who meant it, ns; None where nothing says."""
+    """A twist, and the time in ns that its sender stamped it with, or None without a stamp."""
 
     twist: Twist
     stamp_ns: int | None = None
 
 
 class Hand:
-    """The commands of one viewer: of those that wait, the newest."""
+    """The commands of one viewer; only the newest one waits."""
 
     def __init__(self) -> None:
         self.replaced = self.stale = 0
-        """Messages that did not go: a newer one came, or it was too late for them."""
+        """Counters of messages that were not sent: replaced by a newer one, or too late."""
         self._wish: Wish | None = None
         self._stamp_ns: int | None = None
-        """Of the last that came."""
+        """Stamp of the last message."""
         self._came_ns = 0
         self._heard_ns: int | None = None
         self._lead = False
         self._hold_until_ns = 0
         self._heap = 0
-        """Messages since the silence, until one goes."""
+        """Number of messages since the silence, until one is sent."""
         self._moved_ns: int | None = None
-        """When a speed went, and no zero since."""
+        """Time at which a speed was sent; None after a zero."""
         self._asked_ns: int | None = None
-        """When a speed was last asked for, and no zero since."""
+        """Time at which a speed was last requested; None after a zero."""
         self._slow = 0
 
     def take(self, wish: Wish, now_ns: int) -> None:
-        """One has come."""
+        """Take a message from the viewer."""
         silence = None if self._heard_ns is None else now_ns - self._heard_ns
         if silence is None or silence > SILENCE_NS:
             self._lead, self._hold_until_ns, self._heap = True, now_ns + HEAP_NS, 0
@@ -78,13 +80,13 @@ class Hand:
         self._asked_ns = None if wish.twist == REST else now_ns
 
     def due_ns(self) -> int | None:
-        """When `send` has something to send: at once for what is past; None for never."""
+        """Return the time at which `send` has a message, which may be in the past, or None."""
         if self._lead:
             return self._came_ns
         return None if self._wish is None else self._hold_until_ns
 
     def send(self, now_ns: int) -> Wish | None:
-        """What to send now; None for nothing."""
+        """Return the message to send now, or None."""
         if self._lead:
             self._lead = False
             return self._zero(now_ns)
@@ -99,7 +101,7 @@ class Hand:
         return wish
 
     def end(self, now_ns: int) -> Wish | None:
-        """The viewer lets go: a zero if a speed of his may still be followed."""
+        """Release the robot; return a zero if it may still follow a speed of this viewer."""
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
         self._lead = False
@@ -108,15 +110,18 @@ class Hand:
         return self._zero(now_ns)
 
     def _zero(self, now_ns: int) -> Wish:
-        """One of ours, by his clock: another's would look as if his had been set."""
+        """Return a zero stamped by the viewer's clock.
+
+        A stamp of another clock would look like a clock change.
+        """
         if self._stamp_ns is None:
             return Wish(REST)
         return Wish(REST, self._stamp_ns + now_ns - self._came_ns)
 
     def drives(self, now_ns: int) -> bool:
-        """He asks for a speed."""
+        """Return whether the viewer asks for a speed."""
         return self._asked_ns is not None and now_ns - self._asked_ns <= DRIVES_NS
 
     def is_slow(self) -> bool:
-        """The robot stops between his messages."""
+        """Return whether the messages come so seldom that the robot stops in between."""
         return self._slow >= SLOW_TIMES

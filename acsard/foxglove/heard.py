@@ -1,4 +1,4 @@
-"""The commanders that somebody looks at: what each sends, on each key that it may send on."""
+"""Subscriptions to the commands of the shown sources, on every key of each source."""
 
 from __future__ import annotations
 
@@ -18,11 +18,15 @@ from acsard.messages.schema import TwistStamped
 from acsard.ros.channels import CMD_VEL_IN
 
 MOST = 100
-"""Held at most, the newest: a second's of one who sends all he may get through."""
+"""Maximum number of waiting commands per source, about one second of the highest accepted rate; the
+oldest are dropped."""
 
 
 class Commanders:
-    """All of them, each by its topic; used by one thread, `wake` called by Zenoh's."""
+    """The commands of all sources, by topic.
+
+    One thread uses this class; Zenoh's threads call `wake`.
+    """
 
     def __init__(self, robot: Client, wake: Callable[[], object]) -> None:
         self._robot, self._wake = robot, wake
@@ -31,21 +35,21 @@ class Commanders:
         self._heard: dict[str, _Heard] = {}
 
     def use(self, facts: Facts) -> None:
-        """Hear them as this robot does."""
+        """Use the configuration and sources of this robot."""
         ros, self._deaf = facts.config.ros, bool(facts.deaf)
         self._reader = Reader(facts.config)
         for source in facts.sources:
             topic = CMD_VEL_IN.topic(ros.namespace, source)
             self._ways[topic] = ways(self._robot.key, ros, source)
-        self.follow(())  # it may be on other keys than before
+        self.follow(())  # the keys may have changed
 
     @property
     def topics(self) -> Collection[str]:
-        """There is one for each source."""
+        """The command topics, one for each source."""
         return self._ways.keys()
 
     def follow(self, topics: Collection[str]) -> None:
-        """Subscribe to these, and to no other."""
+        """Subscribe to these topics only, and to none if this program cannot receive commands."""
         wanted = set() if self._deaf else self._ways.keys() & set(topics)
         for topic in self._heard.keys() - wanted:
             self._heard.pop(topic).undeclare()
@@ -53,17 +57,23 @@ class Commanders:
             self._heard[topic] = _Heard(self._robot.session, self._ways[topic], self._wake)
 
     def take(self) -> Iterator[tuple[str, TwistStamped]]:
-        """What has come since, by topic."""
+        """Yield each received command with its topic.
+
+        A command that cannot be decoded is skipped.
+        """
         for topic, heard in self._heard.items():
             for arrival, wall_ns in heard.take():
                 try:
                     yield topic, self._reader.read(arrival, wall_ns)
                 except DecodeError:
-                    pass  # the daemon refuses it too, and counts why
+                    pass  # the daemon refuses it too, and counts the reason
 
 
 class _Heard:
-    """Filled by Zenoh's threads, each command with the time it came."""
+    """The subscriptions of one source.
+
+    Zenoh's threads append each command with its arrival time.
+    """
 
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
@@ -79,13 +89,14 @@ class _Heard:
         head, _, last = key.rpartition("/")
         way = self._ways.get(key) or self._ways.get(f"{head}/*")
         if way is None:
-            return  # a stranger put it on a wildcard
+            return  # published on a wildcard key, which matches no source
         put = sample.kind == zenoh.SampleKind.PUT
         attached = sample.attachment
         arrival = Arrival(
             way.native.replace("*", last),
             put,
-            sample.payload.to_bytes()[: MAX_COMMAND_BYTES + 1],  # by one too many it is refused
+            # One byte over the limit is enough for the receiver to refuse the command.
+            sample.payload.to_bytes()[: MAX_COMMAND_BYTES + 1],
             way.encoding or str(sample.encoding),
             now.mono_ns,
             None,
@@ -97,13 +108,13 @@ class _Heard:
         self._wake()
 
     def take(self) -> list[tuple[Arrival, int]]:
-        """What has come since, with the wall-clock time, ns."""
+        """Return the commands since the last call, with their wall-clock arrival times in ns."""
         return [self._held.popleft() for _ in range(len(self._held))]
 
     def undeclare(self) -> None:
-        """No more of them."""
+        """End the subscriptions."""
         for one in self._declared:
             try:
                 one.undeclare()
             except zenoh.ZError:
-                pass  # with its session closed it is no more already
+                pass  # the session is closed, and the subscription with it

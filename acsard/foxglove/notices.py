@@ -1,4 +1,4 @@
-"""What the viewers are told in words: their status messages, the topic `log`, and the terminal."""
+"""Messages to the viewers: as status messages, on the topic `log`, and on the terminal."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ STATUS: dict[Level, StatusLevel] = {
 }
 
 AGAIN_NS = 2 * NS_PER_S
-"""The same words at most so often."""
+"""Minimum interval between two notices with the same text."""
 
 WAITING = 100
-"""Notices that wait to be sent; the oldest are dropped beyond that."""
+"""Maximum number of waiting notices; the oldest are dropped."""
 
 
 class Notice(Struct, frozen=True):
-    """`stays` is its name while it holds, "" for what is said once; without `text` it is over."""
+    """A message.
+
+    `stays` is the id of a lasting status, or "" for a single message; an empty `text` ends it.
+    """
 
     level: Level
     name: str
@@ -38,18 +41,21 @@ class Notice(Struct, frozen=True):
 
 
 class Notices:
-    """Said by any thread, sent by one."""
+    """Collects notices from any thread; the main thread sends them."""
 
     def __init__(self, tell: Callable[[str], None], wake: Callable[[], None]) -> None:
         self._tell, self._wake = tell, wake
         self._lock = Lock()
         self._waiting: deque[Notice] = deque(maxlen=WAITING)
         self._said: dict[str, int] = {}
-        """When the words of each name were last said."""
+        """Time at which each text was last reported."""
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
-        """Tell everybody who looks; the same again only if it is to stay."""
+        """Queue a message to all viewers.
+
+        A repeated text is dropped unless it is a lasting status.
+        """
         now_ns = clock.mono_ns()
         with self._lock:
             recent = {t: ns for t, ns in self._said.items() if now_ns - ns < AGAIN_NS}
@@ -60,13 +66,13 @@ class Notices:
         self._wake()
 
     def over(self, stays: str) -> None:
-        """What was said under this name holds no more."""
+        """End the lasting status with this id."""
         with self._lock:
             self._waiting.append(Notice("info", "", "", stays))
         self._wake()
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
-        """Send what waits; `newcomers` have not seen what still holds."""
+        """Send the waiting notices. With `newcomers`, send all lasting statuses again first."""
         if newcomers:
             for one in self._staying.values():
                 server.publish_status(one.text, STATUS[one.level], one.stays)

@@ -1,23 +1,24 @@
-"""When a viewer whose commands do not drive is told why; pure."""
+"""Decides when a viewer is informed why its commands do not drive. This module is pure."""
 
 from __future__ import annotations
 
 from acsard.values import NS_PER_S
 
 OBJECTS_NS = NS_PER_S // 2
-"""For so long they do not count is no news: the first 0.25 s of a new sender never do."""
+"""Delay before an objection is reported: the first 0.25 s of a new sender never drive, which is
+normal."""
 
 
 class Objections:
-    """Those to one viewer."""
+    """The objection to one viewer's commands."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self.told = ""
-        """What he has been told, and still holds."""
+        """The objection that was reported and still holds, or ""."""
 
     def look(self, objection: str, now_ns: int) -> bool:
-        """By what is objected to now, "" for nothing: whether `told` is another."""
+        """Process the current objection ("" for none); return whether `told` has changed."""
         if not objection:
             self._since_ns = None
             changed, self.told = bool(self.told), ""

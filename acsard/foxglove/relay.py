@@ -1,7 +1,8 @@
-"""From the bus to the viewers: a subscription for each topic that somebody looks at, no other.
+"""Forwards messages from the bus to the viewers, with a subscription only for topics that are
+shown.
 
-What nobody shows costs nothing, here and at the daemon. Of what comes faster than it can be passed
-on, the newest goes.
+A topic that nobody looks at costs nothing, neither here nor in the daemon. If messages arrive
+faster than they can be forwarded, the oldest are dropped.
 """
 
 from __future__ import annotations
@@ -25,29 +26,29 @@ from acsard.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.ros.shapes import Log
 
 MOST = 100
-"""Messages of a topic passed on at once: a second's."""
+"""Maximum number of messages of a topic per round; a second's worth at 100 Hz."""
 
 STATE, EVENTS = "state", "events"
 
 KEPT = ("tf_static", "diagnostics", STATE)
-"""What comes seldom: who begins to look gets the last one."""
+"""Keys that are published seldom; a viewer that starts to look receives the last message."""
 
 
 class _Out:
-    """A topic as the viewers have it."""
+    """A topic as the viewers see it."""
 
     def __init__(self, row: Channel, key: str, channel: foxglove.Channel) -> None:
         self.row, self.key, self.channel = row, key, channel
         self.last: bytes | None = None
 
     def log(self, message: object) -> None:
-        """Pass one on."""
+        """Forward a message."""
         self.last = self.row.encode(message)
         self.channel.log(self.last)
 
 
 class Relay:
-    """All topics of a robot; used by one thread, `wake` called by Zenoh's."""
+    """All topics of a robot. One thread uses this class; Zenoh's threads call `wake`."""
 
     def __init__(self, robot: Client, context: foxglove.Context, wake: Callable[[], None]) -> None:
         self._robot, self._context, self._wake = robot, context, wake
@@ -58,10 +59,10 @@ class Relay:
         self._news = News()
         self.log_topic = ""
         self.unreadable = 0
-        """Samples that are no messages of ours."""
+        """Number of samples that could not be decoded."""
 
     def offer(self, facts: Facts) -> None:
-        """Show what the robot has, beside what was shown before."""
+        """Offer the robot's topics, in addition to those offered before."""
         self._commanders.use(facts)
         for row, source in facts.rows():
             topic = row.topic(facts.config.ros.namespace, source)
@@ -78,13 +79,16 @@ class Relay:
 
     @property
     def commanders(self) -> Collection[str]:
-        """The topics that show what each source commands."""
+        """The topics that show the commands of each source."""
         return self._commanders.topics
 
     def follow(self, topics: Collection[str], fresh: Collection[str], *, state: bool) -> None:
-        """Subscribe to what these need, and to `state` if it is asked for; `fresh` are new ones."""
+        """Subscribe to the keys of these topics only, and to `state` if requested.
+
+        `fresh` are topics that a viewer has just begun to look at.
+        """
         if self.log_topic in fresh:
-            self._news = News()  # who opens the log sees the last events
+            self._news = News()  # a viewer that opens the log sees the last events
         self._commanders.follow(topics)
         shown = [
             out
@@ -111,11 +115,11 @@ class Relay:
         arrivals = queue_on(self._robot.session, self._robot.key(key), latched=topic.latched)
         arrivals.wakes(self._wake)
         if not topic.latched:
-            self._robot.ask(key, arrivals.take)  # the next one may be seconds away
+            self._robot.ask(key, arrivals.take)  # the next message may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
     def pass_on(self) -> RobotState | None:
-        """Pass on what has come; the newest state among it."""
+        """Forward the received messages; return the newest state among them, or None."""
         newest: RobotState | None = None
         for topic, command in self._commanders.take():
             self._outs[topic].log(command)
@@ -133,13 +137,16 @@ class Relay:
         return newest
 
     def ask_state(self) -> None:
-        """The next state may be long in coming: ask for one that comes as if published."""
+        """Query the state, because the next one may be late.
+
+        The answer is treated like a published state.
+        """
         samples = self._followed.get(STATE)
         if samples is not None:
             self._robot.ask(STATE, samples.add)
 
     def log(self, line: Log) -> None:
-        """A line on the topic `log`."""
+        """Publish a line on the topic `log`."""
         out = self._outs.get(self.log_topic)
         if out is not None:
             out.log(line)
@@ -150,7 +157,7 @@ class Relay:
             while (sample := samples.try_recv()) is not None:
                 held.append(sample)
         except zenoh.ZError:
-            pass  # the session has been closed: we are leaving
+            pass  # the session is closed: the program is ending
         found: list[msgspec.Struct] = []
         for sample in held:
             try:

@@ -1,6 +1,7 @@
-"""The websocket server of foxglove-sdk: what its threads call, and how it is started.
+"""The websocket server of foxglove-sdk: its callbacks and its start.
 
-The protocol is the library's. It asks nobody who he is: `address.py`.
+The library implements the protocol. The protocol has no authentication, so `address.py` limits the
+server to this machine.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from acsard.foxglove.settings import Settings
 from acsard.host.errors import InUseError, NotPermittedError
 
 BACKLOG = 256
-"""Messages held for one slow viewer: the oldest are dropped beyond that."""
+"""Maximum number of waiting messages for a slow viewer; the oldest are dropped."""
 
 REFUSED = (
     "a viewer was turned away: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 does "
@@ -29,7 +30,7 @@ REFUSED = (
 
 
 class Shown:
-    """Who looks at which topic."""
+    """The viewers of each topic."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -38,14 +39,14 @@ class Shown:
         self._fresh: set[str] = set()
 
     def add(self, topic: str, client: int) -> None:
-        """A viewer begins to look."""
+        """Record that a viewer subscribed to a topic."""
         with self._lock:
             self._viewers.setdefault(topic, set()).add(client)
             self._fresh.add(topic)
         self._wake()
 
     def remove(self, topic: str, client: int) -> None:
-        """A viewer looks no more."""
+        """Record that a viewer ended its subscription."""
         with self._lock:
             left = self._viewers.get(topic, set())
             left.discard(client)
@@ -54,14 +55,14 @@ class Shown:
         self._wake()
 
     def take(self) -> tuple[set[str], set[str]]:
-        """The topics that are shown, and those that somebody began to look at since the last."""
+        """Return the shown topics, and the topics with a new viewer since the last call."""
         with self._lock:
             fresh, self._fresh = self._fresh, set()
             return set(self._viewers), fresh
 
 
 class Listener:
-    """What the server calls, on threads of its own."""
+    """Callbacks of the server, which runs them on threads of its own."""
 
     def __init__(self, shown: Shown, drives: Drives, settings: Settings) -> None:
         self._shown, self._drives, self._settings = shown, drives, settings
@@ -102,7 +103,7 @@ class Listener:
 
 
 def as_parameters(values: dict[str, foxglove.AnyNativeParameterValue]) -> list[foxglove.Parameter]:
-    """Settings as the protocol has them."""
+    """Return settings in the form that the protocol uses."""
     return [foxglove.Parameter(key, value=value) for key, value in values.items()]
 
 
@@ -115,9 +116,9 @@ def start(
     *,
     acts: bool,
 ) -> WebSocketServer:
-    """Listen; `acts` is whether commands and settings are taken.
+    """Start to listen. `acts` says whether viewers may send commands and change settings.
 
-    Raises `InUseError` when the port is taken, `NotPermittedError` when it is root's.
+    Raises `InUseError` if the port is taken, and `NotPermittedError` if the port needs root.
     """
     host, port = address
     takes = [Capability.Services]
@@ -148,13 +149,13 @@ def start(
 
 
 class Refusals(logging.Handler):
-    """What the library logs: whom it turned away is told, who just left is not."""
+    """Reports viewers that the library turned away, and ignores its other errors."""
 
     def __init__(self, notices: Notices) -> None:
         super().__init__(logging.ERROR)
         self._notices = notices
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Take a line of its log."""
+        """Take a line of the library's log."""
         if "handshake failed" in record.getMessage():
             self._notices.say("warning", "refused", REFUSED)

@@ -1,4 +1,4 @@
-"""The robot's services as a viewer calls them: JSON, answered in the daemon's words."""
+"""The robot's services in the form that viewers call: JSON, with the daemon's own replies."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from acsard.ros.names import full_name
 from acsard.values import AcsardError
 
 CALLED = tuple(verb for verb in SERVICES if verb != "set")
-"""`set` is what parameters are for."""
+"""Services that are offered; `set` is left out because viewers set parameters instead."""
 
 STOPS = ("stop",)
-"""What anybody may who comes in: a browser does not say which of its pages it is."""
+"""Services that are offered without `--drive`. Any web page in a local browser can connect, and the
+browser does not identify the page, so only a stop is safe."""
 
 NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
 
@@ -29,7 +30,7 @@ _poses = Decoder(SetPose)
 
 
 def services(robot: Client, ros: RosConfig, verbs: Iterable[str]) -> list[foxglove.Service]:
-    """These, called as in ROS: `/acsard/stop`."""
+    """Return the services for these verbs under their ROS names, for example `/acsard/stop`."""
     return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
 
 
@@ -48,7 +49,7 @@ def _service(robot: Client, verb: str, name: str) -> foxglove.Service:
 
 
 def called(robot: Client, verb: str, payload: bytes) -> ServiceReply:
-    """Call it; whatever keeps the daemon from answering is the answer."""
+    """Call a service. An error becomes a negative reply."""
     try:
         fields: dict[str, float] = {}
         if verb == "set_pose":

@@ -1,4 +1,4 @@
-"""The viewers' parameters: what the robot's live settings are, and what they are to be."""
+"""The viewers' parameters: reads and changes the robot's live settings."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from acsard.host import clock
 from acsard.values import NS_PER_S, AcsardError
 
 OLD_NS = NS_PER_S
-"""What was read longer ago is read again for who asks."""
+"""Age at which the settings are read again for a viewer that asks."""
 
 POLL_NS = 5 * NS_PER_S
-"""While somebody follows them: others may set them too."""
+"""Interval at which the settings are read while a viewer follows them, because other clients change
+them too."""
 
 
 class Settings:
-    """Asked by the server's threads, read again by the main one."""
+    """The live settings. The server's threads query them; the main thread reads them again."""
 
     def __init__(self, robot: Client, notices: Notices, tables: object) -> None:
         self._robot, self._notices = robot, notices
@@ -32,7 +33,10 @@ class Settings:
         self.learn(tables)
 
     def learn(self, tables: object) -> dict[str, Any]:
-        """The configuration is this one, None where we may not read it; what is new."""
+        """Store the configuration and return the settings that changed.
+
+        `tables` is None if this program may not read the configuration.
+        """
         now = {} if tables is None else parameters.values(tables)
         with self._lock:
             news = parameters.news(self._known, now)
@@ -41,18 +45,21 @@ class Settings:
         return news
 
     def get(self, names: Collection[str]) -> dict[str, Any]:
-        """Those of these names, or all; as they were read last."""
+        """Return the settings with these names, or all, as last read."""
         with self._lock:
             self._asked = True
             return parameters.asked(self._known, names)
 
     def follow(self, *, followed: bool) -> None:
-        """Somebody wants to know of changes, or nobody does any more."""
+        """Record whether any viewer follows changes."""
         with self._lock:
             self._followed = followed
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Set these, all or none; what they are then. A refusal is told in the daemon's words."""
+        """Change settings, all or none, and return their values afterwards.
+
+        A refusal is reported to the viewers.
+        """
         try:
             if any(value is None for value in wishes.values()):
                 raise AcsardError("a setting cannot be removed, only changed")
@@ -67,7 +74,7 @@ class Settings:
             return parameters.asked(self._known, wishes.keys()) if wishes else {}
 
     def refresh(self) -> dict[str, Any]:
-        """Read them again if somebody wants to know; what is new."""
+        """Read the settings again if a viewer needs them; return the settings that changed."""
         with self._lock:
             age_ns = clock.mono_ns() - self._read_ns
             due = (self._asked and age_ns > OLD_NS) or (self._followed and age_ns > POLL_NS)
@@ -78,4 +85,4 @@ class Settings:
         except AcsardError:
             with self._lock:
                 self._read_ns = clock.mono_ns()
-            return {}  # the daemon is gone, which is told elsewhere
+            return {}  # the daemon is gone, which the bridge reports

@@ -1,6 +1,7 @@
-"""What a viewer publishes -> what it wishes, or why that is nothing; pure.
+"""Decodes the twists that a viewer publishes. This module is pure.
 
-Decoded as the daemon decodes commands, by its rules: refused whole, with the reason.
+It decodes them as the daemon decodes commands: a message is accepted or refused as a whole, with a
+reason.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
 from acsard.messages.encodings import DecodeError, encoding_name
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
-"""For twists alone, of which neither joints nor wheels are asked."""
+"""Decoder for twists only. They depend on neither joints nor wheels, so the defaults are
+sufficient."""
 
 
 def encoding_of(encoding: str, schema_name: str) -> str:
-    """The Encoding of what a viewer will publish; raises `DecodeError` for what drives nothing."""
+    """Return the Zenoh encoding of a channel. Raises `DecodeError` if it cannot carry twists."""
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
     if full not in (TWISTS[0], STAMPED_TWISTS[0]):
@@ -29,6 +31,6 @@ def encoding_of(encoding: str, schema_name: str) -> str:
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """The twist in what a viewer published, with its stamp; raises `DecodeError`."""
+    """Return the twist and the stamp of a message. Raises `DecodeError`."""
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)

@@ -17,9 +17,9 @@ from acsard.incoming.bindings import Bindings
 from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import (
-    Clear,
     Header,
     JointState,
+    Release,
     SetPose,
     Settings,
     Twist,
@@ -84,14 +84,18 @@ _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
 _poses = Decoder(SetPose)
 _settings = Decoder(Settings)
-_clears = Decoder(Clear)
+_releases = Decoder(Release)
 
 EXAMPLES: dict[Verb, str] = {
     "set_pose": '{"x": 0, "y": 0, "yaw": 0}',
     "set": '{"settings": {"limits.linear_speed": 0.8}}',
     "clear": '{"latch": 1800000000000}',
+    "activate": '{"latch": 1800000000000}',
 }
-"""The payload of each service that has one; `clear` may also come without."""
+"""An example payload of each service that takes one."""
+
+MAY_BE_PLAIN: tuple[Verb, ...] = ("clear", "activate")
+"""Services that may also come without their payload."""
 
 
 class Receiver:
@@ -189,15 +193,15 @@ class Receiver:
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
         """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
-        if verb not in EXAMPLES or (verb == "clear" and not payload):
+        if verb not in EXAMPLES or (verb in MAY_BE_PLAIN and not payload):
             return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
         if verb == "set":
             wished = _settings.decode(encoding, payload).settings
             return Request(verb, ticket, asked_ns=asked_ns, settings=wished)
-        if verb == "clear":
-            latch = _clears.decode(encoding, payload).latch
+        if verb in MAY_BE_PLAIN:
+            latch = _releases.decode(encoding, payload).latch
             return Request(verb, ticket, asked_ns=asked_ns, latch=latch)
         got = _poses.decode(encoding, payload)
         if (

@@ -62,7 +62,8 @@ does not answer with it now; it does not know it, and it is required."""
 MENDS: dict[Trouble, str] = {
     "": "",
     "echo": "what is sent comes back: TX and RX are joined, or the terminal echoes, or the RS-485 "
-    "adapter; mend that, then replug it",
+    "adapter, or the board reports the speeds it was sent, not those it measures; mend that, then "
+    "replug it",
     "forgotten": "the microcontroller answered with a check before and now does not: its replies "
     "are damaged on the way (look at cable and baud rate), or it has other firmware "
     "(then replug it)",

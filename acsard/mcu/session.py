@@ -1,8 +1,10 @@
-"""One serial port through opens, losses and silences: bytes in, feedback out, lines made.
+"""Follows one serial port through opens, losses and silences.
 
-Takes what the port received, gives feedback with the time each line was complete, and puts the
-lines that leave into the form in force. Decides nothing about motion itself: whether the link may
-carry any says `link_state.py`, what a good line is `negotiation.py`; while it asks, it is not up.
+The session takes the bytes that the port received and returns feedback, with the time at which each
+line was complete. It writes the lines that leave in the form in force, plain or checked. It decides
+nothing about motion: `link_state.py` decides whether the link may carry motion, and
+`negotiation.py` which form is in force. The link is not up while the session asks the board for the
+check.
 """
 
 from __future__ import annotations
@@ -55,17 +57,23 @@ class McuSession:
         wheel_speed: float = FeedbackConfig().wheel_speed,
         longest_reply: float = LONGEST_REPLY_S,
     ) -> None:
-        """`wheel_speed` rad/s is the fastest a wheel can turn, `longest_reply` s the most that
-        mcu.reply_period may be."""
+        """Start without a port.
+
+        Args:
+            mcu: The table `[mcu]`.
+            rate_hz: Control rate.
+            wheel_speed: The highest speed that a wheel can have, rad/s.
+            longest_reply: The highest value that mcu.reply_period may have, s.
+        """
         self.codec = Codec(mcu.wheels, mcu.trailing_comma)
         self._lines = LineReader()
         self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
-        """Silence after which the link is stale, ns."""
+        """Duration of silence after which the link is stale, ns."""
         self.negotiation = Negotiation(mcu, self.codec.stop)
         self._link = Link(self.quiet_ns)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
-        self._echo = EchoDetector(mcu.baud_rate)
+        self._echo = EchoDetector()
         self.snapping = Snapping()
         self._hearing = Hearing()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
@@ -75,10 +83,10 @@ class McuSession:
         self.good_lines = 0
         self._heard_ns: int | None = None
         self.restarted = False
-        """The last `update` saw a new session with the MCU: reopened, it has started again, or it
-        is back from a long gap."""
+        """True if the last `update` saw a new session with the MCU: the port was opened again, the
+        MCU has started again, or a long gap has ended."""
         self.events: list[Event] = []
-        """What the last `update` found worth a log line."""
+        """Events of the last `update`, for the log."""
         self._starting_over = False
         self._announced: tuple[LinkState, str, bool, bool]
         self._announced = ("down", self.negotiation.in_force, False, False)
@@ -89,9 +97,9 @@ class McuSession:
         self._left_ns = 0
         """When the last line that left was made, or when the port was opened."""
         self._held_up = False
-        """The last line made did not leave."""
+        """True if the last line made did not leave."""
         self.blocked = False
-        """The port is open, but its driver has not taken a line for `BLOCKED_NS`."""
+        """True if the port is open, but its driver has not taken a line for `BLOCKED_NS`."""
 
     @property
     def link(self) -> LinkState:
@@ -106,10 +114,14 @@ class McuSession:
         received: tuple[Received, ...],
         unsent: bool = False,
     ) -> list[Feedback]:
-        """Take the port's state and bytes; the good lines in order, and `link` brought up to date.
+        """Take the port's state and bytes, and return the good lines in order.
 
-        `opened` counts the port's openings; a new number starts a new session. `unsent` says that
-        the last line did not go out.
+        Args:
+            now: Both clocks at this step.
+            port_open: Whether the port is open.
+            opened: The number of openings of the port. Another number starts a new session.
+            received: The bytes since the last update.
+            unsent: True if the last line did not leave.
         """
         self.restarted, self._starting_over, self.events = False, False, []
         self._settle(not unsent, port_open)
@@ -135,10 +147,10 @@ class McuSession:
         return feedback
 
     def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
-        """The line that says these speeds, in the form in force; None when none is due.
+        """Return the line with these speeds, in the form in force, or None if none is due.
 
-        To an MCU that does not answer, and while the check is asked for, only stops leave: the
-        first one at once, for it may be doing what it was told last.
+        While the MCU does not answer, and while the session asks it for the check, only stops
+        leave. The first stop leaves at once, because the MCU may still obey the line before.
         """
         line = self._next_line(now_ns, speeds)
         self._made = None if line is None else (line, now_ns)
@@ -156,7 +168,7 @@ class McuSession:
         return self.negotiation.seal(line, now_ns)
 
     def silent(self, now_ns: int) -> bool:
-        """No good line within `quiet`, or none at all in this session."""
+        """Return whether no good line came for `quiet`, or none at all in this session."""
         return self._link.silent(now_ns)
 
     def feedback_age_s(self, now_ns: int) -> float | None:
@@ -164,7 +176,7 @@ class McuSession:
         return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
 
     def words(self, port_trouble: str = "") -> str:
-        """How the link is, for people; `port_trouble` is why the port is closed."""
+        """Return a sentence about the link; `port_trouble` is the reason of a closed port."""
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
@@ -174,14 +186,14 @@ class McuSession:
 
     @property
     def note(self) -> str:
-        """Which check is in force, to go behind a reason; "" where none is wanted."""
+        """The check in force, as an addition to a reason; "" with `link_check = "off"`."""
         check = self.negotiation
         return "" if check.state == "off" else f" (serial lines {check.in_force})"
 
     # sessions
 
     def _settle(self, went: bool, port_open: bool) -> None:
-        """Note the fate of the line just made. An open port that took none uses up no throttle."""
+        """Note whether the line just made has left. A line that did not uses up no throttle."""
         self.negotiation.settle(went)
         made, self._made = self._made, None
         blind, self._just_blind = self._just_blind, False
@@ -190,7 +202,7 @@ class McuSession:
         self._held_up = not went
         if went:
             line, made_ns = made
-            self._echo.left(line, made_ns)
+            self._echo.left(line)
             self._timeline.left(made_ns)
             self.restarted = self.blocked and made_ns - self._left_ns >= LONG_GAP_NS
             self._left_ns = made_ns
@@ -212,7 +224,7 @@ class McuSession:
         self.negotiation.begin(fresh=True)
 
     def _restart(self, how: str) -> None:
-        """The MCU has started again: its motors stand, and nobody may drive on as if they did."""
+        """Start over with an MCU that has started again: its motors stand still now."""
         if self.link == "up":
             self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
         self._link.sign("restarted")
@@ -222,13 +234,13 @@ class McuSession:
         self.negotiation.begin()
 
     def _judge(self, now_ns: int) -> None:
-        # A step that comes late finds an old line too, but that is this computer's fault.
+        # A step that comes late also finds an old line, but then the computer was late.
         late = self.lateness.step_s > 0.0
         long = now_ns - self._left_ns > BLOCKED_NS
         self.blocked = self._held_up and (self.blocked or (long and not late))
         if self.blocked:
             self._link.sign("blocked")
-        # Never up in the update that saw a restart: who drives has to see the link go first.
+        # The link is never up in the update that saw a restart: the arbiter must see it lost first.
         self._link.judge(now_ns, may_rise=not self._starting_over)
         check, up = self.negotiation, self.link == "up"
         quiet = not up and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
@@ -256,13 +268,13 @@ class McuSession:
         self._rejected.clear()
 
     def _bad(self) -> None:
-        """A line came that is none; so many in a row that a check in force has to be asked anew."""
+        """Note a bad line. After several in a row the session asks for the check again."""
         if self._link.bad() and self.negotiation.checked:
             self._link.sign("damaged")
             self.negotiation.begin()
 
     def _announce(self) -> None:
-        """An event for the link and one for the check, when they have changed."""
+        """Add an event for the link and one for the check if they have changed."""
         link, check = self.link, self.negotiation
         before = self._announced
         self._announced = (link, check.in_force, bool(check.trouble), self.blocked)
@@ -281,7 +293,7 @@ class McuSession:
     # lines
 
     def _read(self, piece: Received) -> list[Feedback]:
-        """The good lines of one read; of each line the timeline hears."""
+        """Return the good lines of one read, and show each line to the timeline."""
         lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
         link = self._link
         if link.state != "up":
@@ -316,7 +328,7 @@ class McuSession:
                 asked_ns = check.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
-                if not asking and self._echo.report(line, speeds, read_at.mono_ns):
+                if not asking and self._echo.report(line, speeds):
                     check.found_echo()
                     self._link.sign("echo")
                     self._reject("echo")
@@ -338,7 +350,7 @@ class McuSession:
         size: tuple[int, int],
         asked_ns: int | None,
     ) -> Feedback:
-        """`size` are the bytes behind the line and its own."""
+        """Return the feedback of a good line; `size` is the bytes behind it, then its own."""
         self.good_lines += 1
         self._heard_ns = read_at.mono_ns
         since_ns = self._link.good(read_at.mono_ns)

@@ -14,10 +14,10 @@ import msgspec
 from acsard.config.settings import Config
 from acsard.messages.schema import (
     MESSAGES,
-    Clear,
     DoorState,
     Imu,
     JointState,
+    Release,
     SetPose,
     Settings,
     Twist,
@@ -26,7 +26,7 @@ from acsard.messages.schema import (
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = (Twist, SetPose, Clear, Settings, DoorState)
+ONLY_IN = (Twist, SetPose, Release, Settings, DoorState)
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 ENOUGH: dict[type, list[str]] = {

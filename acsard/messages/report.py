@@ -233,7 +233,7 @@ class Report:
             doubt=snapshot.doubt.text,
             sender=snapshot.sender,
             recording=snapshot.recording.trouble,
-            latch=0 if outputs.latches.next is None else outputs.latches.next.number,
+            latch=0 if outputs.latches.in_force is None else outputs.latches.in_force.number,
             latch_file=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
         )

@@ -243,7 +243,7 @@ class RobotState(Message, frozen=True):
     recording: str = ""
     """Why nothing is recorded just now, though it is asked for, in words; empty else."""
     latch: LatchNumber = 0
-    """Number of the stop or fault that `clear` releases next; 0 while none is latched."""
+    """Number of the fault, else of the stop, else of "inactive"; 0 while none is latched."""
     latch_file: str = ""
     """Why a stop would not survive a restart, in words; empty if it would, or in the simulator."""
     feedback_age: float | None = None
@@ -327,8 +327,8 @@ class SetPose(Message, frozen=True):
     yaw: float
 
 
-class Clear(Message, frozen=True):
-    """The latch that `clear` releases, by the number in `RobotState.latch`; null names none."""
+class Release(Message, frozen=True):
+    """The latch that `clear` or `activate` releases, by `RobotState.latch`; null names none."""
 
     latch: LatchNumber | None = None
 
@@ -411,7 +411,7 @@ MESSAGES: dict[str, type[Message]] = {
         Events,
         ServiceReply,
         SetPose,
-        Clear,
+        Release,
         Settings,
         Info,
         Interfaces,

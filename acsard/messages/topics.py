@@ -49,7 +49,7 @@ SERVICES: tuple[Verb, ...] = get_args(Verb)
 _SERVICE_NOTES: dict[Verb, str] = {
     "stop": "stop and stay stopped until clear",
     "clear": "release the fault if there is one, else the stop; the payload {latch} names it",
-    "activate": "switch on; commands count",
+    "activate": "switch on; commands count; the payload {latch} names the latch",
     "deactivate": "switch off; ramps to zero, commands do not count",
     "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
     "set_pose": "the pose becomes the payload {x, y, yaw}",

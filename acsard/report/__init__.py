@@ -1,9 +1,11 @@
-"""Pure: what `acsard log report` shows. A recording in, the text of one HTML file out.
+"""`acsard log report`: turns a recording into the text of one HTML file. All modules here are pure.
 
-`course` takes step after step and keeps what is to be drawn, thinned by `thinning` as it comes, so
-that a day takes no more room than a minute; `line` is what it keeps of the serial line and of the
-loop, `commanders` of who sent commands. `account` says it in words, `path` and `figures` make
-pictures of it with what `drawing` has, `page` puts all into a file, `look` has how that looks. The
-library's own code comes as an argument; what strangers wrote (names, sentences) passes
-`page.escaped` or `drawing.label`, whatever it says.
+`course` processes the steps one by one and keeps the data to draw. `thinning` limits that data as
+it arrives, so a day takes no more memory than a minute. `line` keeps the data of the serial line
+and of the control loop, and `commanders` the data of the command sources. `account` describes the
+recording in words. `path` and `figures` draw it, with the elements in `drawing`. `page` assembles
+the file, with the style in `look`.
+
+The plotly library's code is passed in as an argument. Text of unknown origin (names, sentences)
+must always pass `page.escaped` or `drawing.label`.
 """

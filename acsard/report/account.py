@@ -1,4 +1,4 @@
-"""A recording in words: the paragraph on top of a report, and the rows below it."""
+"""Describes a recording in words: the summary of a report and the table below it."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from acsard.config.validation import show
 from acsard.report.course import Course, Mark
 
 Clock = Callable[[float, bool], str]
-"""A time, s since 1970, as the clocks here tell it, with the day or without."""
+"""Formats a time in s since 1970 as local time, with the date if the second argument is true."""
 
 MOST_REASONS = 8
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
 FINE_S = 0.05
-"""s; what a point stands for is said from there on."""
+"""Bin width in s from which a note about the thinning is shown."""
 
 MOST_NAMES = 5
-"""Who stopped it, of those that are named."""
+"""Maximum number of names or different texts in a list."""
 
 
 class Origin(Struct, frozen=True):
-    """Where the pictures are from."""
+    """Source of the recording."""
 
     file: str
     robot: str
     version: str
-    """Of the acsard that recorded it."""
+    """Version of the acsard that made the recording."""
     python: str
     notes: tuple[str, ...] = ()
-    """What is missing of it, in words."""
+    """Notes about missing parts of the recording, in words."""
 
 
 class Setting(NamedTuple):
@@ -49,7 +49,10 @@ class Setting(NamedTuple):
 
 
 def differences(config: Config) -> list[Setting]:
-    """What is set otherwise than by default; a source that is new, or gone, by its priority."""
+    """Return the settings that differ from their defaults.
+
+    A source that was added or removed appears with all its keys.
+    """
     here, default = (dict(flat(effective(one))) for one in (config, Config()))
     return [
         Setting(key, _shown(here, key), _shown(default, key))
@@ -67,7 +70,7 @@ def _shown(table: dict[str, object], key: str) -> str:
 
 
 def lasted(seconds: float) -> str:
-    """A time as people say it."""
+    """Format a duration for people."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -76,12 +79,12 @@ def lasted(seconds: float) -> str:
 
 
 def many(count: int, one: str, more: str = "") -> str:
-    """So many of them; `no` for none."""
+    """Return a count with its noun; zero is written as `no`."""
     return f"{count or 'no'} {one if count == 1 else more or one + 's'}"
 
 
 def summary(course: Course) -> str:
-    """What happened, in three sentences."""
+    """Return the course of events in two or three sentences."""
     fast, counts = course.fastest, course.marks.counts
     drove = sum(one.seconds for one in course.driven.values())
     way = (
@@ -113,9 +116,10 @@ def _names(marks: list[Mark]) -> str:
 
 
 def reasons(course: Course) -> list[tuple[str, str, str, float]]:
-    """Source, what it did but drive, why, and for how many s: the longest first.
+    """Return source, state, reason and duration in s of the times that a source did not drive.
 
-    Sentences that differ by a number are one, as the longest of them says it.
+    The longest come first, at most `MOST_REASONS`. Sentences that differ only in numbers count as
+    one, represented by the one that lasted longest.
     """
     found: dict[tuple[str, str, str], dict[str, float]] = {}
     for name, band in course.commanders.bands.items():
@@ -132,7 +136,7 @@ def reasons(course: Course) -> list[tuple[str, str, str, float]]:
 
 
 def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
-    """What was said, and when first."""
+    """Return each distinct text with the time of its first occurrence."""
     first: dict[str, Mark] = {}
     for mark in marks:
         first.setdefault(mark.text, mark)
@@ -142,7 +146,7 @@ def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
 
 
 def notes(course: Course, origin: Origin) -> list[str]:
-    """What a reader has to know of these pictures."""
+    """Return notes about missing steps and about the resolution of the pictures."""
     found = list(origin.notes)
     if course.missing:
         found.append(
@@ -160,7 +164,7 @@ def notes(course: Course, origin: Origin) -> list[str]:
 
 
 def rows(course: Course, origin: Origin, clock: Clock) -> Iterator[tuple[str, str]]:
-    """What each row of the summary is about, and what it says."""
+    """Yield the label and the content of each row of the summary table."""
     began, config = course.began or 0.0, course.config
     yield "When", f"{clock(began, True)} to {clock(began + course.seconds, True)}"
     yield "How long", f"{lasted(course.seconds)}, {course.steps} steps"

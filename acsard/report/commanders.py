@@ -1,4 +1,4 @@
-"""Who sent commands, whose counted, and why the others waited or were refused."""
+"""The command sources over time: which one drove, and why the others waited or were refused."""
 
 from __future__ import annotations
 
@@ -14,45 +14,49 @@ from acsard.robot import Robot
 from acsard.values import NS_PER_S, Command, Outputs, Twist
 
 DOES = ("refused", "waits", "sends", "drives")
-"""What a source does while it is not silent; those first that stay where too many are to be drawn.
-`sends`: its commands count, and the robot stands for another reason."""
+"""States of a source that is not silent, in the order in which they win when short spans are
+merged.
+
+`sends` means that its commands are accepted but the robot stands for another reason.
+"""
 
 MOVES = ("ready", "driving")
-"""The modes in which a source decides whether the robot moves: in others it waits for no source."""
+"""Modes in which a source decides whether the robot moves. In the other modes the robot follows
+none."""
 
 OTHERS = "others"
-"""The sources that are in no list, whatever they call themselves."""
+"""Collective name of sources that are not in the configuration."""
 
 LOOK_S = 0.1
-"""Between two looks at what the sources wait for, unless the mode or the commander changes."""
+"""Interval in s at which the sources are sampled, unless the mode or the driving source changes."""
 
 MOST_TEXT = 300
-"""Characters of a sentence or a name that are kept."""
+"""Maximum number of characters that are kept of a sentence or a name."""
 
 MOST_SENDERS = 256
 
 
 class Commanders:
-    """Follows all sources through the steps."""
+    """The states of all sources over the steps."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
         self._timeouts = {
             source.name: source.timeout for source in sorted(sources, key=lambda s: -s.priority)
         }
         self.bands = {name: Band(DOES) for name in (*self._timeouts, OTHERS)}
-        """The highest priority first."""
+        """The states of each source, highest priority first."""
         self._newest: dict[tuple[str, str], Command] = {}
-        """Of each sender of a source."""
+        """Last command by (source, sender), the newest last."""
         self._counted: Counter[str] = Counter()
         self._refused: dict[str, tuple[float, str]] = {}
-        """Until when a source counts as refused, and why."""
+        """Time until which a source counts as refused, and the reason."""
 
     def name(self, source: str) -> str:
-        """The source, if it is one of the list."""
+        """Return the name of a configured source, or `OTHERS`."""
         return source if source in self._timeouts else OTHERS
 
     def hear(self, step: Step, t: float, robot: Robot) -> bool:
-        """Take the commands of a step; whether one was refused."""
+        """Take the commands of a step; return whether the set of refused sources changed."""
         commands, before = step.inputs.commands, dict(self._refused)
         for command in commands:
             self._newest.pop((command.source, command.sender), None)
@@ -67,7 +71,11 @@ class Commanders:
         return before != self._refused
 
     def _objections(self, step: Step, t: float, robot: Robot) -> None:
-        """What the robot objected to in commands that could be read: counted by its reasons."""
+        """Find the commands of this step that the robot refused, by its counters.
+
+        A counter does not name the source, so the command of each source is compared with the last
+        accepted one.
+        """
         counted = Counter({name: robot.counters[f"command_{name}"] for name in REFUSED})
         news, self._counted = counted - self._counted, counted
         if not news:
@@ -78,14 +86,14 @@ class Commanders:
         for command in step.inputs.commands:
             age_s = ages.get(command.source)
             if age_s is None or age_s * NS_PER_S > now_ns - command.arrived_ns + 1:
-                self._refuse(command.source, t, words)  # else its newest one counts
+                self._refuse(command.source, t, words)  # otherwise the robot accepted it
 
     def _refuse(self, source: str, t: float, words: str) -> None:
         until = t + self._timeouts.get(source, LOOK_S)
         self._refused[self.name(source)] = until, words[:MOST_TEXT]
 
     def wish(self, outputs: Outputs) -> Twist | None:
-        """What the command that is followed asks for."""
+        """Return the twist of the command that the robot follows, or None."""
         if outputs.command_ns is None:
             return None
         for command in reversed(self._newest.values()):
@@ -94,7 +102,7 @@ class Commanders:
         return None
 
     def look(self, step: Step, t: float, robot: Robot) -> None:
-        """What each of them does now."""
+        """Record the present state of each source."""
         for name, does, words in self._do(step, t, robot):
             self.bands[name].add(t, does, words)
 
@@ -116,6 +124,6 @@ class Commanders:
         yield OTHERS, "refused" if lately else "", lately
 
     def _lately(self, name: str, t: float) -> str:
-        """Why its commands were refused within its timeout, "" for not at all."""
+        """Return why commands of a source were refused within its timeout, or ""."""
         until, words = self._refused.get(name, (-math.inf, ""))
         return words if t < until else ""

@@ -1,7 +1,7 @@
-"""What a recording shows, taken step by step: what to draw and what to say of it.
+"""The content of a recording, collected step by step: the data to draw and to describe.
 
-Mode, reasons, path, events and whose commands came are as they were recorded. What was wished,
-allowed and measured is of the robot that is run over the same inputs beside it.
+Mode, reasons, path, events and the driving source are taken from the recording. The wished, limited
+and measured speeds come from a robot that replays the same inputs.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from acsard.robot import Robot
 from acsard.values import NS_PER_S, Outputs, Twist
 
 MODES = ("fault", "stopped", "leaving", "waiting", "inactive", "driving", "ready")
-"""The worst first: where there are too many to draw, these stay."""
+"""Robot modes, in the order in which they win when short spans are merged."""
 
 LINKS = ("down", "stale", "booting", "up")
 
 FIRST, LAST = 30, 30
-"""Events of one name that are kept."""
+"""Number of first and of last events of one name that are kept."""
 
 
 class Mark(Struct, frozen=True):
-    """An event, at `t` s, and where the robot was then by odometry."""
+    """An event at time `t` (s), and the place of the robot by odometry."""
 
     t: float
     name: str
@@ -43,17 +43,17 @@ class Mark(Struct, frozen=True):
 
 
 class Marks:
-    """Events: of each name the first ones and the last ones."""
+    """Events; of each name only the first and the last ones are kept."""
 
     def __init__(self) -> None:
         self._first: dict[str, list[Mark]] = {}
         self._last: dict[str, deque[Mark]] = {}
         self.counts: Counter[str] = Counter()
-        """All there were, each for as many as it stands for."""
+        """Number of events by name. A repeated event counts as often as it occurred."""
         self.left_out = 0
 
     def add(self, mark: Mark) -> None:
-        """One more."""
+        """Add an event, and drop a middle one of the same name if there are too many."""
         self.counts[mark.name] += mark.count
         first = self._first.setdefault(mark.name, [])
         if len(first) < FIRST:
@@ -64,48 +64,48 @@ class Marks:
         last.append(mark)
 
     def all(self) -> list[Mark]:
-        """Those that are kept, by time."""
+        """Return the kept events in order of time."""
         rows = [mark for kept in (self._first, self._last) for row in kept.values() for mark in row]
         return sorted(rows, key=lambda mark: mark.t)
 
 
 class Driven(Struct):
-    """What one source did with the robot."""
+    """Time and distance that one source drove the robot."""
 
     seconds: float = 0.0
     metres: float = 0.0
 
 
 class Course:
-    """Takes one step after the other, those between `begin` and `end` (s since 1970) count."""
+    """Collects the steps between the times `begin` and `end` (s since 1970)."""
 
     def __init__(
         self, config: Config, begin: float | None = None, end: float | None = None
     ) -> None:
         self._window = (-math.inf if begin is None else begin, math.inf if end is None else end)
         self.config = config
-        """In force at the beginning."""
+        """Configuration at the beginning."""
         self.path = Track()
         self.linear = {name: Curve() for name in ("wished", "limited", "measured")}
         self.angular = {name: Curve() for name in ("wished", "limited", "measured")}
         self.asked, self.turned = [Curve() for _ in range(4)], [Curve() for _ in range(4)]
-        """rad/s, in `WHEELS` order."""
+        """Commanded and measured wheel speeds, rad/s, in `WHEELS` order."""
         self.modes, self.links = Band(MODES), Band(LINKS)
         self.commanders = Commanders(config.commands.sources)
         self.link = Link()
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
         self.began: float | None = None
-        """s since 1970 of the first step that counts: t is 0 there."""
+        """Time of the first collected step in s since 1970; `t` is 0 there."""
         self.seconds = self.metres = 0.0
         self.driven: dict[str, Driven] = {}
         self.fastest = Twist()
-        """Each axis by itself, without its sign."""
+        """Highest measured speed of each axis, as a magnitude."""
         self.steps = self.missing = 0
         self._story = Story()
         self._mono_ns = self._wall_ns = 0
         self._wall = -math.inf
-        """s since 1970 of the last step."""
+        """Wall-clock time of the last step, s since 1970."""
         self._number: int | None = None
         self._place: Place | None = None
         self._jumps = True
@@ -114,16 +114,16 @@ class Course:
 
     @property
     def over(self) -> bool:
-        """No step to come counts."""
+        """Whether the last step was after the end of the time window."""
         return self._wall > self._window[1]
 
     @property
     def at(self) -> float:
-        """Wall-clock time of the last step, s."""
+        """Wall-clock time of the last step, s since 1970."""
         return self._wall
 
     def step(self, step: Step, outputs: Outputs, robot: Robot) -> None:
-        """A step as it was recorded, and what `robot` made of it now."""
+        """Process a recorded step; `outputs` and `robot` are its replay."""
         now = step.inputs.now
         if self._number is None:
             self._mono_ns, self._wall_ns = now.mono_ns, now.wall_ns
@@ -149,7 +149,7 @@ class Course:
         self._number = step.number
 
     def end(self) -> None:
-        """There are no more steps."""
+        """Finish after the last step."""
         t = self.seconds
         for band in (self.modes, self.links, *self.commanders.bands.values()):
             band.end(t)
@@ -159,7 +159,7 @@ class Course:
         text, by = one.text[:MOST_TEXT], one.by[:MOST_TEXT]
         return Mark(t, one.name, text, one.level, by, one.count, self._place)
 
-    # what it drove
+    # Distance and speeds.
 
     def _drive(self, step: Step, t: float, counts: bool) -> None:
         mode, _, _, source = step.said.status
@@ -176,7 +176,7 @@ class Course:
             self._place, self._jumps = place, False
             if counts:
                 self.path.add(place)
-        # Requests are served after the poses of their step.
+        # A request takes effect after the poses of its step.
         if any(request.verb in ("set_pose", "reset_odometry") for request in step.inputs.requests):
             self._jumps = True
 
@@ -207,13 +207,16 @@ class Course:
             )
 
     def _asked(self, curve: Curve, step: Step, t: float, speed: float) -> None:
-        """What a line that left says counts until the microcontroller has waited for another."""
+        """Record a commanded speed.
+
+        A sent line is valid until the microcontroller's watchdog expires.
+        """
         if step.said.left is not None:
             curve.add(t, speed)
         elif t - self._left > WATCHDOG_S:
             curve.add(t, None)
 
-    # what the line and the modes were
+    # Serial line and modes.
 
     def _line(self, step: Step, outputs: Outputs, robot: Robot, t: float, known: bool) -> None:
         inputs, left = step.inputs, step.said.left is not None

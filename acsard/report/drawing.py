@@ -1,7 +1,8 @@
-"""What the pictures are made of, as the library plotly wants it: plain lists and dicts.
+"""Elements of the pictures in the format of the library plotly: plain lists and dicts.
 
-Numbers are doubles in base64, which the library reads and JSON has no word for NaN. The colours of
-paper, grid and text are the page's (`look.py`); those here suit light and dark.
+Numbers are doubles in base64, because plotly reads them and JSON cannot represent NaN. The colours
+of paper, grid and text are set by the page (`look.py`). The colours here suit a light and a dark
+background.
 """
 
 from __future__ import annotations
@@ -33,26 +34,26 @@ UNKNOWN = "#9a9a9a"
 COMMANDERS = (
     "#159a6b", "#2f6fd8", "#b04fc4", "#8f4f22", "#1ab2d2", "#8a8f00", "#e0588c", "#4a2f8f",
 )  # fmt: skip
-"""Who drives: told apart also beside each other."""
+"""Colours of the driving sources; neighbours in the list are easy to tell apart."""
 
 PATTERNS = ("", "/", "x", ".", "-")
-"""For who comes after so many: the same colours, hatched."""
+"""Fill patterns. When the colours are used up, they repeat with the next pattern."""
 
 
 def commander(number: int) -> tuple[str, str]:
-    """The colour and the pattern of the n-th who drives."""
+    """Return the colour and the pattern of the n-th driving source."""
     beyond, place = divmod(number, len(COMMANDERS))
     return COMMANDERS[place], PATTERNS[beyond % len(PATTERNS)]
 
 
 WRAP = 42
-"""Characters of a line that fits on a phone."""
+"""Line length in characters that fits on a phone."""
 
 Trace = dict[str, Any]
 
 
 class Key(NamedTuple):
-    """A sign of a picture, its colour, and what it means."""
+    """An entry of a legend: symbol, colour and meaning."""
 
     sign: str
     colour: str
@@ -65,27 +66,27 @@ class Figure(NamedTuple):
     caption: str
     keys: list[Key]
     height: int
-    """px"""
+    """Height in px."""
     data: list[Trace]
     layout: dict[str, Any]
     timed: bool = True
-    """Its x axis is time: who looks closer at it wants the others to follow."""
+    """True if the x axis is time; zooming one such picture zooms all of them."""
 
 
 def label(text: str) -> str:
-    """A text by whomever as the library shows it: as it is, on short lines."""
+    """Escape any text for plotly and wrap it to short lines."""
     lines = textwrap.wrap(printable(text), WRAP) or [""]
     return "<br>".join(html.escape(line) for line in lines)
 
 
 def numbers(values: Iterable[float]) -> dict[str, str]:
-    """A column of doubles."""
+    """Encode a column of numbers as doubles in base64."""
     data = struct.pack(f"<{len(values := list(values))}d", *values)
     return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
 
 
 def sentence(mark: Mark) -> str:
-    """An event for who points at it."""
+    """Return the hover text of an event."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
     by = [label(f"by {mark.by}")] if mark.by else []
     return "<br>".join([head, label(mark.text), *by])
@@ -105,7 +106,7 @@ def layout() -> dict[str, Any]:
 
 
 def note(text: str, x: float, y: float) -> dict[str, Any]:
-    """A heading within a picture: it takes no room beside it."""
+    """Return a heading inside a picture, where it needs no margin."""
     return {
         "text": label(text), "x": x, "y": y, "xref": "paper", "yref": "y", "xanchor": "left",
         "yanchor": "middle", "showarrow": False, "font": {"size": 13},

@@ -1,6 +1,6 @@
-"""The pictures of a course over time, and `Pictures.all`: every picture of it.
+"""The pictures of a course over time; `Pictures.all` returns every picture of a report.
 
-Time is in ms since 1970 by the clock on the wall here: the library knows no time zones.
+Times are local times in ms since 1970, because the library knows no time zones.
 """
 
 from __future__ import annotations
@@ -31,43 +31,43 @@ from acsard.report.thinning import Point, Span
 from acsard.values import WHEELS
 
 ROW_PX, ROOM_PX = 54, 68
-"""Height of a row of bands, and what the time axis takes beside the rows."""
+"""Height of a row of bands, and additional height for the time axis."""
 
 
 class Line(NamedTuple):
-    """A curve of a picture, and how it goes from one value to the next."""
+    """A curve of a picture; `shape` is plotly's interpolation between two values."""
 
     name: str
     colour: str
     points: Sequence[Point]
     shape: str = "linear"
     width: float = 1.6
-    """px"""
+    """Line width, px."""
 
 
 BENEATH = 3.4
-"""Of what another curve nearly hides: its colour is seen on both sides."""
+"""Width of a curve that another one nearly covers, so that its colour shows on both sides."""
 
 
 class Part(NamedTuple):
-    """One of several pictures above one time axis."""
+    """One of several pictures above a common time axis."""
 
     title: str
     lines: list[Line]
 
 
 Row = tuple[str, list[Span]]
-"""A row of bands, and whose they are."""
+"""The name of a row and its bands."""
 
 DRIVES = "drives"
 
 
 class Look(NamedTuple):
-    """How the bands of a kind look; of those that drive each has a look of its own."""
+    """Appearance of the bands of one kind. Each driving source has its own."""
 
     kind: str
     who: str
-    """"" for whoever it is."""
+    """Name of the driving source; "" applies to all rows."""
     colour: str
     pattern: str = ""
 
@@ -76,7 +76,7 @@ class Look(NamedTuple):
         return f"{self.who} {self.kind}".strip()
 
     def of(self, row: Row) -> list[Span]:
-        """The bands of a row that look so."""
+        """Return the bands of a row with this appearance."""
         name, spans = row
         return [one for one in spans if one.kind == self.kind] if self.who in ("", name) else []
 
@@ -92,7 +92,7 @@ def _looks(rows: list[Row]) -> Iterator[Look]:
 
 
 def _keys(looks: list[Look]) -> list[Key]:
-    """One for each colour, with all that it means, each in a row of its own."""
+    """Return one legend entry for each colour and pattern, with all its meanings."""
     meanings: dict[tuple[str, str], list[str]] = {}
     for one in looks:
         meanings.setdefault((one.colour, one.pattern), []).append(one.told)
@@ -103,21 +103,21 @@ def _keys(looks: list[Look]) -> list[Key]:
 
 
 class Pictures:
-    """Draws a course; `offset_s` is what the clocks here are ahead of UTC."""
+    """Draws a course; `offset_s` is the local time's offset from UTC."""
 
     def __init__(self, course: Course, offset_s: float) -> None:
         self._course = course
         self._zero_ms = 1000 * ((course.began or 0.0) + offset_s)
 
     def all(self) -> list[Figure]:
-        """In the order of the page."""
+        """Return all pictures in the order of the page."""
         return [
             path(self._course), self.speeds(), self.who(), self.events(), self.wheels(),
             self.link(), self.loop(),
         ]  # fmt: skip
 
     def speeds(self) -> Figure:
-        """What was wished, allowed and measured."""
+        """Draw the wished, limited and measured speeds."""
         course = self._course
         parts = [
             Part(
@@ -140,7 +140,7 @@ class Pictures:
         return self._stack("speeds", "Speed", caption, parts, 210)
 
     def wheels(self) -> Figure:
-        """What each wheel was asked, and what it said."""
+        """Draw the commanded and measured speed of each wheel."""
         pairs = zip(WHEELS, self._course.asked, self._course.turned, strict=True)
         parts = [
             Part(
@@ -156,7 +156,7 @@ class Pictures:
         return self._stack("wheels", "The four wheels", caption, parts, 150)
 
     def link(self) -> Figure:
-        """Lines a second."""
+        """Draw the lines per second, and the lost ones."""
         link = self._course.link
         bad = [Line("dropped", COLOURS["error"], link.dropped.points(), "hvh")]
         if not self._course.config.mcu.reply_period:
@@ -178,13 +178,13 @@ class Pictures:
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
-        """How late it was."""
+        """Draw the lateness of the control loop."""
         late = Line("late", LIMITED, self._course.lateness.points(), "hv")
         caption = "From when a period was due to its step, against the one that was least late."
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
     def who(self) -> Figure:
-        """Mode, link and sources as bands."""
+        """Draw mode, link and sources as bands."""
         course, silent = self._course, list[str]()
         rows: list[Row] = [
             ("mode", course.modes.spans()),
@@ -214,7 +214,7 @@ class Pictures:
 
     def _bars(self, look: Look, spans: list[tuple[int, Span]]) -> Trace:
         kind, colour = look.kind, look.colour
-        # However short it is, a line of it is seen.
+        # The border line keeps even a very short band visible.
         marker: dict[str, Any] = {"color": colour, "line": {"color": colour, "width": 1}}
         if look.pattern:
             marker["pattern"] = {"shape": look.pattern}
@@ -236,7 +236,7 @@ class Pictures:
         }
 
     def events(self) -> Figure:
-        """All events as marks."""
+        """Draw all events as marks."""
         levels, kept = ("info", "warning", "error"), self._course.marks
         data = [
             self._marks(level, at, [mark for mark in kept.all() if mark.level == level])
@@ -262,7 +262,7 @@ class Pictures:
             "hovertemplate": "%{hovertext}<extra></extra>",
         }
 
-    # what is alike in them
+    # Shared parts.
 
     def _ms(self, t: float) -> float:
         return self._zero_ms + 1000 * t
@@ -272,13 +272,13 @@ class Pictures:
         axis = {
             "type": "date",
             "range": [self._ms(-0.01 * seconds), self._ms(1.01 * seconds)],
-            # Ticks that nobody sees hold the times clear of the lowest number beside them.
+            # Invisible ticks keep the time labels away from the lowest label of the y axis.
             "ticks": "outside", "ticklen": 8, "tickcolor": "rgba(0,0,0,0)",
         }  # fmt: skip
         return layout() | {"xaxis": axis, "margin": {"l": 44, "r": 12, "t": 8, "b": 44}}
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
-        """Pictures above each other, with one time axis and one legend."""
+        """Draw pictures above each other, with one time axis and one legend."""
         axes, data, notes = self._timed(), list[Trace](), list[dict[str, Any]]()
         share, gap = 1 / len(parts), 30 / (px * len(parts))
         for at, part in enumerate(parts):

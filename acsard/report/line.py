@@ -1,4 +1,4 @@
-"""The serial line second by second, and how late the control loop was."""
+"""Per-second counts of the serial line, and the lateness of the control loop."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from acsard.report.thinning import Curve, Point
 from acsard.values import NS_PER_S
 
 GOOD = "lines"
-"""What `Snapshot.counters` has of lines that were read and understood."""
+"""Name of the counter of lines that were parsed."""
 
 BAD = "line_"
-"""Begins the counters of those that were dropped."""
+"""Prefix of the counters of dropped lines."""
 
 IMPOSSIBLE = "line_impossible"
-"""Of those that were understood, and could not be true."""
+"""Counter of lines that were parsed but whose content was impossible."""
 
 NS_PER_MS = 1_000_000
 
 
 class Totals:
-    """Counts of a part of a recording."""
+    """Totals of a part of a recording."""
 
     def __init__(self) -> None:
         self.sent = self.good = self.dropped = self.unanswered = 0
 
 
 class Link:
-    """Lines sent, answered, dropped and without an answer, each second."""
+    """Lines sent, answered, dropped and unanswered, for each second."""
 
     def __init__(self) -> None:
         self.sent, self.good, self.dropped, self.unanswered = Curve(), Curve(), Curve(), Curve()
@@ -36,17 +36,17 @@ class Link:
         self._second: int | None = None
         self._sent = self._base = 0
         self._heard = (0, 0)
-        """Good and dropped, all there ever were, when this second began."""
+        """Good and dropped lines since the daemon's start, at the beginning of this second."""
         self._now = (0, 0)
-        """The same by now."""
+        """Good and dropped lines since the daemon's start, at the last step."""
         self._least: int | None = None
-        """The fewest lines that had no answer at any time of this second: the newest line may just
-        be under way, the others are lost."""
+        """Smallest number of unanswered lines at any step of this second. The newest line may just
+        be under way; the others are lost."""
         self._open: int | None = None
-        """The most of these fewest, of all seconds before."""
+        """Maximum of `_least` over all earlier seconds."""
 
     def step(self, t: float, sent: bool, counters: Mapping[str, int]) -> None:
-        """A step at `t`, whether a line left with it, and what was counted by then."""
+        """Process a step: its time in s, whether a line was sent, and the counters after it."""
         heard = self._now = _heard(counters)
         if self._second is None:
             self._second, self._heard, self._base = int(t), heard, sum(heard)
@@ -61,7 +61,7 @@ class Link:
         return self.totals.sent + self._sent - (sum(heard) - self._base)
 
     def _end(self, heard: tuple[int, int]) -> None:
-        """Of a second, which may be followed by others without a step."""
+        """Close a second; seconds without a step may follow."""
         t, totals = float(self._second or 0) + 0.5, self.totals
         good, dropped = (now - then for now, then in zip(heard, self._heard, strict=True))
         least = self._least or 0
@@ -81,22 +81,22 @@ class Link:
         self._sent, self._heard, self._open, self._least = 0, heard, most, None
 
     def end(self) -> None:
-        """No more steps: what the last second has counts too."""
+        """Close the last second."""
         if self._second is not None:
             self._end(self._now)
 
 
 def _heard(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Lines that were believed, and those that were dropped."""
+    """Return the number of accepted and of dropped lines."""
     bad = sum(count for name, count in counters.items() if name.startswith(BAD))
     return counters.get(GOOD, 0) - counters.get(IMPOSSIBLE, 0), bad
 
 
 class Lateness:
-    """How late each period's step was, in ms, against the clock that the earliest of them keep.
+    """Lateness of each period's step in ms, relative to the earliest step.
 
-    Periods without a step of their own are counted, so their number is known, and with it the clock
-    but for where it begins: there the step that was least late shows it.
+    Missed periods are counted, so the number of each period is known. Its due time is then known
+    except for a constant offset, which the least late step determines.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -107,16 +107,20 @@ class Lateness:
         self._began_ns: int | None = None
         self._earliest = math.inf
         self.missed = 0
-        """Periods without a step."""
+        """Number of periods without a step."""
         self.most_missed = 0
-        """In a row."""
+        """Largest number of consecutive periods without a step."""
 
     def at_once(self) -> None:
-        """A line went at once: it takes the place of a period's."""
+        """Note that a line was sent at once, in place of the next period's line."""
         self._ahead += 1
 
     def tick(self, t: float, now_ns: int, missed: int, known: bool) -> None:
-        """A period's step; `missed` ended before it. Where steps are missing it is not `known`."""
+        """Process the step of a period, before which `missed` periods ended without a step.
+
+        `known` is False if steps are missing from the recording; then the period is derived from
+        the clock.
+        """
         period_ns, began_ns = self._period_ns, self._began_ns
         if began_ns is None:
             began_ns = self._began_ns = now_ns
@@ -127,7 +131,7 @@ class Lateness:
             self._number, missed = round((now_ns - began_ns) / period_ns), 0
         behind_ns = now_ns - began_ns - self._number * period_ns
         if missed and self._ahead and behind_ns < self._earliest - period_ns / 2:
-            self._number -= 1  # the line that went at once was in a period that was missed
+            self._number -= 1  # the line sent at once belonged to a missed period
             behind_ns += period_ns
         self._ahead = 0
         self.missed += missed
@@ -136,11 +140,11 @@ class Lateness:
         self._curve.add(t, (behind_ns + missed * period_ns) / NS_PER_MS)
 
     def points(self) -> list[Point]:
-        """ms, by time."""
+        """Return the lateness in ms over time in s."""
         least = self._earliest / NS_PER_MS
         return [Point(t, value - least) for t, value in self._curve.points()]
 
     @property
     def most(self) -> float:
-        """ms"""
+        """Largest lateness, ms."""
         return max([point.value for point in self.points()], default=0.0)

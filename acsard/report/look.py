@@ -1,4 +1,4 @@
-"""How a report looks, and what its one small program does."""
+"""The style sheet of a report and its script."""
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2127; --soft: #59636e; --paper: #fff; --card: #f5f7f9;

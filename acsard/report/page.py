@@ -1,8 +1,8 @@
-"""A report as one HTML file: all in it, nothing fetched, and no word of a stranger is code.
+"""A report as one self-contained HTML file, in which no text of unknown origin can become code.
 
-Texts pass `escaped`; the pictures are data in a block that no browser runs, without a `<` in it.
-Were one forgotten, the policy of the page would still stop it: only the two programs in it may run,
-by their hashes, and nothing may be loaded.
+Texts pass `escaped`. The pictures are JSON in a block that browsers do not execute, without any
+`<`. As a second barrier, the page's security policy allows only its two scripts, by their hashes,
+and forbids all loading.
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ from acsard.report.figures import Pictures
 from acsard.report.look import PROGRAM, STYLE
 
 MOST_OPEN = 40
-"""Events; a longer list is shown when it is asked for."""
+"""Number of events up to which the list is open at first."""
 
 
 def escaped(text: str) -> str:
-    """A text by whomever, as it is shown."""
+    """Return any text as safe HTML."""
     return html.escape(printable(text))
 
 
 def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: float = 0.0) -> str:
-    """The file; `library` is plotly's program, `offset_s` what the clocks here are ahead of UTC."""
+    """Return the text of the file.
+
+    `library` is the code of plotly, `offset_s` the local time's offset from UTC.
+    """
     figures = Pictures(course, offset_s).all()
     title = escaped(f"{origin.robot}, {clock(course.began or 0.0, True)}")
     body = [

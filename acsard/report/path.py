@@ -1,4 +1,4 @@
-"""The picture of where a robot went."""
+"""The picture of the path."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from acsard.report.drawing import (
 from acsard.report.thinning import Place
 
 HEADINGS = 12
-"""Arrows along a path."""
+"""Approximate number of heading arrows along a path."""
 
 NOTED = {
     "fault": ("✖", "x", COLOURS["error"]),
@@ -31,11 +31,11 @@ NOTED = {
     "link_stale": ("▲", "triangle-up", "#e0b400"),
     "link_late": ("⬟", "pentagon", "#8f4f22"),
 }
-"""Events that the path shows where they happened: sign, as the library calls it, and colour."""
+"""Events that are drawn on the path: legend symbol, plotly's name of the symbol, and colour."""
 
 
 def path(course: Course) -> Figure:
-    """Where it went."""
+    """Draw the path with its events."""
     places = course.path.places()
     keys: list[Key] = []
     data: list[Trace] = []
@@ -67,7 +67,7 @@ def path(course: Course) -> Figure:
 
 
 def _noted(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
-    """Where these events happened."""
+    """Draw the events of one name at their places, or return None without any."""
     marks_here = [mark for mark in marks.all() if mark.name == name]
     here = [(mark, mark.place) for mark in marks_here if mark.place is not None]
     if not here:
@@ -90,14 +90,14 @@ def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
 
 
 def _broken(places: list[Place]) -> list[Place]:
-    """With a gap where it was set elsewhere."""
+    """Insert a gap where the pose was set."""
     gap = Place(0.0, math.nan, math.nan, 0.0)
     found = [one for place in places for one in ((gap, place) if place.new else (place,))]
     return found[1:] if found and found[0] is gap else found
 
 
 def _spread(places: list[Place]) -> list[Place]:
-    """Some of them, as far from each other by way as can be."""
+    """Return about `HEADINGS` places at equal distances along the path."""
     ways = [0.0]
     for one, other in pairwise(places):
         step = 0.0 if other.new else math.hypot(other.x - one.x, other.y - one.y)
@@ -111,7 +111,7 @@ def _spread(places: list[Place]) -> list[Place]:
 
 
 def _arrows(places: list[Place]) -> dict[str, Any]:
-    """The library's angles are in degrees from up, clockwise."""
+    """Return markers along the heading. Plotly's angles are in degrees clockwise from up."""
     angles = [round(90 - math.degrees(place.yaw), 2) for place in places]
     return {"symbol": "arrow", "size": 13, "color": LIMITED, "angle": angles}
 

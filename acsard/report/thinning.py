@@ -1,7 +1,7 @@
-"""Long rows of numbers kept short as they come: no peak is lost, and no more room is taken.
+"""Containers that limit long series as they arrive, without losing a peak.
 
-Time is in s since the first step, and does not go back. Each of these holds a bounded number of
-entries; when there is one more, what lies close together becomes one, twice as wide as before.
+Times are in s since the first step and never decrease. Each container holds a bounded number of
+entries. When it overflows, neighbouring entries are merged and the resolution is halved.
 """
 
 from __future__ import annotations
@@ -11,17 +11,18 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 MOST_BINS = 1500
-"""Of a curve: two for each pixel that a picture has across."""
+"""Maximum number of bins of a curve: two for each pixel of a picture's width."""
 
 FIRST_WIDTH = 0.001
-"""s; finer than the steps: a short recording is kept as it is."""
+"""First bin width in s. It is finer than the interval of the steps, so a short recording is not
+thinned."""
 
 MOST_SPANS = 1500
 
 MOST_PLACES = 4000
 
 FIRST_STRIDE = 0.001
-"""m"""
+"""First minimum distance of two kept places, m."""
 
 
 class Point(NamedTuple):
@@ -34,19 +35,19 @@ class _Bin(NamedTuple):
     low: Point
     high: Point
     breaks: bool = False
-    """There is no value after these."""
+    """True if the curve is interrupted after this bin."""
 
 
 class Curve:
-    """A value over time: of each bin the lowest and the highest, and when those were."""
+    """A value over time: the lowest and the highest value of each bin, with their times."""
 
     def __init__(self, most: int = MOST_BINS) -> None:
         self._most, self._bins = most, list[_Bin]()
         self.width = FIRST_WIDTH
-        """s of one bin."""
+        """Width of a bin, s."""
 
     def add(self, t: float, value: float | None) -> None:
-        """The value at `t`; None (or what is no number) is none, and breaks the line."""
+        """Add the value at `t`; None, NaN and infinity interrupt the line."""
         bins = self._bins
         if value is None or not math.isfinite(value):
             if bins:
@@ -64,7 +65,7 @@ class Curve:
             self._bins = bins = list(_halved(bins))
 
     def points(self) -> list[Point]:
-        """What to draw, in order; a value that is NaN is a break."""
+        """Return the points to draw, in order; NaN marks an interruption."""
         found: list[Point] = []
         for _, low, high, breaks in self._bins:
             found += [low] if low == high else sorted((low, high))
@@ -74,7 +75,7 @@ class Curve:
 
 
 def _merged(one: _Bin, other: _Bin) -> _Bin:
-    """Both in one; a break between them is too short to be seen."""
+    """Merge two bins. An interruption between them is too short to be visible, so it is dropped."""
     low = other.low if other.low.value < one.low.value else one.low
     high = other.high if other.high.value > one.high.value else one.high
     return _Bin(one.number, low, high, other.breaks)
@@ -94,7 +95,7 @@ def _halved(bins: list[_Bin]) -> Iterator[_Bin]:
 
 
 class Span(NamedTuple):
-    """From `begin` to `end` it was of this kind, for the reason in `words`."""
+    """A time span with one state; `words` is the reason."""
 
     begin: float
     end: float
@@ -103,16 +104,19 @@ class Span(NamedTuple):
 
 
 class Band:
-    """What something was, over time; the shortest spans give way to their neighbours."""
+    """A state over time.
+
+    If there are too many spans, short ones are merged with their neighbours.
+    """
 
     def __init__(self, ranks: Sequence[str], most: int = MOST_SPANS) -> None:
-        """`ranks`: the kinds, those first that must not be lost where several become one."""
+        """Create an empty band. `ranks` lists the kinds; earlier ones win when spans are merged."""
         self._rank = {kind: at for at, kind in enumerate(ranks)}
         self._most, self._least = most, FIRST_WIDTH
         self._spans: list[Span] = []
 
     def add(self, t: float, kind: str, words: str = "") -> None:
-        """It is so from now on; kind "" is nothing."""
+        """Record the state from `t` on; the kind "" means none."""
         spans = self._spans
         if spans:
             last = spans[-1] = spans[-1]._replace(end=max(t, spans[-1].end))
@@ -124,11 +128,11 @@ class Band:
             self._spans = spans = self._wider(spans)
 
     def end(self, t: float) -> None:
-        """Nothing is known after this."""
+        """End the last span at `t`."""
         self.add(t, "")
 
     def spans(self) -> list[Span]:
-        """All of a kind, in order."""
+        """Return the spans with a kind, in order."""
         return [span for span in self._spans if span.kind]
 
     def _wider(self, spans: list[Span]) -> list[Span]:
@@ -145,7 +149,10 @@ class Band:
 
 
 class Place(NamedTuple):
-    """m and rad in odom; `new` where it did not drive to here from the place before."""
+    """A pose in the odom frame, m and rad.
+
+    `new` is True if the robot did not drive here from the previous place.
+    """
 
     t: float
     x: float
@@ -155,7 +162,7 @@ class Place(NamedTuple):
 
 
 class Track:
-    """A path: no place of it is further than `stride` m from one that is kept."""
+    """A path, thinned so that each place of it is less than `stride` m from a kept one."""
 
     def __init__(self, most: int = MOST_PLACES) -> None:
         self._most, self._kept = most, list[Place]()
@@ -163,7 +170,7 @@ class Track:
         self._last: Place | None = None
 
     def add(self, place: Place) -> None:
-        """The next place."""
+        """Append a place."""
         self._last = place
         kept = self._kept
         if kept and not place.new and not self._far(kept[-1], place):
@@ -174,7 +181,7 @@ class Track:
             self._kept = kept = self._wider(kept)
 
     def places(self) -> list[Place]:
-        """What to draw, in order: the first and the last place are among them."""
+        """Return the places to draw, in order, always with the first and the last one."""
         last = self._last
         return [*self._kept, *([last] if last and last != self._kept[-1] else [])]
 

@@ -1,6 +1,7 @@
-"""Collects inputs, calls `Robot.step`, carries the outputs. Decides nothing.
+"""Collects the inputs of `Robot.step`, calls it, and carries its outputs. It decides nothing.
 
-Synchronous on purpose: the daemon calls `step` from one task, the tests call it in virtual time.
+The control loop is synchronous, so that the daemon can call `step` from one task and the tests can
+call it in virtual time.
 """
 
 from __future__ import annotations
@@ -50,10 +51,10 @@ from acsard.values import (
 )
 
 FEEDBACK = ("odom", "tf", "wheel_states")
-"""What is published of each feedback line."""
+"""Keys that are published from the feedback lines."""
 
 QUERIES_PER_STEP = 8
-"""Replies built in one step; a crowd of questions waits its turn instead of costing a period."""
+"""Most queries that one step answers. The others wait, so that many of them cost no period."""
 
 BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
 
@@ -78,16 +79,16 @@ class ControlLoop:
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
     ) -> None:
-        """`others` are the events of the daemon's other parts; each step takes what is there.
+        """Make a robot with these latches, which `keeper` keeps over a restart.
 
-        `beside` has the present values of the keys that those parts publish; `adopted` hears of a
-        configuration that is in force from now on; `recorder` is the black box, that hears of every
-        step. The robot starts with `latches`, and `keeper` keeps them over a restart.
+        `others` are the events of the daemon's other parts. Each step takes them and empties the
+        list. `beside` returns the present value of a key that another part publishes. `adopted` is
+        called with a configuration that is in force from now on. `recorder` is the black box.
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends_ns)
         self.leaving = False
-        """Set to begin the way down: the robot ramps to zero and stays there."""
+        """Set it to go down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
         self._others = [] if others is None else others
@@ -97,7 +98,7 @@ class ControlLoop:
         self._answers: deque[tuple[int, Answer]] = deque()
         """Answers that wait until the file has the latches, each with its monotonic time."""
         self._got = NOTHING
-        """What this step took from the bus."""
+        """The input that this step took from the bus."""
         stop = self.robot.session.codec.stop
         self._guard = Guard(stop, config)
         if recorder is not None and latches != Latches():
@@ -108,10 +109,10 @@ class ControlLoop:
         self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
         self._routers = RoutersTold()
         self._turn_rates: list[GyroSample] = []
-        """What a gyro said since the last step."""
+        """Samples of a gyro since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
         self._superseded, self._trip = False, ""
-        """What became of the last line made; told to the robot with the next step."""
+        """The fate of the last line, for the next step: superseded, and replaced by the guard."""
         # The longest line of either direction: answers must not queue in the MCU either.
         period_ns = int(NS_PER_S / config.rate_hz)
         self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
@@ -119,28 +120,28 @@ class ControlLoop:
 
     @property
     def at_rest(self) -> bool:
-        """The last line said zero, or there is no link to say it on."""
+        """True if the last step commanded zero, as it does without a link."""
         outputs = self.outputs
         return outputs is not None and not any(outputs.speeds.as_tuple())
 
     def totals(self, now_ns: int) -> dict[str, float]:
-        """What there is to say at the end: s, m, and all that was counted."""
+        """Return the run time, s, the distance, m, and all counters, for the last log line."""
         seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
         shot = self.robot.snapshot(now_ns)
         return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
 
     @property
     def retry_ns(self) -> int | None:
-        """When to step again for a command that came too soon after a line; None for no need."""
+        """Monotonic time of the next step for a command that came too soon after a line, if any."""
         return self._pace.retry_ns(self._port.sent_ns)
 
     @property
     def listens(self) -> bool:
-        """Worth a step of its own: a command that comes in now. Else the next period has it."""
+        """Whether a command that arrives now gets a step of its own, before the next period."""
         return self._pace.listens
 
     def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
-        """One step at `now`, at the end of a period or between two."""
+        """Take one step at `now`, at the end of a period or between two."""
         self._got = NOTHING
         try:
             return self._step(now, period)
@@ -186,15 +187,16 @@ class ControlLoop:
         heard = bool(commands or refusals or requests)
         pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
         self._publish(outputs)
-        if self._config is not before and self._adopted:  # once the log has told of it
+        # Only now, after the log has the event.
+        if self._config is not before and self._adopted:
             self._adopted(self._config)
         self._stopwatch.step(now.mono_ns, self._mono_ns())
-        # Last of all: who sends needs the interpreter, and gets it when the loop waits again.
+        # Last, because the sending thread needs the interpreter, which is free when the loop waits.
         self._bus.flush()
         return outputs
 
     def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
-        """What comes of it, and whether its line went; the black box has it, however it ends."""
+        """Return the outputs and whether their line left, and record the step in any case."""
         try:
             outputs = self.outputs = self.robot.step(inputs)
             self._handover.take(outputs.latches)
@@ -210,18 +212,18 @@ class ControlLoop:
         return outputs, went is not None
 
     def finish(self, now: Instant) -> None:
-        """Keep the stops that arrived after the last step; give the last answers."""
+        """Keep the stops that arrived after the last step, and give the last answers."""
         self.keep_last_stops(now)
         self._handover.wait()
         self._answer(now, last=True)
         self._bus.flush()
 
     def keep_last_stops(self, now: Instant) -> None:
-        """Keep the stops that arrived since; no step will serve them."""
+        """Keep the stops that no step will serve, because they arrived after the last one."""
         self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
 
     def _adopt(self, config: Config) -> None:
-        """Go by the configuration that the robot goes by since this step."""
+        """Use the configuration that the robot has used since this step."""
         self._config = config
         self._guard.use(config)
         self.report.use(config)
@@ -230,7 +232,7 @@ class ControlLoop:
     def _from_bus(
         self, now: Instant
     ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
-        # Before the first step there is nothing to answer with.
+        # Before the first step there are no outputs to answer with.
         got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
         if got is NOTHING:
             return (), (), ()
@@ -274,7 +276,7 @@ class ControlLoop:
         return tuple(commands), tuple(refusals), tuple(requests)
 
     def _note(self, got: BusInput) -> None:
-        """What is the matter with the bus itself."""
+        """Count and report the troubles of the bus itself."""
         if got.overrun:
             self.robot.counters["bus_overrun"] += got.overrun
         if got.dropped:
@@ -286,7 +288,7 @@ class ControlLoop:
             self._others.append(BUS_STUCK)
 
     def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
-        """Answer a query, or have the robot decide: then what it is asked for."""
+        """Answer a query and return None, or return the request that the robot must decide."""
         try:
             served = self._queries.serve(query, self._current, self.outputs)
         except DecodeError as error:
@@ -315,7 +317,7 @@ class ControlLoop:
             return line
         self._superseded = True
         if offered == "superseded" and tick:
-            # One that could not go at once has its period still before it.
+            # A line that could not go at once is no loss: its period's line follows.
             self.robot.counters["lines_superseded"] += 1
         return None
 

@@ -1,1 +1,1 @@
-"""Shell: `acsard top`: what a running robot says, on one screen."""
+"""`acsard top` shows the state of a running robot on one terminal screen."""

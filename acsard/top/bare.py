@@ -1,4 +1,4 @@
-"""The screen of `acsard drive` where there is no rich: the same lines, without colours."""
+"""The screen of `acsard drive` without the library rich: the same lines, without colours."""
 
 from __future__ import annotations
 
@@ -11,15 +11,21 @@ from acsard.top.held import hold, steer
 from acsard.top.teleop import Teleop, lines
 
 ENTER, LEAVE = "\x1b[?1049h\x1b[?25l\x1b[?7l", "\x1b[?7h\x1b[?25h\x1b[?1049l"
-"""A screen of its own without a cursor, where what is wider than we know is cut, not broken."""
+"""Escape sequences: an alternate screen without a cursor and without line wrap, and back.
+
+Without line wrap, a character that is wider than expected is cut instead of breaking the layout.
+"""
 
 HOME, CLEAR_LINE, CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
-"""Where each screen begins, and what clears the one before: from the begin of a line, since behind
-a full one the cursor still stands on its last sign."""
+"""Escape sequences: move to the top left, clear a line, clear everything below.
+
+Each line is cleared from its beginning, because after a full line the cursor still stands on its
+last character.
+"""
 
 
 def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
-    """Hand the keys to `step`, also when there are none, and show what is seen; until a signal."""
+    """Pass the typed keys to `step`, "" if none, and show the result of `seen`, until a signal."""
     hold(lambda suspend: steer(step, seen, _screen(), suspend))
 
 

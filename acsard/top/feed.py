@@ -1,7 +1,7 @@
-"""What `acsard top` knows of a robot: what has come of its state, and when that is a silence.
+"""The data of `acsard top`: the robot's received states, and the decision when the robot is silent.
 
-It asks for `state` at the start, since states may be 10 s apart, and subscribes to it and to
-nothing else: it costs the daemon what one reader of `state` does.
+States may be published 10 s apart, so the feed queries one at the start. It subscribes to `state`
+only, which costs the daemon the same as any other reader of `state`.
 """
 
 from __future__ import annotations
@@ -20,39 +20,45 @@ from acsard.messages.schema import Info, RobotState
 from acsard.top.seen import SILENT_S, Seen
 
 SPAN_S = 1.0
-"""Rates are taken over about this; over less they would jump."""
+"""Time over which rates are averaged; over less they would jump."""
 
 GAPS = 8
-"""Times between states that are remembered, so that a burst of changes is not all of them."""
+"""Number of remembered intervals between states. One burst of changes must not replace all of
+them."""
 
 MISSING = 3
-"""So many states that did not come are a silence."""
+"""Number of consecutive missing states that count as silence."""
 
 SLOWEST_S = 10.0
-"""Between states at the lowest rate there is; also held to be so until two have come."""
+"""Interval between states at the lowest configurable rate; also assumed until two states have
+arrived."""
 
 STEADY = ("lines", "lines_sent", "commands")
-"""Counters that only a new daemon has smaller."""
+"""Counters that decrease only when the daemon restarts."""
 
 
 class Feed:
-    """What has come of a robot's state so far."""
+    """The received states of a robot."""
 
     def __init__(self, robot: Client, endpoint: str, robot_id: str) -> None:
         self._robot, self._endpoint, self._id = robot, endpoint, robot_id
         self._decoder = Decoder(RobotState)
-        # The first question also finds out whether anybody is there, in the words of all verbs.
+        # The first query also fails with the usual message if no daemon answers.
         self._info = self._ask_info()
         self._samples = robot.subscribe("state")
         self._past: deque[tuple[float, RobotState]] = deque()
         self._heard = time.monotonic()
         self._came: float | None = None
-        """When the last one came unasked."""
+        """Arrival time of the last published state, monotonic clock; answers to queries do not
+        count."""
         self._gaps: deque[float] = deque(maxlen=GAPS)
         self._undecodable = 0
 
     def ask(self) -> None:
-        """Take the state of this moment, however long it is until the next comes by itself."""
+        """Query the present state instead of waiting for the next published one.
+
+        Raises `ReplyError`.
+        """
         try:
             state: RobotState = self._robot.get("state")
         except DecodeError as error:
@@ -60,13 +66,13 @@ class Feed:
             raise ReplyError(
                 f"cannot read the state ({error}); is the daemon of another version?"
             ) from None
-        # What came before the answer is older than it.
+        # A state that arrived before the answer is usually older than it, but not always.
         come = self._newest()
         later = come is not None and come.stamp.to_ns() > state.stamp.to_ns()
         self._take(come if come is not None and later else state)
 
     def poll(self) -> None:
-        """Take what has come since."""
+        """Take the states that were published since the last call."""
         state = self._newest()
         if state is None:
             return
@@ -88,7 +94,7 @@ class Feed:
             self._past.popleft()
 
     def seen(self, hint: str = "") -> Seen:
-        """What there is to show."""
+        """Return the data for the screen; `hint` is shown in the header."""
         return Seen(
             self._id,
             self._endpoint,
@@ -104,7 +110,7 @@ class Feed:
 
     def _newest(self) -> RobotState | None:
         waiting: list[zenoh.Sample] = []
-        for _ in range(QUEUED):  # no flood holds up the screen
+        for _ in range(QUEUED):  # bounded, so a flood cannot block the screen
             sample = self._samples.try_recv()
             if sample is None:
                 break
@@ -124,7 +130,7 @@ class Feed:
             info: Info = self._robot.get("info")
             return info
         except DecodeError:
-            return None  # of another version: it is only for the header
+            return None  # another version; the info is only for the header
 
     def _refresh_info(self) -> None:
         try:
@@ -134,11 +140,14 @@ class Feed:
 
 
 def anew(before: RobotState, state: RobotState) -> bool:
-    """It is another daemon's than the state before: its counters began again."""
+    """Return whether a counter decreased, which means that the daemon was restarted."""
     return any(state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY)
 
 
 def silence(gaps: Collection[float]) -> float:
-    """How long without a state is a silence, by the last times between states, s."""
+    """Return the time in s without a state that counts as silence.
+
+    `gaps` are the last intervals between states, s.
+    """
     longest = min(SLOWEST_S, max(gaps, default=SLOWEST_S))
     return max(SILENT_S, MISSING * longest)

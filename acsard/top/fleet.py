@@ -1,4 +1,4 @@
-"""What `acsard fleet` knows: who is there by its token, and what its state says."""
+"""The data of `acsard fleet`: the robots present, by their liveliness tokens, and their states."""
 
 from __future__ import annotations
 
@@ -21,34 +21,37 @@ from acsard.top.roster import Row
 from acsard.top.seen import SILENT_S
 
 ASK_S = 2.0
-"""A robot that is there and says nothing is asked again so often."""
+"""Interval of queries to a robot that is present but silent."""
 
 SILENCE_S = SILENT_S + ASK_S
-"""An answer may be so late, and no later."""
+"""Age from which a robot counts as silent: the last answer may be this late."""
 
 NEVER = -math.inf
 
 MOST = 1000
-"""Robots; a stranger may invent names."""
+"""Maximum number of robots. The bound is needed because any client of the bus can invent robot
+names."""
 
 
 class _Known:
-    """What is known of one robot."""
+    """The known facts of one robot."""
 
     def __init__(self) -> None:
         self.here = False
         self.since = time.monotonic()
-        """When it came, or we began to look for it."""
+        """Time when the robot appeared, or when the search for it began."""
         self.said: tuple[RobotState | None, float] = None, NEVER
-        """Its state and when that came: one value, since another thread reads it. `NEVER`: a first
-        answer, which may be a storage's."""
+        """State and arrival time in one value, because another thread reads it.
+
+        The time is `NEVER` for a first answer to a query, which a router's storage may have sent.
+        """
         self.asked = NEVER
         self.answered = Answers()
         self.version = ""
 
 
 class Fleet:
-    """Follows the robots of these ids, or all there are; callbacks come on threads of Zenoh's."""
+    """Follows the robots with these ids, or all robots. The callbacks run on Zenoh's threads."""
 
     def __init__(self, robot: Client, ids: Sequence[str], endpoint: str) -> None:
         self._robot, self._ids, self._endpoint = robot, ids, endpoint
@@ -62,7 +65,7 @@ class Fleet:
             liveliness.declare_subscriber(full_key(one, "alive"), self._token, history=True)
 
     def rows(self) -> list[Row]:
-        """What is known now, after taking what has come; asks who has not said anything."""
+        """Process the received samples, query silent robots, and return one row per robot."""
         for _ in range(QUEUED):
             sample = self._samples.try_recv()
             if sample is None:
@@ -78,15 +81,17 @@ class Fleet:
             if now - max(heard, one.asked) > ASK_S or unheard:
                 self._ask(name, one, now)
             if one.here and heard == NEVER and now - one.since < SILENCE_S:
-                state = None  # the robot itself may speak yet
+                state = None  # wait for the robot's own answer
             age = max(0.0, now - heard)
             rows.append(Row(name, one.here, state, age, one.version, SILENCE_S))
         return rows
 
     @property
     def whole(self) -> bool:
-        """All who were named are here and have said what a line holds; never so for all there are,
-        as nobody knows how many these are."""
+        """Whether all named robots are present and have reported their state and version.
+
+        This is never true if all robots were requested, because their number is unknown.
+        """
         with self._lock:
             known = list(self._known.values())
         named = ALL not in self._ids
@@ -94,20 +99,20 @@ class Fleet:
 
     @property
     def seen(self) -> str:
-        """How many robots are all there are, and where; "" where they were named."""
+        """Number of present robots and where they were found; "" if the robots were named."""
         with self._lock:
             here = sum(one.here for one in self._known.values())
         return seen(self._endpoint, here) if ALL in self._ids else ""
 
     @property
     def more(self) -> str:
-        """That not all who are there are shown, "" when they are."""
+        """Note that some robots are left out, or ""."""
         if not self._left_out:
             return ""
         return f"more than {MOST} robots: the others are left out; name yours, --id robot1,robot2"
 
     def hint(self) -> str:
-        """Why there may be nobody to show."""
+        """Return the reason why there may be no robots to show."""
         return nobody(self._endpoint) if ALL in self._ids else "none of these robots is there"
 
     def _ask(self, name: str, one: _Known, now: float) -> None:
@@ -131,7 +136,7 @@ class Fleet:
             return self._known.get(name)
 
     def _forget_one(self) -> None:
-        """Who is gone for longest makes room."""
+        """Drop the unnamed robot that has been gone for the longest time."""
         gone = [(one.since, name) for name, one in self._known.items() if not one.here]
         for _, name in sorted(one for one in gone if one[1] not in self._ids)[:1]:
             del self._known[name]
@@ -142,13 +147,13 @@ class Fleet:
             one.here = sample.kind == zenoh.SampleKind.PUT
             one.since = time.monotonic()
             if not one.here:
-                one.version = ""  # it may come back as another
+                one.version = ""  # a restarted daemon may have another version
 
     def _state(self, sample: zenoh.Sample, asked: bool) -> None:
         try:
             state = self._states.decode(*encoded(sample))
         except DecodeError:
-            return  # of another version: shown as silent
+            return  # another version: the robot is shown as silent
         one = self._of(sample)
         if one is None:
             return

@@ -1,4 +1,4 @@
-"""A terminal that is held by one screen until a key or a signal; ^Z gives it back, fg goes on."""
+"""A terminal screen that ends with a key or a signal. ^Z suspends it, and `fg` resumes."""
 
 from __future__ import annotations
 
@@ -16,19 +16,22 @@ from acsard.top.teleop import Teleop
 PERIOD_S = 0.25
 
 KEYS_S = 0.05
-"""Who drives is looked after so often."""
+"""Interval at which the keys are read and the robot is driven."""
 
 
 def hold(shows: Callable[[list[bool]], bool]) -> None:
-    """Have a screen until a signal, or until it is over; `shows` ends at ^Z, which it is told by
-    what is in its list, and gives True for it."""
+    """Show a screen until a signal arrives or `shows` returns False.
+
+    `shows` gets a list that becomes non-empty when the user presses ^Z. It must then leave its
+    screen and return True, and is called again after `fg`.
+    """
     be_lenient()
     suspend: list[bool] = []
     signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
     with until_told():
         while shows(suspend):
             suspend.clear()
-            os.kill(os.getpid(), signal.SIGSTOP)  # ^Z: the terminal is as it was; fg goes on
+            os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
 
 
 def steer(
@@ -37,8 +40,10 @@ def steer(
     screen: AbstractContextManager[Callable[[Teleop], None]],
     suspend: list[bool],
 ) -> bool:
-    """Hand the keys to `step`, also when there are none, and what is seen to the screen; True at
-    ^Z."""
+    """Pass the typed keys to `step`, "" if none, and show the screen.
+
+    Return True at ^Z and False when the input ends.
+    """
     with keys() as read, screen as show:
         due = 0.0
         while not suspend:
@@ -50,11 +55,11 @@ def steer(
                 due = time.monotonic() + PERIOD_S
                 show(seen())
     for letter in ("k", "", ""):
-        step(letter)  # nobody steps while we are stopped
+        step(letter)  # stop the robot: no steps run while suspended
     return True
 
 
 def be_lenient() -> None:
-    """A terminal without a sign of ours shows another in its place."""
+    """Replace characters that the terminal's encoding lacks, instead of failing."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")

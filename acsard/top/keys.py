@@ -1,4 +1,4 @@
-"""The keys of a terminal, one by one and unseen, until a signal; what is left is as it was."""
+"""Reads a terminal's keys one by one without echo, and restores the terminal at the end."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextmanager
 def until_told() -> Iterator[None]:
-    """Ends what is done within at the first signal that ends a program, or with its terminal.
+    """End the block at the first terminating signal, or when its terminal closes.
 
-    No later one disturbs what is done behind it: a terminal that is closed under a shell sends two,
+    Later signals are ignored during the cleanup: a terminal that closes under a shell sends two,
     and Ctrl-C may be held down.
     """
 
@@ -41,7 +41,7 @@ def until_told() -> Iterator[None]:
     except OSError as error:
         if error.errno != errno.EIO:
             raise
-        # The terminal has been closed: nobody to tell.
+        # The terminal was closed, so discard further output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         deaf()
@@ -49,7 +49,10 @@ def until_told() -> Iterator[None]:
 
 @contextmanager
 def keys() -> Iterator[Callable[[float], str | None]]:
-    """Yields what waits at most so many seconds for keys: None when the terminal has ended."""
+    """Yield a function that waits up to a number of seconds for keys.
+
+    The function returns "" if no key was typed, and None when the input has ended.
+    """
 
     def read(seconds: float) -> str | None:
         ready, _, _ = select.select([sys.stdin], [], [], seconds)

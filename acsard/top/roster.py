@@ -1,4 +1,4 @@
-"""A line for each robot of a fleet, for any width; pure, and without a library."""
+"""One line per robot of a fleet, for any width. This module is pure and needs no library."""
 
 from __future__ import annotations
 
@@ -16,36 +16,41 @@ SILENT_S = 2.0
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY")
 
 ROOM = (32, 8, 6, 7, 10, 6)
-"""At most so wide each but the last, which has what is left; the first is the longest id."""
+"""Maximum width of each column but the last, which takes the rest. The first is as wide as its
+longest id."""
 
 NAME, WHY = 12, 20
-"""So much of the last column is kept free of a long name, unless that gets narrower than this."""
+"""Minimum widths of the first and last column. A long id may not narrow the last column below its
+minimum, unless the first would fall below its own."""
 
 NARROW = (0, 1, 2, 5, 6)
-"""The columns that a narrow terminal has, below `WIDE`."""
+"""Columns of a terminal that is narrower than `WIDE`."""
 
 WIDE = 72
 
 URGENT = ("fault", "stopped", "GONE", "SILENT")
-"""What needs a person, and is above the others, whose lines may be too many."""
+"""Modes that need attention; they are listed first, because the lines may not all fit."""
 
 
 class Row(Struct, frozen=True):
-    """What is known of one robot."""
+    """The known facts of one robot."""
 
     robot_id: str
     here: bool
-    """Its daemon runs."""
+    """True while the liveliness token of its daemon is present."""
     state: RobotState | None
     age: float
-    """Since `state` came, s; inf when only an answer that may be a storage's has."""
+    """Age of `state` in s; inf if the only state is an answer that a storage may have sent."""
     version: str
     silence: float = SILENT_S
-    """The age from which on it is no news any more, s."""
+    """Age in s from which the robot counts as silent."""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
-    """Heads and a line for each robot, at most `width` long and `height` many, the urgent first."""
+    """Return a header and a line for each robot, the urgent ones first.
+
+    There are at most `height` lines of at most `width` characters.
+    """
     shown = range(len(HEADS)) if width >= WIDE else NARROW
     cells = [HEADS, *map(told, sorted(rows, key=_order))]
     widest = [max(len(row[n]) for row in cells) for n in range(len(HEADS))]
@@ -67,7 +72,10 @@ def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[st
 
 
 def shortened(names: Sequence[str], room: int) -> list[str]:
-    """At most `room` long: what is left out is the middle, or where fewer then look the same."""
+    """Shorten names to `room` characters by cutting out a part in the same place of each.
+
+    The cut is in the middle, unless more names stay distinct with a cut elsewhere.
+    """
     if all(len(name) <= room for name in names):
         return list(names)
 
@@ -83,7 +91,7 @@ def shortened(names: Sequence[str], room: int) -> list[str]:
 
 
 def told(row: Row) -> tuple[str, ...]:
-    """Its cells, in the order of `HEADS`."""
+    """Return the cells of a row in the order of `HEADS`."""
     name = printable(row.robot_id)
     if row.state is None:
         why = "waiting for its state" if row.here else "not there"
@@ -103,7 +111,7 @@ def told(row: Row) -> tuple[str, ...]:
 
 
 def _speed(state: RobotState) -> str:
-    """m/s; "-" without feedback."""
+    """Return the forward speed in m/s, or "-" without feedback."""
     if state.linear is None:
         return "-"
     return f"{state.linear + 0.0:+.2f}" if math.isfinite(state.linear) else "?"
@@ -116,7 +124,7 @@ def _absence(row: Row) -> str:
 
 
 def _order(row: Row) -> tuple[int, str]:
-    """What it is now comes before what it was."""
+    """Sort by urgency, then by id. Absence counts before the last reported mode."""
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     return URGENT.index(what) if what in URGENT else len(URGENT), row.robot_id
 

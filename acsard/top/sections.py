@@ -1,4 +1,7 @@
-"""The parts of the screen below the mode, each a list of lines with a rule as its first; pure."""
+"""The parts of a wide screen below the mode: each is a list of lines that starts with a rule.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +28,16 @@ from acsard.top.text import (
 from acsard.values import NS_PER_S
 
 WIDEST = 116
-"""Wider than this a line is harder to read, not easier."""
+"""Maximum width in cells; longer lines are harder to read."""
 
 SHORT_WORDS, LONG_WORDS = 21, 56
-"""The room for what each figure is; the long words from `WIDEST` on."""
+"""Width of the explanation of each figure; the long form is used from `WIDEST` on."""
 
 MOST_REASONS, MOST_PORT = 16, 34
 
 LATE_S = 0.2
-"""By so much one state may come later than another, which stamps do not know."""
+"""Difference in s between stamps and local clock that network delay explains; more means that the
+robot's clock was set."""
 
 LINKS = {"up": "green", "booting": "yellow"}
 
@@ -45,11 +49,11 @@ FIGURES = {
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
-"""`figures.Name` in few words and in more. An arrow is from one moment to another."""
+"""Short and long explanation of each `figures.Name`. An arrow leads from one moment to another."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Pose and twist on the left, the wheels as they sit on the robot on the right."""
+    """Return pose and twist on the left, and the wheels in their places on the right."""
     (right, left, rear_left, rear_right), scale = speeds(state)
     cells = 6 + max(0, width - 80) // 2
     at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
@@ -67,14 +71,14 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
-    """Of the four wheels, NaN where there is none, and what a whole bar is, rad/s."""
+    """Return the four wheel speeds (NaN if unknown) and the speed of a full bar, rad/s."""
     wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
     top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
     return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
 
 
 def wheel(speed: float, scale: float, cells: int) -> Text:
-    """Direction, speed and bar in `10 + cells` cells."""
+    """Return direction, speed and bar in `10 + cells` cells."""
     if speed == 0.0 or not math.isfinite(speed):
         sign, style = "·", "dim"
     else:
@@ -86,7 +90,7 @@ def wheel(speed: float, scale: float, cells: int) -> Text:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """A line for each source, in at most `room` lines."""
+    """Return a line for each command source, in at most `room` lines."""
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
     at = ((0, "sources"), (start, "priority"), (start + 10, "heard"), (start + 17, "waits for"))
@@ -99,18 +103,18 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def hidden(left: Sequence[SourceState]) -> str:
-    """Those that there is no room for."""
+    """Return a line that names the sources that do not fit."""
     names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
     return f"  and {count(len(left))} more: {names}"
 
 
 def drives(source: SourceState, state: RobotState) -> bool:
-    """The robot does what it says."""
+    """Return whether the robot follows this source."""
     return source.name == state.source and state.mode == "driving" and not source.waits_for
 
 
 def waits(source: SourceState, state: RobotState) -> str:
-    """For what, in words."""
+    """Return the reason why a source does not drive, in words."""
     if source.waits_for:
         return clean(source.waits_for)
     if drives(source, state):
@@ -129,7 +133,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
 
 
 def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
-    """The serial line, the commands, and all that was refused."""
+    """Return the lines about the serial link, the commands and the refusals."""
     before = seen.before or state
     head = title(seen, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
@@ -158,7 +162,7 @@ def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
 
 
 def title(seen: Seen, state: RobotState) -> Text:
-    """The link and where it goes."""
+    """Return the state of the link and its port."""
     told = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
     if seen.info is not None:
         sim = seen.info.simulated
@@ -167,14 +171,14 @@ def title(seen: Seen, state: RobotState) -> Text:
 
 
 def certificate(state: RobotState) -> Text:
-    """How long it is good for."""
+    """Return the remaining validity of the certificate."""
     style = "" if state.certificate.startswith("valid for") else "bold red"
     return Text(f"certificate {clean(state.certificate)}", style)
 
 
 def rates(seen: Seen, state: RobotState, before: RobotState) -> Callable[[str], str]:
-    """How often a counter counts, and what it has counted."""
-    # Stamps are exact; where the robot's clock was set, ours tells.
+    """Return a function that formats the rate and the total of a counter."""
+    # Stamps are exact, but if the robot's clock was set, the local clock decides.
     seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
     if abs(seconds - seen.passed) > LATE_S:
         seconds = seen.passed
@@ -187,33 +191,33 @@ def rates(seen: Seen, state: RobotState, before: RobotState) -> Callable[[str], 
 
 
 def overrun(state: RobotState) -> Text:
-    """Samples that the bus could not hold, where there were any."""
+    """Return the number of samples that the bus dropped; empty if there were none."""
     lost = state.counters.get("bus_overrun", 0)
     return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
 
 
 def _gyro(does: str) -> Text:
-    """What the gyro does for the heading."""
+    """Return the effect of the gyro on the heading."""
     good = does in ("used", "waiting for rest")
     told = next((f"{name}: {words}" for name, words in WORDS.items() if name == does), clean(does))
     return row("gyro", told, "" if good else "yellow")
 
 
 def _port(info: Info) -> str:
-    """The serial port; of a long name its own part."""
+    """Return the serial port; of a long path only the last part."""
     port = clean(info.port)
     return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
 
 
 def missed(state: RobotState, before: RobotState) -> Text:
-    """Periods, in yellow while they grow."""
+    """Return the number of missed periods, in yellow while it grows."""
     missed = state.counters.get("missed_periods", 0)
     grows = missed > before.counters.get("missed_periods", 0)
     return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
 
 
 def _refusals(state: RobotState, before: RobotState) -> list[Text]:
-    """What was rejected, by reason, and the last refusal in words."""
+    """Return the rejections by reason, and the last refusal in words."""
     kinds = [
         Text(f"{kind} ").append_text(Text(", ").join(parts))
         for kind, parts in refused(state, before)
@@ -224,7 +228,7 @@ def _refusals(state: RobotState, before: RobotState) -> list[Text]:
 
 
 def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
-    """What was rejected, by kind and reason, what grows in yellow."""
+    """Return the rejections by kind and reason, with growing ones in yellow."""
     kinds = []
     for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
         found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
@@ -240,7 +244,7 @@ def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
-    """The daemon's figures of itself."""
+    """Return the daemon's timing figures."""
     long = width >= WIDEST
     room = LONG_WORDS if long else SHORT_WORDS
     start = 16 + room
@@ -257,7 +261,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def spread(found: Spread | None) -> Text:
-    """Of one figure, in 21 cells."""
+    """Return median, 99th percentile and maximum of a figure, in 21 cells."""
     if found is None or found.count <= 0:
         return Text("-".rjust(7) * 3, "dim")
     p50, p99, most = (duration(value).rjust(7) for value in (found.p50, found.p99, found.max))

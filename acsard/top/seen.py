@@ -1,4 +1,4 @@
-"""What `acsard top` has seen of a robot: what the feed gives and the screen shows."""
+"""The data that the feed passes to the screen of `acsard top`."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from msgspec import Struct
 from acsard.messages.schema import Info, RobotState
 
 SILENT_S = 2.0
-"""Without a state for this long at least there is no news, and all below is old."""
+"""Shortest time without a state after which the shown data counts as old."""
 
 
 class Seen(Struct, frozen=True):
-    """All that the screen tells; `before` is an earlier state to take rates from."""
+    """Everything that the screen shows; `before` is an earlier state, used to compute rates."""
 
     robot_id: str
     endpoint: str
     state: RobotState | None
     before: RobotState | None = None
     age: float = 0.0
-    """Since `state` came, or since we began to wait for one, s."""
+    """Seconds since `state` arrived, or since the wait for the first one began."""
     info: Info | None = None
     undecodable: int = 0
-    """Messages in the state's place that are none."""
+    """Number of consecutive messages on the state's key that could not be decoded."""
     hint: str = ""
     silence: float = SILENT_S
-    """The age from which on it is a silence, s."""
+    """Age in s from which the robot counts as silent."""
     passed: float = 0.0
-    """From `before` to `state` by our own clock, s: about what their stamps say, unless the robot's
-    clock was set meanwhile."""
+    """Seconds from `before` to `state` by the local clock. The stamps differ from it by more than
+    the network delay only if the robot's clock was set."""

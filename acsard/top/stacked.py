@@ -1,6 +1,7 @@
-"""The parts of the screen where it is narrow: the same figures, below each other; pure.
+"""The parts of a narrow screen: the same figures as on a wide one, but below each other.
 
-What goes on is set in. The figures since the start come last: on a screen of few lines, they go.
+This module is pure. Continued lines are indented. The figures since the start come last, because a
+screen with few lines cuts them off.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from acsard.top.seen import Seen
 from acsard.top.text import ago, clean, count, rule, signed
 
 BELOW = 80
-"""Cells of width from which on things stand beside each other."""
+"""Width in cells from which the wide layout is used."""
 
 BAR = 4
 
 
 def motion(state: RobotState, width: int) -> list[Text]:
-    """Pose and twist, then the wheels as they sit on the robot."""
+    """Return pose and twist, then the wheels in their positions on the robot."""
     told = [
         f"x {signed(state.x, 3, 8)} m",
         f"y {signed(state.y, 3, 8)} m",
@@ -56,7 +57,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
-    """Priority and age of each source, and below what it waits for, in about `room` lines."""
+    """Return priority and age of each source, with its reason below, in about `room` lines."""
     lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "heard")])]
     left = list(state.sources)
     while left:
@@ -76,7 +77,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
 
 
 def link(seen: Seen, state: RobotState, width: int) -> list[Text]:
-    """The serial line, the commands, and all that was refused."""
+    """Return the lines about the serial link, the commands and the refusals."""
     before = seen.before or state
     lines = [rule(width, [(0, title(seen, state))])]
     if state.certificate:
@@ -104,7 +105,7 @@ LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "comma
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
-    """The daemon's figures of itself."""
+    """Return the daemon's timing figures."""
     heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
     lines = [rule(width, [(0, "timing")])]
     for since, last in (("last minute", True), ("since start", False)):
@@ -117,7 +118,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
 
 
 def flow(parts: Sequence[Text], width: int, inset: int) -> list[Text]:
-    """As many in a line as fit."""
+    """Put as many parts in a line as fit."""
     lines: list[Text] = []
     for part in parts:
         if lines and lines[-1].cell_len + 2 + part.cell_len <= width:
@@ -128,8 +129,8 @@ def flow(parts: Sequence[Text], width: int, inset: int) -> list[Text]:
 
 
 def folded(text: str, width: int, inset: int) -> list[Text]:
-    """A sentence broken between words, all but a sentence's label set in."""
+    """Wrap a sentence between words. The first line is indented unless it starts with a label."""
     first = "" if text.startswith(("gyro ", "track ", "last one ")) else " " * inset
-    wide = max((cell_len(one) for one in text), default=1)  # a sign may take two cells
+    wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
     room, rest = max(inset + 1, width // max(1, wide)), " " * inset
     return [Text(one) for one in wrap(text, room, initial_indent=first, subsequent_indent=rest)]

@@ -1,6 +1,7 @@
-"""What `acsard drive` shows of the robot, as lines of text for any width; pure.
+"""The lines that `acsard drive` shows of the robot, for any width. This module is pure.
 
-It needs no library: a terminal gets them as a screen (`terminal.py`), all else one line at a time.
+It needs no library. A terminal shows the lines as a screen (`terminal.py`, `bare.py`); any other
+output gets single lines.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from acsard.messages.text import printable
 NARROWEST = 40
 
 SILENT_S = 1.0
-"""Without a state for so long there is no news."""
+"""Time without a state after which the shown data counts as old."""
 
 HELP = (
     " u  i  o    arrows drive, too",
@@ -32,24 +33,27 @@ Look = Literal["head", "mode", "news", "trouble", "help"]
 
 
 class Teleop(Struct, frozen=True):
-    """All that is shown."""
+    """Everything that is shown."""
 
     robot_id: str
     endpoint: str
     source: str
     linear: float
-    """What a key asks for, m/s."""
+    """Forward speed that a key sets, m/s."""
     angular: float
-    """rad/s"""
+    """Turn rate that a key sets, rad/s."""
     state: RobotState | None
     age: float
-    """Since `state` came, or since we began to wait for one, s."""
+    """Seconds since `state` arrived, or since the wait for the first one began."""
     objection: str = ""
-    """Why what the keys ask for does not drive."""
+    """Reason why the robot does not follow the keys, or ""."""
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[tuple[Look, str]]:
-    """The screen, each line at most `width` long: the first with "mode" begins with the mode."""
+    """Return the screen as lines of at most `width` characters.
+
+    The first "mode" line starts with the mode.
+    """
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown: list[tuple[Look, str]] = [
@@ -72,7 +76,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[tuple[Loo
 
 
 def news(seen: Teleop, width: int) -> list[str]:
-    """All of it but the help in few lines, broken between words and between figures."""
+    """Return the content without the help, wrapped between words and between figures."""
     told = [f"keys ask {asked(seen)}"]
     if seen.state is None or seen.age > SILENT_S:
         return _words([silence(seen), *told], width)
@@ -83,7 +87,7 @@ def news(seen: Teleop, width: int) -> list[str]:
 
 
 def parting(seen: Teleop, width: int) -> list[str]:
-    """The same at the end: whether the robot that is left stands, and where."""
+    """Return the last message: whether the robot stands, and where."""
     if seen.state is None or seen.age > SILENT_S:
         return _words([f"left: {silence(seen)}"], width)
     what = "still moves" if moves(seen.state) else "stands"
@@ -99,29 +103,29 @@ def moves(state: RobotState) -> bool:
 
 
 def silence(seen: Teleop) -> str:
-    """Nothing comes, and since when."""
+    """Return a message that the robot is silent, and for how long."""
     if seen.state is None and seen.age <= SILENT_S:
         return "waiting for the first state"
     return f"no word from the daemon for {seen.age:.0f} s: is it running?"
 
 
 def reason(state: RobotState) -> str:
-    """Why it moves or does not, without the mode in it."""
+    """Return the reason of the mode, without the mode itself."""
     return printable(state.reason.removeprefix(f"{state.mode}: "))
 
 
 def asked(seen: Teleop) -> str:
-    """What a key asks for."""
+    """Return the speeds that the keys set."""
     return f"{seen.linear:.2f} m/s, {seen.angular:.2f} rad/s"
 
 
 def measured(state: RobotState) -> list[str]:
-    """Pose and twist, each with its unit."""
+    """Return pose and twist, each with its unit."""
     return [*place(state.x, state.y, state.yaw), *speeds(state.linear, state.angular)]
 
 
 def flow(parts: Sequence[str], width: int) -> list[str]:
-    """As many in a line as fit."""
+    """Put as many parts in a line as fit."""
     found: list[str] = []
     for part in parts:
         if found and len(found[-1]) + 2 + len(part) <= width:
@@ -132,7 +136,7 @@ def flow(parts: Sequence[str], width: int) -> list[str]:
 
 
 def _words(told: Sequence[str], width: int, figures: Sequence[str] = ()) -> list[str]:
-    """Sentences and figures below each other, what goes on set in."""
+    """Wrap sentences, and figures below them; continued lines are indented."""
     width = max(20, width)
     lines = wrap("; ".join(told), width, subsequent_indent="  ", break_on_hyphens=False)
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]

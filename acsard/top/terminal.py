@@ -1,4 +1,4 @@
-"""The screens of `top`, `fleet` and `drive` by rich, and one of them as plain text."""
+"""The screens of `top`, `fleet` and `drive` with the library rich, and `top` as plain text."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ LOOKS: dict[Look, str] = {
 }
 
 ONCE_S = 0.5
-"""Rates are taken over this with --once, where a person waits for it."""
+"""Time over which `--once` averages rates; a person waits for it."""
 
 
 def once(feed: Feed) -> str:
-    """One screen as plain text."""
+    """Return one screen as plain text."""
     feed.ask()
     time.sleep(ONCE_S)
     feed.ask()
@@ -44,21 +44,22 @@ def once(feed: Feed) -> str:
 
 
 def live(feed: Feed) -> None:
-    """Show the screen, and what changes, until a key or a signal."""
-    with suppress(AcsardError):  # it may come by itself; the screen says that it waits
+    """Show the screen and update it until a key or a signal."""
+    # A failed query is no problem, because the screen says that it waits for a state.
+    with suppress(AcsardError):
         feed.ask()
     console = Console()
     hold(lambda suspend: _watch(feed, console, suspend))
 
 
 def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
-    """Hand the keys to `step`, also when there are none, and show what is seen; until a signal."""
+    """Pass the typed keys to `step`, "" if none, and show the result of `seen`, until a signal."""
     console = Console()
     hold(lambda suspend: steer(step, seen, _teleop(console), suspend))
 
 
 def roster(fleet: Fleet) -> None:
-    """Show a line for each robot, and what changes, until a key or a signal."""
+    """Show a line for each robot and update them until a key or a signal."""
     console = Console()
     hold(lambda suspend: _roster(fleet, console, suspend))
 
@@ -101,7 +102,7 @@ def _teleop(console: Console) -> Iterator[Callable[[Teleop], None]]:
 
 
 def teleop_screen(seen: Teleop, width: int, height: int) -> Group:
-    """The lines of `teleop.py` in colours."""
+    """Return the lines of `teleop.py` in colours."""
     told = []
     for look, text in lines(seen, width, height):
         line = Text(text, LOOKS[look], no_wrap=True)

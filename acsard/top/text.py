@@ -1,7 +1,7 @@
-"""What the screen of `acsard top` is written with: short texts and lines; pure.
+"""Formats the values and lines on the screen of `acsard top`. This module is pure.
 
-Values become text of a bounded length, whatever the bus says. Text from the bus reaches a terminal
-only through `clean`, and only inside rich's `Text`, which knows no markup.
+Every value becomes a text of bounded length, whatever arrives on the bus. Text from the bus reaches
+the terminal only through `clean`, and only inside rich's `Text`, which does not interpret markup.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from rich.cells import cell_len
 from rich.text import Text
 
 MOST = 256
-"""Characters of one text that are looked at; no screen shows more."""
+"""Maximum number of characters of a text; a screen shows fewer."""
 
 _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
 def clean(text: str) -> str:
-    """The text without what a terminal would obey, hide or draw over its neighbours."""
+    """Return the text without control, invisible and zero-width characters."""
     return "".join(
         " " if c.isspace() else c if c.isprintable() and cell_len(c) else "\ufffd"
         for c in text[:MOST]
@@ -33,19 +33,19 @@ def signed(value: float | None, decimals: int, width: int) -> str:
     """
     if value is None or math.isnan(value):
         return "-".rjust(width)
-    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
+    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 turns "-0.00" into "+0.00"
     return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
 
 
 def count(number: int) -> str:
-    """A whole number with its thousands apart."""
+    """Format an integer with thousands separators."""
     if abs(number) < 10**10:
         return f"{number:,}"
     return f"{float(max(-(10**300), min(10**300, number))):.1e}"
 
 
 def duration(us: float) -> str:
-    """Microseconds with about two digits, in 6 characters."""
+    """Format microseconds with about two digits, in at most 6 characters."""
     if not 0.0 <= us < 1e10:
         return "?"
     if us < 999.5:
@@ -55,7 +55,7 @@ def duration(us: float) -> str:
 
 
 def ago(seconds: float | None) -> str:
-    """How long since something was heard."""
+    """Format the time since an event, or "never" for None."""
     if seconds is None:
         return "never"
     if not 0.0 <= seconds < 1e9:
@@ -67,8 +67,8 @@ def ago(seconds: float | None) -> str:
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:
-    """How often a counter counts, in 7 characters; "-" when that cannot be told."""
-    # A clock that was set, a daemon that was started anew: no rate is better than a wrong one.
+    """Format the rate of a counter in 7 characters, or "-/s" if it is unknown."""
+    # After a clock change or a restart of the daemon, no rate is better than a wrong one.
     if not 0.05 <= seconds <= 60.0 or not 0 <= later - earlier < 10**6:
         return "-/s".rjust(7)
     hz = (later - earlier) / seconds
@@ -76,29 +76,29 @@ def rate(later: int, earlier: int, seconds: float) -> str:
 
 
 def bar(value: float, scale: float, cells: int) -> str:
-    """The size of `value` as a bar of at most `cells` characters, full at `scale`."""
+    """Return a bar for the magnitude of `value`: at most `cells` characters, full at `scale`."""
     if not math.isfinite(value):
         return ""
     eighths = round(min(1.0, abs(value) / scale) * cells * 8)
     return ("█" * (eighths // 8) + _EIGHTHS[eighths % 8]).strip()
 
 
-# lines
+# Lines.
 
 
 def row(label: str, told: str, style: str = "") -> Text:
-    """A line with a label before it."""
+    """Return a line with a label in front."""
     return Text.assemble((f"{label:<12}", "dim"), (told, style))
 
 
 def ends(left: Text, right: Text, width: int) -> Text:
-    """One at the left end of a line, one at the right."""
+    """Join a text at the left end of a line and a text at the right end."""
     left.truncate(max(0, width - right.cell_len - 2), overflow="ellipsis")
     return left.append(" " * (width - left.cell_len - right.cell_len)).append_text(right)
 
 
 def rule(width: int, titles: Sequence[tuple[int, str | Text]]) -> Text:
-    """A line across with titles in it, each at its column."""
+    """Return a horizontal line with titles, each at its column."""
     line = Text()
     for at, title in titles:
         if at:

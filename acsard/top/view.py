@@ -1,7 +1,8 @@
-"""One screen of `acsard top`: a robot's state in, lines of coloured text out; pure.
+"""One screen of `acsard top`: turns a robot's state into lines of coloured text. This module is
+pure.
 
-Every line is cut to the width and the lines to the height, so that the screen holds whatever
-comes on the bus. What does not fit is left out in this order: air, then sources.
+Lines are cut to the width and their number to the height, so no message can break the layout. If
+space is short, empty lines are left out first, then sources.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ MODES = {
 
 
 def screen(seen: Seen, width: int, height: int | None = None) -> Group:
-    """The screen as lines of at most `width` cells, at most `height` of them (None: all)."""
+    """Return the screen as lines of at most `width` cells, at most `height` of them (None: all)."""
     width = max(20, min(WIDEST, width))
     silent = seen.age >= seen.silence
     head = [_header(seen, width), *(_no_news(seen, width) if silent else _mode(seen, width))]
@@ -52,7 +53,7 @@ def screen(seen: Seen, width: int, height: int | None = None) -> Group:
     used = len(head) + sum(map(len, sections))
     airy = height is None or height - used >= len(sections) - 1
     body = [line for part in sections for line in ([Text(), *part] if airy else part)]
-    body = body[1:] if airy else body  # the mode has some air below it already
+    body = body[1:] if airy else body  # the mode already leaves an empty line below it
     if silent:
         for line in body:
             line.stylize("dim")
@@ -64,7 +65,7 @@ def screen(seen: Seen, width: int, height: int | None = None) -> Group:
 
 
 def _unmeasured(state: RobotState) -> RobotState:
-    """Without the speeds of before the link was lost."""
+    """Return the state without speeds, which are outdated because the link is down."""
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
@@ -79,8 +80,11 @@ def _header(seen: Seen, width: int) -> Text:
 
 
 def _mode(seen: Seen, width: int) -> list[Text]:
-    """The mode as a badge, the reason beside it; two lines, so that a long one moves nothing,
-    but where it is narrow as many as it takes."""
+    """Return the mode as a badge with the reason next to it.
+
+    A wide screen always uses two lines, so that a long reason does not move the rest. A narrow
+    screen uses as many lines as the reason needs.
+    """
     state = seen.state
     if state is None:
         return [Text("waiting for the first state", "yellow")]
@@ -94,7 +98,7 @@ def _mode(seen: Seen, width: int) -> list[Text]:
 
 
 def _split(words: str, room: int) -> tuple[str, str]:
-    """What fits and the rest, cut between words where that is possible."""
+    """Split the words into the part that fits and the rest, between words if possible."""
     if len(words) <= room:
         return words, ""
     at = words.rfind(" ", 0, room + 1)
@@ -102,7 +106,7 @@ def _split(words: str, room: int) -> tuple[str, str]:
 
 
 def _no_news(seen: Seen, width: int) -> list[Text]:
-    """A bar across the screen: what is below is old."""
+    """Return a bar across the screen that marks the data below as old."""
     since = ago(int(min(seen.age, 1e9))).replace(".0", "")
     words = f"NO NEWS FOR {since}: is the daemon running?"
     if seen.undecodable:

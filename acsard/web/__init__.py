@@ -1,1 +1,1 @@
-"""The robot's page: `acsard web`, a process of its own and a client of the bus."""
+"""The robot's web page: `acsard web` is a process of its own and a client of the bus."""

@@ -1,7 +1,8 @@
-"""The page's server as an aiohttp application: who may come in, what he gets, by which headers.
+"""The page's server as an aiohttp application: admission, routes and response headers.
 
-Every request passes `_admit` first. What it hands on has a `Who`, but for the page's own files and
-`/token`, which are for everybody who asks for the robot by its name.
+Every request passes `_admit` first. `_admit` attaches the caller's identity (a `Who`) to the
+request before a handler sees it. Only the paths in `OPEN` and the page's own files are served
+without an identity, to any client that addresses the robot by one of its names.
 """
 
 from __future__ import annotations
@@ -48,20 +49,24 @@ from acsard.web.who import MAINTAINER, Reason, Refusal, Who, cookie_name, foreig
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 OPEN = ("/", "/token", "/favicon.ico")
-"""For everybody: a page has to be there before it can say who shows it."""
+"""Paths that are served without a token: a browser must load the page before it can send one."""
 
 UNHURRIED = ("/api/srv/stop", "/api/whoami", "/ws")
-"""A stop always goes; and a page that comes back must not be kept out by another program that has
-its token: how many connections there are is limited elsewhere."""
+"""Paths that are exempt from the request rate limit.
+
+A stop must always go through. A page that reconnects must not be kept out by another program that
+uses the same token; `Seats` limits the number of connections instead.
+"""
 
 REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""What aiohttp refuses by itself; anything else is malformed."""
+"""Refusal reason per HTTP status that aiohttp raises by itself. Every other status counts as
+`malformed`."""
 
 WHO: web.RequestKey[Who | None] = web.RequestKey("who", object)  # type: ignore[arg-type]
 
 
 class Page:
-    """All that the handlers share."""
+    """The application and the state that its request handlers share."""
 
     def __init__(
         self,
@@ -76,7 +81,11 @@ class Page:
         guide: Guide,
         page: Path = PAGE,
     ) -> None:
-        """`names` are those by which the robot is reached from elsewhere, lower case."""
+        """Build the routes.
+
+        `names` are the host names and addresses, in lower case, by which other machines reach the
+        robot.
+        """
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
         self._guide = guide
         self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
@@ -110,18 +119,25 @@ class Page:
 
     @property
     def viewers(self) -> int:
-        """Connected now."""
+        """Number of open WebSocket connections."""
         return len(self._viewers)
 
     def end_all(self, why: str) -> None:
-        """Everybody goes; who drove stops."""
+        """End the report and every connection; `Viewer.end` also stops a robot that a viewer is
+        driving.
+
+        `why` is sent as the close reason, at most 120 characters.
+        """
         self._reports.end()
         for viewer in list(self._viewers):
             viewer.end(why)
 
     async def tidy(self) -> None:
-        """To be called now and then: those go whose token counts no more, or cannot be looked
-        up, and the report that nobody waits for."""
+        """Drop expired work; the server calls this once a second.
+
+        This ends the connection of each viewer whose token has expired, was revoked or cannot be
+        looked up on disk within `READ_S`, and gives up a report that no client waits for.
+        """
         self._reports.tidy()
         try:
             counting = await in_thread(self._vault.counting, READ_S)
@@ -131,7 +147,7 @@ class Page:
             if viewer.who.token and viewer.who.token not in counting:
                 viewer.end("your token has ended")
 
-    # who
+    # Admission of requests.
 
     @web.middleware
     async def _admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -172,19 +188,26 @@ class Page:
             return problem(error.status, _WORDS.get(error.status, error.reason))
 
     def _hurries(self, request: web.Request, who: Who) -> bool:
-        """He asks for more than he may have; whoever is at the machine may."""
+        """Return whether the client exceeds its request rate.
+
+        Clients on the robot itself are exempt.
+        """
         if not who.token or request.path in UNHURRIED:
             return False
         return not self._paces.take(who.token, clock.mono_ns())
 
     async def _known(self, peer: str, shown: Sequence[str]) -> Who | Refusal:
-        """Whose the first of these tokens is that counts; raises `TimeoutError` where they cannot
-        be looked up."""
+        """Return the owner of the first valid token in `shown`, or a refusal.
+
+        Raises `TimeoutError` if the disk does not answer within `READ_S`.
+        """
         now_ns = clock.mono_ns()
         if not any(shown):
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
         who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
-        if who is not None:  # whoever else tries: nobody is shut out by a stranger's guesses
+        # A valid token is accepted even while guessing is throttled, so another client's wrong
+        # guesses lock nobody out.
+        if who is not None:
             return replace(who, address=peer)
         if self._tries.spent(peer, now_ns):
             return Refusal("too_fast", "too many wrong tokens: wait a minute")
@@ -194,12 +217,12 @@ class Page:
         )
 
     def refused(self, why: Refusal, origin: str) -> web.Response:
-        """The answer to who may not, counted; `origin` is for the log."""
+        """Count the refusal, log it under `origin`, and return the error response."""
         self._counts.refuse(why.reason, origin)
         return problem(STATUS.get(why.reason, 403), why.text)
 
     async def _token(self, request: web.Request) -> web.StreamResponse:
-        """A token becomes a cookie, which no script can read."""
+        """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
         text, peer = await token_posted(request), peer_of(request)
         if not request.secure:
             return self.refused(Refusal("plain", "here you need no token"), peer)
@@ -214,7 +237,7 @@ class Page:
         )  # fmt: skip
         return response
 
-    # the page
+    # The page and its files.
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
         return await self._send(request, "index.html")
@@ -235,7 +258,8 @@ class Page:
         who, peer = _who(request), peer_of(request)
         if full := self._seats.enter(peer, who.token):
             answer = self.refused(Refusal("too_many", full), who.origin)
-            answer.force_close()  # who asks again and again keeps no connection either
+            # A client that retries in a loop must not keep its TCP connection either.
+            answer.force_close()
             return answer
         try:
             served = web.WebSocketResponse(
@@ -256,7 +280,7 @@ class Page:
             self._seats.leave(peer, who.token)
         return served
 
-    # for programs
+    # The interface for programs.
 
     async def _api(self, request: web.Request) -> web.StreamResponse:
         return self._programs.described()
@@ -266,7 +290,8 @@ class Page:
 
     async def _whoami(self, request: web.Request) -> web.StreamResponse:
         who = _who(request)
-        # A browser does not tell its page why a WebSocket was refused; this does.
+        # A browser does not report to its page why a WebSocket was refused, so `full` reports it
+        # here.
         full = self._seats.missing(peer_of(request), who.token)
         return web.json_response({"role": who.role, "name": who.name, "full": full})
 

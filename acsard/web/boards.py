@@ -17,14 +17,17 @@ NO_DEVICE = (
 
 
 class Board(Struct, frozen=True):
-    """A port, and what is behind it in words."""
+    """A serial port and a description of the device behind it."""
 
     port: str
     what: str
 
 
 def boards(configured: str) -> list[Board]:
-    """The configured one first, those that are plugged in, and the simulator; slow."""
+    """Return the configured port first, then the ports with a device, then the simulator.
+
+    This scans the serial devices and the processes that hold them, so call it in a thread.
+    """
     found: dict[str, str] = {}
     for device in serial_devices():
         name = device.names[0] if device.names else device.device
@@ -36,6 +39,7 @@ def boards(configured: str) -> list[Board]:
         there = "" if os.path.exists(configured) else ", not there now"
         found = {configured: f"configured{there}", **found}
     found[SIMULATOR] = "the simulator: nothing real moves"
-    # What is begun without a look at the list is of the robot that is seen: no other's wheels turn.
+    # The configured port comes first: a check that is started without looking at the list must run
+    # on the robot that the operator sees, because wheels turn.
     ports = sorted(found, key=lambda port: port != configured)
     return [Board(port, found[port]) for port in ports]

@@ -1,5 +1,7 @@
-"""Services of the robot and questions to it: each in a thread of its own, so that a stop waits for
-nothing, and so many at most."""
+"""Service calls and queries to the robot.
+
+Each one blocks a thread of its own and their number is limited, so a stop never waits behind them.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,16 @@ from acsard.web.robots import Robots
 from acsard.web.who import Who
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
-"""Of all viewers. Stops have a room of their own; more of them would all stop the same robot."""
+"""Limits on concurrent requests of all viewers together. Stops have a separate limit; further stops
+would only stop the same robot again."""
 
 ELSEWHERE_AT_ONCE = 8
-"""Stops of other robots that are waited for; one beyond is told to its robot all the same."""
+"""Limit on concurrent stops of other robots that wait for an answer. A stop beyond the limit is
+still sent to its robot, but without waiting for the answer."""
 
 ANSWER_S = 8.0
-"""Longer than a client waits for its answer, which says why there is none."""
+"""Longer than a client waits for its answer, so the client's own error message is what the caller
+gets."""
 
 BUSY = "busy: too many questions at once; ask again"
 
@@ -35,21 +40,21 @@ T = TypeVar("T")
 
 
 class RefusedError(AcsardError):
-    """Not for this role, or no such service; the text says which."""
+    """A call that this role may not make, or a service that does not exist; the text says which."""
 
     def __init__(self, text: str, role: bool) -> None:
         super().__init__(text)
         self.role = role
-        """He may not; else there is none."""
+        """True if the role is too low, False if the service or the robot id is invalid."""
 
 
 class Ending(NamedTuple):
-    """What became of what the page's server had begun beside the daemon."""
+    """Result of ending the check or calibration that the page's server had started."""
 
     words: str = ""
-    """Empty where there was nothing."""
+    """Description of the result; empty if nothing was running."""
     ended: bool = True
-    """Else it goes on for a while."""
+    """False if the child process has not exited yet."""
 
 
 async def _nothing() -> Ending:
@@ -57,25 +62,29 @@ async def _nothing() -> Ending:
 
 
 class Calls:
-    """What is under way, at most so much."""
+    """The requests that are under way, within the limits above."""
 
     def __init__(self, robots: Robots, ends: Callable[[], Awaitable[Ending]] = _nothing) -> None:
-        """`ends` ends what the page's server has begun beside the daemon."""
+        """Store the robots, and `ends`, which ends the server's check or calibration."""
         self._robots, self._ends = robots, ends
         self._running, self._stops, self._elsewhere = 0, Stops(), 0
 
     async def call(
         self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
     ) -> ServiceReply:
-        """Call a service in the name of `who`, of another `robot` only stop; raises
-        `RefusedError`."""
+        """Call a service on behalf of `who` and return the reply.
+
+        `robot` is the id of another robot, on which only `stop` may be called. Raises
+        `RefusedError`.
+        """
         require(who, verb)
         other = "" if robot == self._robots.id else robot
         if other:
             _require_stop(verb, other)
         if verb != "stop" or other:
             return await self._called(who, verb, payload, other)
-        # A check has the port, and its wheels turn: the daemon, if there is one, cannot stop them.
+        # A check holds the serial port and turns the wheels, so the daemon cannot stop them: end
+        # the check too.
         ending, reply = await asyncio.gather(self._ends(), self._called(who, verb, payload, other))
         if not ending.words:
             return reply
@@ -103,7 +112,10 @@ class Calls:
         return reply
 
     async def get(self, robot: str, name: str) -> tuple[str, bytes]:
-        """The last value of a key as JSON: encoding and payload; raises a `MendableError`."""
+        """Return the encoding and the payload of the last value of a key, asked for as JSON.
+
+        Raises `MendableError` if there is no connection, no answer, or no free slot.
+        """
         client = self._robots.client
         if client is None:
             raise MendableError(self._robots.gone)
@@ -112,7 +124,10 @@ class Calls:
     async def _stop(
         self, robot: str, client: Client, who: Who, request: Callable[[], ServiceReply]
     ) -> ServiceReply:
-        """Of another robot: names that none has keep none waiting."""
+        """Stop another robot.
+
+        Slots are limited, so a robot id that does not exist cannot block other callers.
+        """
         if self._elsewhere < ELSEWHERE_AT_ONCE:
             self._elsewhere += 1
             try:
@@ -135,14 +150,21 @@ class Calls:
 
 
 class Stops:
-    """So many at once; those beyond wait, together, for one that is asked after all of them."""
+    """Stop requests, of which at most `STOPS_AT_ONCE` run at the same time.
+
+    All further callers share one request that is sent later.
+    """
 
     def __init__(self) -> None:
         self._room = asyncio.Semaphore(STOPS_AT_ONCE)
         self._next: asyncio.Task[ServiceReply] | None = None
 
     async def ask(self, call: Callable[[], ServiceReply]) -> ServiceReply:
-        """The robot's own answer, of this call or of one that is asked later than now."""
+        """Return the robot's reply to this request.
+
+        If too many stops are under way, return the reply to a shared request that is sent after
+        this call began.
+        """
         if not self._room.locked():
             async with self._room:
                 return await in_thread(call, ANSWER_S)
@@ -153,12 +175,12 @@ class Stops:
 
     async def _later(self, call: Callable[[], ServiceReply]) -> ServiceReply:
         async with self._room:
-            self._next = None  # who comes from now on is confirmed by another
+            self._next = None  # later callers share the next request
             return await in_thread(call, ANSWER_S)
 
 
 def require(who: Who, verb: str) -> None:
-    """Raises `RefusedError`."""
+    """Raise `RefusedError` unless the service exists and the role of `who` may call it."""
     if verb not in SERVICES:
         raise RefusedError(f"no service {verb!r}; there are {', '.join(SERVICES)}", role=False)
     least = SERVICE_ROLES[verb]
@@ -169,7 +191,7 @@ def require(who: Who, verb: str) -> None:
 
 
 def _require_stop(verb: str, robot: str) -> None:
-    """Raises `RefusedError`."""
+    """Raise `RefusedError` unless the robot id is valid and the service is `stop`."""
     try:
         require_id(robot)
     except UsageError as error:
@@ -183,7 +205,7 @@ def _require_stop(verb: str, robot: str) -> None:
 
 
 def _named(client: Client, robot: str, who: Who) -> Client:
-    """The daemon's log says who called."""
+    """Return a client for `robot` under the caller's name, which the daemon logs."""
     other = client.like(robot)
     other.name = _caller(who)
     return other

@@ -1,8 +1,8 @@
-"""Hands commands to the bus, on a thread of its own: a bus that is locked holds up nobody else.
+"""Puts velocity commands on the bus from a thread of its own, so a blocked bus blocks nothing else.
 
-Of each sender only the newest waits, and not for long: a command goes out once, with the stamp of
-who meant it, or it is dropped. Nothing is repeated and nothing made up here but the zero of one who
-drove and has gone.
+Only the newest command of each sender waits, and only for a short time. A command is sent once,
+with the stamp of its sender, or it is dropped. The server repeats nothing and makes up nothing,
+except one zero command for a sender that was driving and disconnected.
 """
 
 from __future__ import annotations
@@ -24,43 +24,48 @@ from acsard.values import NS_PER_S
 from acsard.web.counts import Counts
 
 SOURCE = "teleop"
-"""A person's: it goes before programs."""
+"""The command source for a person; the arbiter prefers it to programs."""
 
 SPACING_NS = 2_000_000
-"""The daemon takes 1000 commands a second on a key: what comes on the heels of another is lost."""
+"""Minimum spacing of two commands: the daemon accepts 1000 commands a second on one key and drops
+the rest."""
 
 LATE_NS = NS_PER_S // 4
-"""A speed that waited here for so long is dropped: its timeout is over."""
+"""Maximum age of a command with a speed. An older one is dropped, because its timeout has
+passed."""
 
 SENDERS = 128
-"""Who may wait at once; more than there are connections."""
+"""Maximum number of senders with a waiting command; this is more than there can be connections."""
 
 
 class Order(Struct, frozen=True):
-    """One command, as it came."""
+    """One command as the client sent it."""
 
     sender: str
-    """The sender id, `NAME/SECRET`."""
+    """Sender id in the form `NAME/SECRET`."""
     linear: float
-    """m/s"""
+    """Forward speed, m/s."""
     angular: float
-    """rad/s"""
+    """Turn rate, rad/s, positive to the left."""
     stamp_ns: int
-    """By the sender's clock."""
+    """Time of the command by the sender's clock."""
     sequence: int
     given_ns: int
-    """When it came here, monotonic."""
+    """Arrival time at this server, monotonic clock."""
     steady: bool = False
-    """Nobody adjusts the sender's clock."""
+    """True if the sender's clock is never adjusted."""
 
     @property
     def moves(self) -> bool:
-        """It is no zero."""
+        """Whether the command sets a speed other than zero."""
         return self.linear != 0.0 or self.angular != 0.0
 
 
 class Hand:
-    """The newest of each sender, to the bus; `client` gives the way there, None without one."""
+    """The newest command of each sender, and the thread that publishes them.
+
+    `client` returns the connection to the bus, or None if there is none.
+    """
 
     def __init__(self, client: Callable[[], Client | None], counts: Counts) -> None:
         self._client, self._counts = client, counts
@@ -69,11 +74,12 @@ class Hand:
         self._idle = True
         self._put_ns = 0
         self.dead: Future[Never] = Future()
-        """Raises what ended the thread, if ever: without it nobody drives, and no zero goes out."""
+        """Holds the exception that ended the thread. The server must exit then: without the thread
+        no viewer can drive and no zero command is sent."""
         threading.Thread(target=self._live, name="hand", daemon=True).start()
 
     def give(self, order: Order) -> None:
-        """Hand this on, in the place of an older one of the same sender."""
+        """Queue a command in place of an older one of the same sender."""
         with self._news:
             if self._waiting.pop(order.sender, None) is not None:
                 self._counts.add("commands_superseded")
@@ -84,7 +90,7 @@ class Hand:
             self._news.notify_all()
 
     def flush(self, seconds: float) -> None:
-        """Wait until all is handed on, for so long at most."""
+        """Wait until the queue is empty, at most `seconds`."""
         with self._news:
             self._news.wait_for(lambda: self._idle and not self._waiting, seconds)
 
@@ -92,7 +98,7 @@ class Hand:
         try:
             while True:
                 self._work(self._next())
-        except BaseException as error:  # noqa: BLE001 - carried to who waits for it
+        except BaseException as error:  # noqa: BLE001 - passed on to the waiting server
             self.dead.set_exception(error)
 
     def _work(self, order: Order) -> None:
@@ -103,7 +109,7 @@ class Hand:
                 self._put(client, order)
                 self._counts.add("commands")
                 return
-        except Exception:  # noqa: BLE001, S110 - of one command; the next is another's, or a zero
+        except Exception:  # noqa: BLE001, S110 - only this one command is lost
             pass
         self._counts.add("commands_dropped")
 

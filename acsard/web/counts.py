@@ -1,4 +1,4 @@
-"""What the page's server counts, for `/metrics` and its log."""
+"""Counters of the page's server, for `/metrics` and the log."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from acsard.values import Event
 from acsard.web.who import Reason
 
 NAMED = 5
-"""Who was refused is named, those first who were most often."""
+"""Number of origins that one log line names, starting with the most frequent."""
 
 KNOWN = 1000
-"""So many are told apart between two lines, however many addresses somebody has."""
+"""Maximum number of origins that are counted separately between two log lines. The bound holds even
+if a client uses many addresses."""
 
 
 class Counts:
-    """Counters by name; from any thread."""
+    """Thread-safe counters by name."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -24,32 +25,31 @@ class Counts:
         self._refused: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self._origins: Counter[str] = Counter()
-        """Who was refused since the last line."""
+        """Refusals since the last log line, by origin."""
 
     def add(self, name: str, more: int = 1) -> None:
-        """So many more."""
         with self._lock:
             self._counts[name] += more
 
     def refuse(self, reason: Reason, origin: str = "") -> None:
-        """One more that was refused, and where that came from, "" where nobody knows."""
+        """Count a refusal; `origin` is its source, or "" if it is unknown."""
         with self._lock:
             self._refused[reason] += 1
             if origin and (origin in self._origins or len(self._origins) < KNOWN):
                 self._origins[origin] += 1
 
     def all(self) -> dict[str, int]:
-        """Up to now."""
+        """Return the counters since the start."""
         with self._lock:
             return dict(self._counts)
 
     def refused(self) -> dict[str, int]:
-        """The refusals up to now, by reason."""
+        """Return the refusals since the start, by reason."""
         with self._lock:
             return dict(self._refused)
 
     def news(self) -> Event | None:
-        """The refusals since the last call, for the log; None where there are none."""
+        """Return a log event for the refusals since the last call, or None if there were none."""
         with self._lock:
             new = self._refused - self._told
             self._told = Counter(self._refused)

@@ -1,7 +1,7 @@
-"""What may be begun from the page, as the words of the very command; pure.
+"""Command lines for the checks and calibrations that the page may start. This module is pure.
 
-Nothing of what was sent becomes an option of its own: the options are these, and each value is one
-of a few, or a plain key.
+No text from the browser becomes an option by itself. The options are fixed here, and each value is
+either one of a known set or a plain key.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ KEY = re.compile(r"(?=.{1,80}\Z)[A-Za-z0-9_][A-Za-z0-9_-]*(/[A-Za-z0-9_-]+)*\Z")
 
 
 class Reach(Struct, frozen=True):
-    """By which options a command finds what this page's server has found; "" is not given."""
+    """The options that let a command reach the same daemon as this server.
+
+    An empty value omits its option.
+    """
 
     config: str
     endpoint: str
@@ -29,7 +32,7 @@ class Reach(Struct, frozen=True):
 
 
 def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
-    """Behind `acsard`; raises `FrameError`."""
+    """Return the arguments after `acsard`. Raises `FrameError` if the request is not allowed."""
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
         if begin.way or begin.positions:

@@ -1,4 +1,4 @@
-"""The files of the page, as they lie in `acsard/web/page`: by their plain names, nothing else."""
+"""The page's static files, served from `acsard/web/page` by plain file name only."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ TYPES = {
     ".json": "application/json",
     ".webmanifest": "application/manifest+json",
 }
-"""What is served; a file of another kind is not there."""
+"""Content type per file suffix. A file with any other suffix is not served."""
 
 PAYS = 1000
-"""Bytes from which on it is worth to compress."""
+"""Minimum size in bytes from which a file is compressed."""
 
 
 class File(Struct, frozen=True):
-    """One, as it goes out."""
+    """A file in the form in which it is sent."""
 
     kind: str
     body: bytes
     packed: bytes | None
-    """The same by gzip, where that is shorter."""
+    """The gzip form of the body, or None if it is not shorter."""
     tag: str
     stamp: tuple[int, int]
 
 
 class Files:
-    """The files of a directory; a changed one is read anew."""
+    """The files of a directory, cached until they change on disk."""
 
     def __init__(self, directory: Path = PAGE) -> None:
         self._directory = directory
         self._files: dict[str, File] = {}
 
     def get(self, name: str) -> File | None:
-        """The file of this name; None for what is not there, or no plain name."""
+        """Return the file, or None if it does not exist or the name is not a plain file name."""
         kind = TYPES.get(Path(name).suffix)
         if kind is None or "/" in name or name.startswith("."):
             return None

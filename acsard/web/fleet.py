@@ -1,4 +1,4 @@
-"""The robots that the bus or router knows, a row for each, while somebody looks at them."""
+"""The robots that the bus or router knows, one row each, tracked while a viewer looks at them."""
 
 from __future__ import annotations
 
@@ -22,46 +22,51 @@ from acsard.web.streams import DECLARE_S, UNREADY
 from acsard.web.told import Row
 
 MOST = 200
-"""Robots; a stranger may invent names."""
+"""Maximum number of robots. The bound is needed because any client of the bus can invent robot
+names."""
 
 FORGET_NS = 30 * NS_PER_S
-"""Not heard of for so long, it is none any more."""
+"""A robot that has been silent for longer is dropped, unless its liveliness token is present."""
 
 ASK_NS = 2 * NS_PER_S
-"""Who has not said his version is asked again so often."""
+"""Interval between queries to a robot that has not reported its version."""
 
 UNROUTED = (
     "seen by way of the daemon of {robot} alone, and daemons hand on nothing that others say: only "
     "one that is connected to it is here too. For all robots of a router have this page's server "
     "at the router: acsard web --connect ROUTER --id {robot}"
 )
-"""Why there are not more."""
+"""Note for a server that is connected to a daemon instead of a router."""
 
 BY_NAME = (
     "{endpoint} lets keys pass by their names alone, as all do by TLS: no other robot is seen. For "
     "all of a router have this page's server at its own machine: acsard web --connect "
     "tcp/127.0.0.1:7447 --id {robot}"
 )
-"""Why there are none but its own."""
+"""Note for a server that is connected over TLS, which limits it to its own robot."""
 
 LONG = 40
-"""Characters of a version that are shown."""
+"""Maximum number of characters of a version that the page shows."""
 
 
 class _Known:
-    """What is known of one; each value is set whole, since other threads set them."""
+    """The state of one robot.
+
+    Each value is replaced as a whole because Zenoh's threads write them.
+    """
 
     def __init__(self, now_ns: int) -> None:
         self.newest: tuple[zenoh.Sample | None, int] = None, now_ns
-        """Its state, and when it was heard; without one when it was first heard of."""
+        """The last state and its arrival time. Before the first state: None and the time of the
+        first contact."""
         self.here: bool | None = None
-        """By its token; None where no tokens are told, as over TLS."""
+        """Presence of the liveliness token; None if tokens are not visible, as over TLS."""
         self.version = ""
         self.asked_ns = now_ns - ASK_NS
 
 
 class Fleet:
-    """Follows all robots for as long as somebody has joined."""
+    """Tracks all robots for as long as at least one viewer has joined."""
 
     def __init__(self, robots: Robots) -> None:
         self._robots = robots
@@ -71,20 +76,21 @@ class Fleet:
         self._declared: list[Any] = []
         self._busy: set[asyncio.Task[None]] = set()
         self.note = ""
-        """What is to be known of the rows, in words; "" where all of a router are seen."""
+        """Explanation of why robots may be missing from the rows; "" if all robots of a router are
+        visible."""
 
     def join(self, viewer: object) -> None:
-        """This one looks from now on."""
+        """Start tracking on behalf of this viewer."""
         self._joined.add(viewer)
         self._look()
 
     def leave(self, viewer: object) -> None:
-        """This one does not."""
+        """Remove this viewer; the last one to leave ends the tracking."""
         self._joined.discard(viewer)
         self._tidy()
 
     def rows(self) -> list[Row]:
-        """What is known now, by name; whatever is not declared or known yet is tried again."""
+        """Return the rows sorted by robot id, and retry missing subscriptions and versions."""
         self._look()
         now_ns, rows = clock.mono_ns(), []
         for robot, one in sorted(self._known.copy().items()):
@@ -110,7 +116,7 @@ class Fleet:
             return Row(robot, "gone", was, None, "", age, one.version)
         return Row(robot, state.mode, state.reason, state.linear, state.link, age, one.version)
 
-    # on threads of Zenoh's
+    # The methods below run on Zenoh's threads.
 
     def _of(self, sample: zenoh.Sample) -> _Known | None:
         robot = robot_of(str(sample.key_expr))
@@ -128,8 +134,8 @@ class Fleet:
         if one is not None:
             one.here = sample.kind == zenoh.SampleKind.PUT
             if not one.here:
-                one.newest = one.newest[0], clock.mono_ns()  # told as gone for a while
-                one.version = ""  # it may come back as another
+                one.newest = one.newest[0], clock.mono_ns()  # keeps the "gone" row for `FORGET_NS`
+                one.version = ""  # a restarted daemon may have another version
 
     def _info(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)
@@ -140,7 +146,7 @@ class Fleet:
         if one is not None:
             one.version = version[:LONG]
 
-    # the way there
+    # Subscriptions and queries.
 
     def _look(self) -> None:
         client = self._robots.client
@@ -177,7 +183,7 @@ class Fleet:
         try:
             self._declared = await in_thread(declare, DECLARE_S, _undeclare)
         except UNREADY:
-            return  # who looks next tries again
+            return  # the next viewer that looks retries
         self._tidy()
 
     async def _ask(self, client: Client, robots: Sequence[str]) -> None:
@@ -186,12 +192,12 @@ class Fleet:
                 try:
                     client.like(robot).ask("info", self._info)
                 except UNREADY:
-                    continue  # a name that no robot has, or a bus that is stuck
+                    continue  # the robot does not exist, or the bus is stuck
 
         try:
             await in_thread(ask, DECLARE_S)
         except TimeoutError:
-            pass  # the bus is stuck: they are asked again
+            pass  # the bus is stuck; the queries are repeated
 
     def _tidy(self) -> None:
         if self._joined or not self._declared:
@@ -210,7 +216,7 @@ async def _ended(declared: Sequence[Any]) -> None:
     try:
         await in_thread(lambda: _undeclare(declared), DECLARE_S)
     except UNREADY:
-        pass  # the bus is stuck, or gone: what comes is forgotten
+        pass  # the bus is stuck or closed, so later samples are discarded
 
 
 def _undeclare(declared: Sequence[Any]) -> None:

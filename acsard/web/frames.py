@@ -1,7 +1,8 @@
-"""What a page or a program says on `/ws`: text -> one frame, or the reason it is refused; pure.
+"""Decodes the messages that a page or a program sends on `/ws`. This module is pure.
 
-One JSON object a message; what it is for is told by its first field (`subscribe`, `cmd`, `call`,
-...). A message that is none of these, or holds what is not meant, is refused whole.
+Each message is one JSON object. Its kind is the one field of `KINDS` that it has (`subscribe`,
+`cmd`, `call`, ...). A message of no kind, of two kinds, or with an unknown field is refused as a
+whole.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ from acsard.messages.signature import MOST
 from acsard.values import AcsardError
 
 MAX_BYTES = 65536
-"""Of one message; a command has a hundred."""
+"""Maximum size of one message; a command has about a hundred bytes."""
 
 MAX_RATE, USUAL_RATE = 50.0, 10.0
-"""Messages of one key a second."""
+"""Maximum and default rate of one key, messages per second."""
 
 LATEST_STAMP_MS = MOST // 1_000_000 - 86_400_000.0
-"""ms since 1970: what a signature holds in ns, but for a day, since the zero of who lets go has a
-later stamp than his last command."""
+"""Largest stamp in ms since 1970: the signature's limit in ns, less one day. The margin is needed
+because the zero command after a release carries a later stamp than the last command."""
 
 Short = Annotated[str, Meta(max_length=80)]
 Device = Annotated[str, Meta(max_length=200)]
 
 
 class FrameError(AcsardError):
-    """No frame of ours; `about` is what it was meant for, as far as that can be told."""
+    """A message that is not a valid frame. `about` names its intended kind, or is "message"."""
 
     def __init__(self, about: str, text: str) -> None:
         super().__init__(text)
@@ -38,11 +39,11 @@ class FrameError(AcsardError):
 
 
 class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of all."""
+    """Base of all frames; it rejects unknown fields."""
 
 
 class Subscribe(_Frame, frozen=True):
-    """Send the messages of a key from now on, at most `rate` a second."""
+    """Send the messages of a key from now on, at most `rate` per second."""
 
     subscribe: Short
     rate: float = USUAL_RATE
@@ -50,40 +51,43 @@ class Subscribe(_Frame, frozen=True):
 
 
 class Unsubscribe(_Frame, frozen=True):
-    """No more of them."""
+    """Stop sending the messages of this key."""
 
     unsubscribe: Short
     robot: Short = ""
 
 
 class Wish(_Frame, frozen=True):
-    """A twist: m/s and rad/s."""
+    """A requested velocity: `linear_x` in m/s, `angular_z` in rad/s."""
 
     linear_x: float
     angular_z: float
 
 
 class Command(_Frame, frozen=True):
-    """Drive so; `stamp` is when that was meant, in ms by the sender's own clock."""
+    """Drive at this velocity.
+
+    `stamp` is the time of the command in ms by the sender's own clock.
+    """
 
     cmd: Wish
     stamp: float
     steady: bool = False
-    """Nobody adjusts the clock of `stamp`, as the browser's `performance.now()`."""
+    """True if the clock of `stamp` is never adjusted, like the browser's `performance.now()`."""
 
     @property
     def stamp_ns(self) -> int:
-        """The same in ns."""
+        """The stamp in ns."""
         return int(self.stamp * 1e6)
 
     @property
     def moves(self) -> bool:
-        """It is no zero."""
+        """Whether the command sets a speed other than zero."""
         return self.cmd.linear_x != 0.0 or self.cmd.angular_z != 0.0
 
 
 class Call(_Frame, frozen=True):
-    """Call a service of the robot; the answer carries `id`."""
+    """Call a service of the robot; the answer carries the same `id`."""
 
     call: Short
     id: int | Short = 0
@@ -92,30 +96,30 @@ class Call(_Frame, frozen=True):
 
 
 class Ping(_Frame, frozen=True):
-    """Answered with the same number."""
+    """Ask for a pong with the same number."""
 
     ping: float
 
 
 class Begin(_Frame, frozen=True):
-    """Check the board at `port`, or calibrate by a `way`, "" for the usual one."""
+    """Check the board at `port`, or calibrate by a `way`; "" selects the default way."""
 
     begin: Literal["check", "calibrate"]
     port: Device = ""
     way: Short = ""
     positions: Short = ""
-    """The key they come on, with that way."""
+    """The key on which positions arrive, for the way `positions` only."""
 
 
 class Reply(_Frame, frozen=True):
-    """The answer to the question of this number, of what was begun; none is what is usual."""
+    """Answer the question with this number; null takes the default."""
 
     reply: Annotated[int, Meta(ge=0, le=1 << 31)]
     value: float | Short | None = None
 
 
 class Press(_Frame, frozen=True):
-    """A key at the terminal of what was begun, or Ctrl-C."""
+    """Press a key at the running check or calibration, or interrupt it like Ctrl-C ("leave")."""
 
     press: Literal["key", "leave"]
 
@@ -132,7 +136,7 @@ KINDS: dict[str, type[Frame]] = {
     "reply": Reply,
     "press": Press,
 }
-"""What a message is by the field it has."""
+"""The frame type for each field that identifies one."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])
 _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
@@ -141,7 +145,7 @@ _decoders: dict[str, msgspec.json.Decoder[Frame]] = {
 
 
 def decode(text: str) -> Frame:
-    """The frame in a message; raises `FrameError`."""
+    """Return the frame in a message. Raises `FrameError`."""
     about = "message"
     try:
         meant = [name for name in _heads.decode(text) if name in KINDS]
@@ -156,7 +160,7 @@ def decode(text: str) -> Frame:
 
 
 def _require(frame: Frame) -> None:
-    """Raises `FrameError` for numbers that cannot be meant."""
+    """Raise `FrameError` for numbers that are out of range."""
     if isinstance(frame, Command):
         if not (math.isfinite(frame.cmd.linear_x) and math.isfinite(frame.cmd.angular_z)):
             raise FrameError("cmd", "linear_x and angular_z must be finite")

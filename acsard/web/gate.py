@@ -1,6 +1,6 @@
-"""Connections as such: so many at most, and none that says nothing for ever.
+"""Limits TCP connections: their number, and the time until the first request.
 
-A WebSocket or request is refused by the application; this is for who never gets so far.
+The application refuses a request or a WebSocket. This module handles clients that never send one.
 """
 
 from __future__ import annotations
@@ -13,29 +13,33 @@ from acsard.web.limits import Places
 from acsard.web.who import unmapped
 
 SOCKETS, SOCKETS_OF_ONE = 256, 64
-"""TCP connections: a browser opens six beside its WebSocket."""
+"""Maximum number of TCP connections per listening address, in all and from one client address. A
+browser opens six in addition to its WebSocket."""
 
 REQUEST_S = 10.0
-"""Whoever has not sent the whole head of a request by then is sent away."""
+"""Time limit for the head of the first request; the connection is cut after that."""
 
 Factory = Callable[[], asyncio.Protocol]
 
 
 class Gate:
-    """Counts who is connected."""
+    """The open connections."""
 
     def __init__(self, counts: Counts) -> None:
         self.counts = counts
         self._doors: dict[asyncio.BaseTransport, _Door] = {}
 
     def guarded(self, inner: Factory) -> Factory:
-        """The same protocols, behind this gate: with places of their own for each address of ours,
-        so that strangers never shut out who is at the machine."""
+        """Wrap a protocol factory so that each connection passes this gate first.
+
+        Each call has limits of its own. The server calls it once per listening address, so clients
+        from the network can never lock out a browser on the robot itself.
+        """
         places = Places(SOCKETS, SOCKETS_OF_ONE)
         return lambda: _Door(self, places, inner)
 
     def spoke(self, transport: asyncio.BaseTransport | None) -> None:
-        """A request has come on it."""
+        """Cancel the time limit of this connection, because a request has arrived."""
         if transport is not None and (door := self._doors.get(transport)) is not None:
             door.hurry(False)
 
@@ -47,7 +51,7 @@ class Gate:
 
 
 class _Door(asyncio.Protocol):
-    """One connection: the inner protocol sees it only when there is room."""
+    """One connection. The inner protocol is created only if the limits allow it."""
 
     def __init__(self, gate: Gate, places: Places, inner: Factory) -> None:
         self._gate, self._places, self._make = gate, places, inner
@@ -69,7 +73,7 @@ class _Door(asyncio.Protocol):
         self._inner.connection_made(transport)
 
     def hurry(self, on: bool) -> None:
-        """It has to say something soon, or may take its time."""
+        """Start the time limit for the first request, or cancel it."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None

@@ -1,9 +1,10 @@
-"""A check or a calibration that somebody goes through in his browser: the very command, as a child.
+"""Runs a board check or a calibration for a browser, as a child process of the same command.
 
-One at a time. What the child tells and asks goes to the connection that began it, and from that one
-alone come answers and keys, by `--json-lines` (asking/json_lines.py). When the connection ends the
-child is ended as by Ctrl-C, so that its zeros go out; it listens for us too, and does not outlive
-us. Nothing waits here: an answer goes to an open question, once, or is refused.
+Only one runs at a time. The child's lines (`--json-lines`, see asking/json_lines.py) go to the
+connection that started it, and only that connection may send answers and key presses. If the
+connection ends, the child is interrupted as by Ctrl-C, so it still sends its zeros to the board.
+The child also watches its standard input and does not outlive this server. Nothing is queued: a
+reply goes to the open question once, or is refused.
 """
 
 from __future__ import annotations
@@ -28,23 +29,23 @@ from acsard.web.frames import Begin, FrameError, Press, Reply
 from acsard.web.told import Ended, Guided, Running
 
 ENDING_S = 1.0
-"""Whoever pressed STOP hears by then whether it has ended."""
+"""Longest time that the answer to a STOP waits for the child to end."""
 
 LINE_BYTES = 65536
-"""Of what the child says at once."""
+"""Maximum length of one line of the child's output."""
 
 LAST_BYTES = 4000
-"""Of what it said to standard error."""
+"""Number of bytes that are kept from the end of the child's standard error."""
 
 RELAY_NS = NS_PER_S // 20
-"""So often at most it is told that the browser is heard: about twice as often as that says so
-(page/guide.js), so that none of its signs is lost on the way."""
+"""Minimum interval between signs of life that are relayed to the child. The browser sends them at
+about half this rate (page/guide.js), so none is lost."""
 
 PATIENCE_S = 6.0
-"""For its zeros and its end, once it was told to leave."""
+"""Time for the child to send zeros and exit after an interrupt, before it is killed."""
 
 CLOSING_S = 2.0
-"""The same when this server ends."""
+"""Time for the child to exit when this server ends."""
 
 BOARDS_S = 5.0
 
@@ -52,21 +53,22 @@ Say = Callable[[Guided], None]
 
 
 class Choices(Struct, frozen=True):
-    """What may be begun."""
+    """The checks and calibrations that the page may start."""
 
     ways: dict[str, str]
-    """Of calibrating, and what each needs."""
+    """Description of the requirements of each calibration way."""
     way: str
-    """The one to begin with; "" is the usual one."""
+    """The recommended way; "" selects the default."""
     advice: str
-    """Why that one, and which others there are to choose from here."""
+    """Reason for the recommendation and the alternatives."""
     ports: Sequence[Board]
     note: str
-    """What this server cannot do, and what to type instead."""
+    """Explanation of a limit of this server, with the command to type instead; "" if there is
+    none."""
 
 
 class _Said(Struct, frozen=True):
-    """What we have to know of a line of the child's."""
+    """The fields of the child's lines that this server acts on."""
 
     question: int = 0
     leg: bool = False
@@ -74,34 +76,40 @@ class _Said(Struct, frozen=True):
 
 
 class Guide:
-    """What goes on, and who looks on."""
+    """The running check or calibration and the viewers that are informed of it."""
 
     def __init__(self, reach: Reach, configured: str) -> None:
-        """`configured` is the serial port of the configuration."""
+        """Store how a child reaches the daemon, and the serial port of the configuration."""
         self._reach, self._configured = reach, configured
         self._viewers: dict[object, Say] = {}
         self._errand: _Errand | None = None
         self._task: asyncio.Task[None] | None = None
 
     async def choices(self, *, simulated: bool) -> Choices:
-        """What may be begun now, with a robot that is simulated or not."""
+        """Return the options that the page may start now.
+
+        `simulated` says whether the robot is simulated.
+        """
         found = await self._boards()
         way, advice = SIMULATED if simulated else ("", "")
         return Choices(NEEDS, way, advice, found, NO_DEVICE if len(found) == 1 else "")
 
     def join(self, viewer: object, say: Say) -> None:
-        """He is told who goes through what; or that nobody does any more, if he was away."""
+        """Add a viewer, and report to it what is running, or that nothing is.
+
+        The second report matters to a page that was disconnected when the child ended.
+        """
         self._viewers[viewer] = say
         say(Guided(Running("")) if self._errand is None else self._errand.about(viewer))
 
     def leave(self, viewer: object) -> None:
-        """His connection has ended, and what he has begun ends with it."""
+        """Remove a viewer whose connection has ended, and interrupt a child that it started."""
         self._viewers.pop(viewer, None)
         if (errand := self._of(viewer)) is not None:
             errand.leave()
 
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
-        """Start it; why not, or ""."""
+        """Start a child. Return "" or the reason for a refusal."""
         if self._errand is not None:
             return f"{self._errand.by} goes through a {self._errand.name} already; one at a time"
         self._errand = _Errand(viewer, by, asked.begin, self._viewers[viewer])
@@ -110,14 +118,17 @@ class Guide:
         return ""
 
     def reply(self, viewer: object, reply: Reply) -> str:
-        """Hand on an answer; why not, or ""."""
+        """Pass an answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
             return f"no question {reply.reply} is open"
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
-        """A key, or Ctrl-C; there may be nothing any more that it would stop."""
+        """Pass on a key press, or interrupt the child.
+
+        The child may already have ended, so this never fails.
+        """
         if (errand := self._of(viewer)) is None:
             return
         if press.press == "key":
@@ -126,8 +137,11 @@ class Guide:
             errand.leave()
 
     async def stop(self) -> Ending:
-        """Somebody stops the robot: whoever began what goes on, it is ended, and that is said. The
-        daemon does not hear of a check: it cannot have the port."""
+        """Interrupt the running child because an operator stops the robot, and return the outcome.
+
+        Any operator's stop ends it, no matter which viewer started it. The daemon cannot stop the
+        wheels during a check, because the check holds the serial port.
+        """
         if self._errand is None or self._task is None:
             return Ending()
         self._errand.leave()
@@ -136,12 +150,12 @@ class Guide:
         return Ending(f"{what} has ended" if done else f"{what} is being ended", bool(done))
 
     def heard(self, viewer: object) -> None:
-        """He says something: the child hears that he is there."""
+        """Relay a sign of life from the viewer to the child that it started."""
         if (errand := self._of(viewer)) is not None:
             errand.relay()
 
     async def close(self) -> None:
-        """End what goes on; the child does not outlive us."""
+        """End the running child; kill it after `CLOSING_S`."""
         if self._task is None or self._errand is None:
             return
         self._errand.leave()
@@ -181,27 +195,31 @@ class Guide:
 
 
 class _Errand:
-    """One child and the connection that it is for."""
+    """One child process and the connection that started it."""
 
     def __init__(self, viewer: object, by: str, name: str, say: Say) -> None:
         self.viewer, self.by, self.name, self.say = viewer, by, name, say
         self.left = False
         self._process: asyncio.subprocess.Process | None = None
         self._question = 0
-        """Its number, while it has no answer."""
+        """Number of the open question; 0 if none is open."""
         self._leg = self._rides = False
         self._relayed_ns = 0
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
-        """That it goes on, as this one is told."""
+        """Return the message that this child is running, addressed to `viewer`."""
         return Guided(Running(self.name, self.by, viewer is self.viewer))
 
     async def run(self, given: Sequence[str]) -> tuple[int, str]:
-        """From start to end: exit code, and its last words on standard error. Raises `OSError`."""
+        """Run the child and return its exit code and the end of its standard error.
+
+        Raises `OSError`.
+        """
         if self.left:
             return int(Exit.FAILURE), ""
-        # A session of its own: what is typed at our terminal reaches it by us alone, once.
+        # The child gets a session of its own, so a Ctrl-C at this server's terminal reaches it
+        # once, from this server.
         process = self._process = await asyncio.create_subprocess_exec(
             sys.executable, "-P", "-m", "acsard", *given, limit=LINE_BYTES, start_new_session=True,
             stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
@@ -217,7 +235,7 @@ class _Errand:
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
-        """To the open question; False when that is another one."""
+        """Send an answer to the open question; return False if that is another question."""
         if not self._question or reply.reply != self._question:
             return False
         self._question, self._rides = 0, self._leg
@@ -225,20 +243,23 @@ class _Errand:
         return True
 
     def key(self) -> None:
-        """As at the terminal, where a leg is driven; the first one counts."""
+        """End the current leg like a key press at a terminal.
+
+        Only the first press of a leg counts.
+        """
         if self._rides:
             self._rides = False
             self._write({"key": True})
 
     def relay(self) -> None:
-        """Who is to stop it is heard."""
+        """Send a sign of life: the operator who can stop the robot is still connected."""
         now_ns = clock.mono_ns()
         if now_ns - self._relayed_ns >= RELAY_NS:
             self._relayed_ns = now_ns
             self._write({})
 
     def leave(self) -> None:
-        """As Ctrl-C does, once; and for good if it does not end."""
+        """Interrupt the child once, as Ctrl-C does, and kill it if it does not exit."""
         if self.left:
             return
         self.left = True
@@ -246,7 +267,7 @@ class _Errand:
             self._interrupt()
 
     def kill(self) -> None:
-        """At once, without its zeros."""
+        """Kill the child at once, without letting it send zeros."""
         if self._process is not None and self._process.returncode is None:
             self._process.kill()
 
@@ -257,7 +278,8 @@ class _Errand:
         asyncio.get_running_loop().call_later(PATIENCE_S, self.kill)
 
     def _write(self, message: object) -> None:
-        # Never much: an answer to each question, a key to each leg, and signs of life.
+        # No flow control is needed: one answer per question, one key per leg, and small signs of
+        # life.
         if self._process is not None and self._process.returncode is None:
             assert self._process.stdin is not None
             self._process.stdin.write(msgspec.json.encode(message) + b"\n")
@@ -267,7 +289,7 @@ class _Errand:
         try:
             async for line in process.stdout:
                 self._take(line)
-        except ValueError:  # a line that is too long
+        except ValueError:  # a line over LINE_BYTES
             self.leave()
             while await process.stdout.read(4096):
                 pass
@@ -276,7 +298,7 @@ class _Errand:
         try:
             said = msgspec.json.decode(line, type=_Said)
         except (msgspec.MsgspecError, ValueError):
-            return  # not for us: a library that prints
+            return  # not a protocol line: a library printed it
         if said.question:
             self._question, self._leg, self._rides = said.question, said.leg, False
         if said.progress >= 1.0:
@@ -291,5 +313,5 @@ class _Errand:
     def _words(self) -> str:
         lines = self._last.decode(errors="replace").splitlines()
         if self.left and lines[-1:] == ["KeyboardInterrupt"]:
-            return ""  # it was about to start
+            return ""  # interrupted while the interpreter was starting
         return "\n".join(line.removeprefix("acsard: ") for line in lines).strip()

@@ -1,4 +1,4 @@
-"""The keys that one viewer follows: which, how often, and until when."""
+"""The keys that one viewer subscribes to: robot, rate and lifetime."""
 
 from __future__ import annotations
 
@@ -17,14 +17,19 @@ from acsard.web.to_browser import Following, Outgoing
 MOST = 32
 
 FRAMES_HZ = 300.0
-"""Of all keys of one connection together: nobody who looks takes the time of who drives."""
+"""Maximum message rate of all keys of one connection together. The limit keeps viewers from taking
+the processor time that driving needs."""
 
 CLIENT_S = 0.2
-"""How often it is looked whether there is a way to the robot."""
+"""Interval at which a subscription checks whether the connection to the bus exists."""
 
 
 class Keys:
-    """Of one viewer; `start` runs what has to wait, `holder` is whose share of room it takes."""
+    """The subscriptions of one viewer.
+
+    `start` runs a coroutine in the background. `holder` is the name under which subscriptions to
+    other robots count against the shared limit.
+    """
 
     def __init__(
         self,
@@ -36,7 +41,7 @@ class Keys:
         self._out, self._robots, self._start, self._holder = out, robots, start, holder
 
     def subscribe(self, frame: Subscribe) -> None:
-        """Follow a key, or another rate of it; what may not be is refused."""
+        """Subscribe to a key or change its rate. An invalid request is refused to the viewer."""
         robot, key = frame.robot or self._robots.id, frame.subscribe
         try:
             require_id(robot)
@@ -65,16 +70,17 @@ class Keys:
             self._start(self._join(one))
 
     def unsubscribe(self, frame: Unsubscribe) -> None:
-        """No more of it."""
+        """End the subscription to a key, if there is one."""
         name = frame.robot or self._robots.id, frame.unsubscribe
-        one = self._out.following.pop(name, None)  # at once: it may be subscribed to anew next
+        # Remove it now, because the client may subscribe again in the next message.
+        one = self._out.following.pop(name, None)
         if one is not None:
             self._give_back(one)
             if one.stream is not None:
                 self._start(self._robots.streams.leave(*name))
 
     async def leave_all(self) -> None:
-        """No more of any."""
+        """End all subscriptions."""
         followed, self._out.following = self._out.following, {}
         for one in followed.values():
             self._give_back(one)
@@ -96,14 +102,17 @@ class Keys:
             stream = await self._found(one)
         if stream is None:
             return
-        if not self._is_followed(one):  # left meanwhile
+        if not self._is_followed(one):  # the viewer unsubscribed meanwhile
             await self._robots.streams.leave(one.robot, one.name)
             return
         one.stream = stream
         self._out.wake()
 
     async def _found(self, one: Following) -> Stream | None:
-        """Its stream; None after a while where there is none yet, or once it is given up."""
+        """Return the stream of a key.
+
+        Return None after a delay if the bus is not ready; the caller retries.
+        """
         client = self._robots.client
         if client is None:
             await asyncio.sleep(CLIENT_S)

@@ -1,4 +1,7 @@
-"""How much of one kind is too much: messages a second, tries of a token, connections; pure."""
+"""Limits per client: message rates, token guesses, connections, subscriptions.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 
@@ -8,41 +11,47 @@ from collections.abc import Hashable
 from acsard.values import NS_PER_S
 
 MESSAGES_HZ, MESSAGES_AT_ONCE = 200.0, 400.0
-"""Of one connection. At once: what lay on the way while a network was away."""
+"""Message rate limit per connection. The burst allowance covers the messages a client sends when
+its network returns."""
 
 OVERRUNS = 600
-"""So many messages too many end a connection."""
+"""Number of messages beyond the rate limit that ends a connection."""
 
 REQUESTS_HZ, REQUESTS_AT_ONCE = 50.0, 200.0
-"""Of one token, by HTTP; a page asks now and then. Its files are for everybody."""
+"""HTTP request rate limit per token, with its burst allowance. The page's static files are
+exempt."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
-"""WebSockets of who comes from elsewhere: in all, of one address, with one token from wherever,
-and with one token from one address. So a program that opens one after the other shuts out nobody
-who comes from its address with another token."""
+"""Limits on WebSockets from other machines: in all, per address, per token, and per token and
+address.
+
+The last limit keeps a program that opens one connection after another from locking out clients at
+the same address that use another token.
+"""
 
 CONNECTIONS_HERE = 20
-"""Of who is at the machine, and of nobody else: no stranger shuts out the robot's own browser."""
+"""Limit on WebSockets from the robot itself. It is separate, so clients from the network cannot
+lock out the robot's own browser."""
 
 STREAMS, STREAMS_OF_ONE = 200, 50
-"""Keys of other robots that are followed: in all, and for one token. Those of the page's own robot
-are few, and for everybody."""
+"""Limits on subscribed keys of other robots: in all, and per token. Keys of the page's own robot
+are few and are not limited."""
 
 TRIES_OF_ONE, TRIES = 10, 100
-"""Wrong tokens a minute: of one address, and in all."""
+"""Limits on wrong tokens per minute: from one address, and in all."""
 
 MINUTE_NS = 60 * NS_PER_S
 
 
 class Bucket:
-    """So many a second, and some at once."""
+    """A token bucket: a sustained rate with a burst allowance."""
 
     def __init__(self, rate_hz: float, most: float, now_ns: int) -> None:
         self._rate, self._most = rate_hz / NS_PER_S, most
         self._left, self._at_ns = most, now_ns
 
     def take(self, now_ns: int) -> bool:
-        """One more: is there room?"""
+        """Consume one unit; return False if the bucket is empty."""
         self._left = min(self._most, self._left + (now_ns - self._at_ns) * self._rate)
         self._at_ns = now_ns
         if self._left < 1.0:
@@ -52,13 +61,13 @@ class Bucket:
 
 
 class Paces:
-    """A bucket for each token."""
+    """One request bucket per access token."""
 
     def __init__(self) -> None:
         self._buckets: dict[str, Bucket] = {}
 
     def take(self, token: str, now_ns: int) -> bool:
-        """One more request: is there room?"""
+        """Count one request; return False if the token is over its rate."""
         bucket = self._buckets.get(token)
         if bucket is None:
             bucket = self._buckets[token] = Bucket(REQUESTS_HZ, REQUESTS_AT_ONCE, now_ns)
@@ -66,27 +75,27 @@ class Paces:
 
 
 class Tries:
-    """Wrong tokens of the last minute, by address."""
+    """Wrong tokens by address, counted in windows of one minute."""
 
     def __init__(self) -> None:
         self._since_ns: int | None = None
         self._count: Counter[str] = Counter()
 
     def spent(self, address: str, now_ns: int) -> bool:
-        """This one has to wait, or all have."""
+        """Return whether this address or all together used up this minute's guesses."""
         if self._since_ns is None or now_ns - self._since_ns > MINUTE_NS:
             self._since_ns = now_ns
             self._count.clear()
         return self._count[address] >= TRIES_OF_ONE or self._count.total() >= TRIES
 
     def failed(self, address: str, now_ns: int) -> None:
-        """One more."""
+        """Count one wrong token."""
         self.spent(address, now_ns)
         self._count[address] += 1
 
 
 class Places:
-    """Room for so many, and for so many of one address (or token)."""
+    """Places for connections, limited in all and per name (an address or a token)."""
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
@@ -94,29 +103,29 @@ class Places:
 
     @property
     def taken(self) -> int:
-        """By all."""
+        """Number of taken places."""
         return self._taken.total()
 
     def room(self, address: str) -> bool:
-        """Is there a place?"""
+        """Return whether a place is free for this name."""
         return self._taken[address] < self._of_one and self.taken < self._most
 
     def enter(self, address: str) -> bool:
-        """Take a place, if there is one."""
+        """Take a place; return False if none is free."""
         if not self.room(address):
             return False
         self._taken[address] += 1
         return True
 
     def leave(self, address: str) -> None:
-        """Give it back."""
+        """Give one place back."""
         self._taken[address] -= 1
         if not self._taken[address]:
             del self._taken[address]
 
 
 class Seats:
-    """Room for the pages that are open: at the machine (without a token), and from elsewhere."""
+    """Limits on WebSocket connections. Local ones (without a token) have a limit of their own."""
 
     def __init__(self) -> None:
         self._here = Places(CONNECTIONS_HERE, CONNECTIONS_HERE)
@@ -125,14 +134,14 @@ class Seats:
         self._addresses = Places(CONNECTIONS, CONNECTIONS_OF_ONE)
 
     def missing(self, address: str, token: str) -> str:
-        """Why there is no room for one more, and what to do; "" where there is."""
+        """Return why a connection is refused and what to do, or "" if there is room."""
         for places, name, full in self._places(address, token):
             if not places.room(name):
                 return full
         return ""
 
     def enter(self, address: str, token: str) -> str:
-        """Take a place; why there is none, or ""."""
+        """Take a place; return "" or the reason for a refusal."""
         if full := self.missing(address, token):
             return full
         for places, name, _ in self._places(address, token):
@@ -140,12 +149,12 @@ class Seats:
         return ""
 
     def leave(self, address: str, token: str) -> None:
-        """Give it back."""
+        """Give the place back."""
         for places, name, _ in self._places(address, token):
             places.leave(name)
 
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
-        """Which a page takes one of each, under which name, and what is said when they are full."""
+        """Return each limit for a connection, the name it counts under, and the refusal text."""
         if not token:
             here = f"{CONNECTIONS_HERE} pages are open at the machine itself: close some"
             return [(self._here, address, here)]
@@ -166,16 +175,18 @@ class Seats:
 
 
 class Shares:
-    """Room for so many different things, and for so many that one holds; who holds the same as
-    another takes no more room in all."""
+    """Shared resources with a limit in all and a limit per holder.
+
+    A resource that several holders share counts once against the limit in all.
+    """
 
     def __init__(self, most: int, of_one: int) -> None:
         self._most, self._of_one = most, of_one
         self._held: defaultdict[Hashable, Counter[str]] = defaultdict(Counter)
-        """By thing: who holds it, and how often."""
+        """Per resource, the number of times that each holder entered it."""
 
     def enter(self, holder: str, thing: Hashable) -> bool:
-        """Hold it (once more), if there is room."""
+        """Acquire a resource, again if it is held already; return False if the limits forbid it."""
         holders = self._held.get(thing)
         if holders is None and len(self._held) >= self._most:
             return False
@@ -185,7 +196,7 @@ class Shares:
         return True
 
     def leave(self, holder: str, thing: Hashable) -> None:
-        """Let go of it once."""
+        """Release a resource once."""
         holders = self._held[thing]
         holders[holder] -= 1
         if not holders[holder]:

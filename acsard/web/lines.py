@@ -1,7 +1,7 @@
-"""What a check or a calibration says with `--json-lines`, one object a line; pure.
+"""The lines that a check or a calibration prints with `--json-lines`, one JSON object each.
 
-In this room since the robot's page hands them on and describes them for programs (openapi.py); the
-other way they are `json_lines.Line`.
+This module is pure. It is here because the page's server relays the lines and describes them for
+programs (openapi.py). The lines in the other direction are `json_lines.Line`.
 """
 
 from __future__ import annotations
@@ -14,57 +14,57 @@ from acsard.checkup.findings import Finding
 
 
 class Subject(Struct, frozen=True):
-    """First of all: what it is about."""
+    """The first line: the tested subject."""
 
     subject: str
     simulated: bool
 
 
 class Told(Struct, frozen=True):
-    """What stays."""
+    """A message that stays on the screen."""
 
     told: str
 
 
 class Doing(Struct, frozen=True):
-    """What happens now."""
+    """The current activity; the next one replaces it."""
 
     doing: str
 
 
 class Progress(Struct, frozen=True):
-    """So much of the leg or of the check is done, 0 to 1."""
+    """Completed share of the leg or of the check, 0 to 1."""
 
     progress: float
 
 
 class Question(Struct, frozen=True, omit_defaults=True, kw_only=True):
-    """What is asked: one of the answers, or a number where there are none."""
+    """A question. The reply is one of `answers`, or a number if `answers` is empty."""
 
     question: int
-    """Its answer has this number."""
+    """Number that the answer must quote."""
     words: str
     answers: Sequence[str] = ()
     unit: str = ""
     least: float | None = None
     most: float | None = None
     usual: float | None = None
-    """What no value stands for."""
+    """Default for an empty answer."""
     leg: bool = False
-    """With its answer the robot drives; a key stops it."""
+    """True if the robot drives after the answer; a key press stops it."""
     by_key: bool = False
-    """A key is how the leg is meant to end."""
+    """True if a key press is the intended end of the leg."""
     wrong: str = ""
-    """What the answer before has to be and is not."""
+    """Explanation of why the previous answer was rejected."""
 
 
 class Found(Struct, frozen=True):
-    """Of a check, as it is made."""
+    """One finding of a check, sent as soon as it is made."""
 
     finding: Finding
 
 
 class Result(Struct, frozen=True):
-    """All that was found, as at a terminal; nothing moves any more."""
+    """The complete result as printed at a terminal; nothing moves any more."""
 
     result: str

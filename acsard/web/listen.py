@@ -1,4 +1,4 @@
-"""Where the page listens: addresses as they are written, opened, and written on an invitation."""
+"""The addresses at which the page listens: parsing, binding, and the form on an invitation."""
 
 from __future__ import annotations
 
@@ -13,47 +13,47 @@ from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.web.who import is_loopback
 
 TRIES = 20
-"""Ports after a taken one that are tried."""
+"""Number of ports that are tried, starting with the requested one."""
 
 BACKLOG = 128
 
 EVERYWHERE_4, EVERYWHERE_6 = "0.0.0.0", "::"
-"""All addresses of this machine: those of IPv4, and all there are."""
+"""Wildcard addresses: all IPv4 addresses, and all addresses of this machine."""
 
 
 class Listen(Struct, frozen=True):
-    """Where to listen, and how."""
+    """One address to listen at."""
 
     secure: bool
-    """HTTPS."""
+    """True for HTTPS."""
     host: str
     port: int
 
     @property
     def everywhere(self) -> bool:
-        """At all addresses of this machine."""
+        """Whether this is a wildcard address."""
         return self.host in (EVERYWHERE_4, EVERYWHERE_6)
 
     @property
     def url(self) -> str:
-        """What to open in a browser; where it is everywhere by the name of this machine."""
+        """The URL to open in a browser, with this machine's own name for a wildcard address."""
         return self.url_at(own_name() if self.everywhere else self.host)
 
     def url_at(self, host: str) -> str:
-        """The same by another name."""
+        """Return the URL with another host name or address."""
         host = f"[{host}]" if ":" in host else host
         return f"http{'s' if self.secure else ''}://{host}:{self.port}/"
 
 
 def own_name() -> str:
-    """What others find this machine by, by mDNS."""
+    """Return the mDNS name of this machine."""
     return f"{socket.gethostname().partition('.')[0].lower()}.local"
 
 
 def listens(text: str) -> Listen:
-    """An address like http://127.0.0.1:8080; raises `UsageError`.
+    """Parse an address like http://127.0.0.1:8080. Raises `UsageError`.
 
-    Without TLS nobody but this machine is listened to.
+    Plain HTTP is allowed on loopback addresses only.
     """
     scheme, _, place = text.removesuffix("/").partition("://")
     host, _, port = place.rpartition(":")
@@ -69,10 +69,10 @@ def listens(text: str) -> Listen:
 
 
 def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
-    """The addresses to write on an invitation, the likeliest first; none without HTTPS.
+    """Return the URLs to write on an invitation, the likeliest first, or none without HTTPS.
 
-    `tls` is the directory of the robot's certificate, as `require_certificate` takes it. An IP
-    address before a name: not every phone asks by mDNS.
+    `tls` is the directory of the robot's certificate, already checked by `require_certificate`. IP
+    addresses come before names, because not every phone resolves mDNS names.
     """
     found: list[str] = []
     older_ports = _older_ports(listen)
@@ -83,7 +83,8 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
         if one.everywhere:
             certified = names_in(tls)
             own = [at for at in own_addresses() if at in certified]
-            # Not every network has IPv6, and 0.0.0.0 is not reached by it.
+            # Not every network has IPv6, so IPv4 addresses come first. A `::` socket is not
+            # reachable by IPv4 when another socket has the same port on IPv4.
             both = one.host != EVERYWHERE_6 or one.port not in older_ports
             older = [at for at in own if ":" not in at and both]
             newer = [at for at in own if ":" in at and one.host == EVERYWHERE_6]
@@ -93,12 +94,12 @@ def invitations(listen: Sequence[Listen], tls: str) -> list[str]:
 
 
 def opened_by(one: Listen, tls: str) -> list[str]:
-    """What opens it in a browser: from elsewhere what an invitation says."""
+    """Return the URLs that open this address, as on an invitation if it is HTTPS."""
     return invitations([one], tls) if one.secure else [one.url]
 
 
 def require_certificate(listen: Sequence[Listen], tls: str) -> None:
-    """Raises a `MendableError` where one may come by HTTPS and there is nothing to show him."""
+    """Raise a `MendableError` if an HTTPS address has no usable certificate."""
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
@@ -110,18 +111,24 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
 
 
 def bound(listen: Sequence[Listen], next_port: bool) -> list[tuple[Listen, socket.socket]]:
-    """A socket at each, or at one of the next ports; raises `InUseError`."""
+    """Open a socket at each address, or at a later free port if `next_port`.
+
+    Raises `InUseError`.
+    """
     older_ports = _older_ports(listen)
     return [_bound(one, next_port, one.port not in older_ports) for one in listen]
 
 
 def _older_ports(listen: Sequence[Listen]) -> set[int]:
-    """Those that somebody has by IPv4: `::` has them by IPv6 alone."""
+    """Return the ports that an IPv4 address has. A `::` socket takes those for IPv6 only."""
     return {one.port for one in listen if ":" not in one.host}
 
 
 def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.socket]:
-    """`both`: at `::` also by IPv4, which nobody else here has at this port."""
+    """Open one socket.
+
+    `both` lets `::` accept IPv4 too, when no other address here has this port.
+    """
     ports = range(one.port, min(65536, one.port + TRIES)) if next_port else [one.port]
     both = both and one.host == EVERYWHERE_6 and socket.has_dualstack_ipv6()
     trouble: OSError | None = None

@@ -1,4 +1,7 @@
-"""What the robot and its page count, as Prometheus reads it (text format 0.0.4); pure."""
+"""The counters of the robot and of the page's server, in the Prometheus text format 0.0.4.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 Kind = Literal["gauge", "counter"]
 
 Sample = tuple[Mapping[str, str], float]
-"""Labels and value."""
+"""The labels and the value of one sample."""
 
 WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 
@@ -29,7 +32,10 @@ def text(
     counts: Mapping[str, int],
     refused: Mapping[str, int],
 ) -> str:
-    """All of it; of the robot only what its last state says, while it is heard."""
+    """Return the whole exposition.
+
+    Robot metrics come from the last state, and only while `heard` is true.
+    """
     lines: list[str] = []
 
     def add(name: str, kind: Kind, what: str, samples: Iterable[Sample]) -> None:

@@ -1,7 +1,8 @@
-"""What the plots show, of the last minute, for a page that has just been opened; pure.
+"""The plotted values of the last minute, for a page that has just been opened. This module is pure.
 
-All but what is wished is in the state, which comes anyway. What is wished comes a hundred times a
-second, and only while somebody looks: for nobody it is not subscribed to.
+All values except the commanded speeds come from the state, which the server receives anyway. The
+commanded speeds arrive a hundred times a second, so the server subscribes to them only while a
+viewer does.
 """
 
 from __future__ import annotations
@@ -17,56 +18,62 @@ from acsard.values import NS_PER_S, WHEELS
 LASTS_NS = 60 * NS_PER_S
 
 STEP_NS = NS_PER_S // 5
-"""A phone's plot has a pixel for so long."""
+"""Nominal interval of the rows; a phone's plot has about one pixel for it."""
 
 EARLY_NS = STEP_NS // 4
-"""Whoever looks looks a little early or late."""
+"""Tolerance for states that arrive a little early."""
 
 ROWS = LASTS_NS // (STEP_NS - EARLY_NS)
-"""At most."""
+"""Maximum number of rows in a minute."""
 
 MEASURED = 2 + len(WHEELS)
 
 WIDTH = MEASURED + 4
-"""Of a row: what was measured, what was wished, and lateness."""
+"""Number of columns in a row: measured values, commanded twist (2), lateness (2)."""
 
 MS = 1e-3
 
 Column = Sequence[float | None]
-"""Oldest first; None where it is not known."""
+"""Values of one line, oldest first; None where the value is unknown."""
 
 
 class Plotted(Struct, frozen=True):
-    """A column for each line of the plots, as long as `age`; thinned to five rows a second."""
+    """A column for each line of the plots, thinned to about five rows a second.
+
+    All columns are as long as `age`.
+    """
 
     age: Sequence[int]
-    """ms"""
+    """Age of each row, ms."""
     linear: Column
-    """m/s, as the rest of the twists; measured, which without the board nobody does."""
+    """Measured forward speed, m/s; None without feedback from the board."""
     angular: Column
-    """rad/s"""
+    """Measured turn rate, rad/s, positive to the left."""
     wished_linear: Column
-    """After limits; known only while somebody follows `cmd_vel_out` here."""
+    """Commanded forward speed after limits, m/s; known only while a viewer follows `cmd_vel_out`
+    here."""
     wished_angular: Column
+    """Commanded turn rate after limits, rad/s; known under the same condition."""
     wheels: Sequence[Column]
-    """rad/s: front right, front left, rear left, rear right."""
+    """Measured wheel speeds in rad/s: front right, front left, rear left, rear right."""
     late_p99: Column
-    """ms, over the minute before, as the most of it."""
+    """99th percentile of the period lateness over the minute before the row, ms."""
     late_max: Column
+    """Maximum of the period lateness over the minute before the row, ms."""
 
 
 class Minute:
-    """Rows of the last minute, by a monotonic clock."""
+    """The rows of the last minute; all times are of a monotonic clock."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[int, list[float | None]]] = deque(maxlen=ROWS)
 
     def due(self, at_ns: int) -> bool:
-        """There is room for a row of then."""
+        """Return whether enough time has passed since the last row."""
         return not self._rows or at_ns - self._rows[-1][0] >= STEP_NS - EARLY_NS
 
     def add(self, at_ns: int, state: RobotState, wished: Twist | None) -> None:
-        """The robot says so; `wished` is None where nobody heard what is."""
+        """Append a row; `wished` is None if the commanded twist is not known."""
         measured: list[float | None] = [state.linear, state.angular, *state.wheels[: len(WHEELS)]]
         if len(measured) != MEASURED:
             measured = [None] * MEASURED
@@ -78,7 +85,7 @@ class Minute:
         self._rows.append((at_ns, [None if one is None else round(one, 3) for one in row]))
 
     def plotted(self, now_ns: int) -> Plotted:
-        """What is left of it now."""
+        """Return the rows that are not older than a minute, as columns."""
         rows = [row for row in self._rows if now_ns - row[0] <= LASTS_NS]
         columns = [[values[n] for _, values in rows] for n in range(WIDTH)]
         linear, angular, *wheels, wished_linear, wished_angular, late_p99, late_max = columns

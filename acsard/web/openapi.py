@@ -1,7 +1,8 @@
-"""The page's interface for programs, described as OpenAPI 3.1; pure.
+"""The page's interface for programs as an OpenAPI 3.1 document. This module is pure.
 
-From the table of topics, the schemas that `schema/<Type>` answers with, and the frames of the
-WebSocket: a key or a field that is new there is new here.
+The document is generated from the table of topics, from the schemas that `schema/<Type>` answers
+with, and from the frames of the WebSocket. A new key or field there appears in the document by
+itself.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from acsard.web.socket_schemas import FROM_ROBOT, TO_ROBOT
 Described = dict[str, Any]
 
 PLAIN = re.compile(r"[A-Za-z0-9_/-]{1,80}\Z")
-"""A key without a wildcard."""
+"""Pattern of a key without wildcards."""
 
 NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
-"""Rows that have no value to be asked for here."""
+"""Topics without a value that this interface can return."""
 
-PAYLOADS = {"set": "Settings", "set_pose": "SetPose", "clear": "Clear"}
+PAYLOADS = {"set": "Settings", "set_pose": "SetPose", "clear": "Release", "activate": "Release"}
 
 
 def asked(topic: Topic) -> bool:
-    """A row with a value that may be asked for."""
+    """Return whether the topic has a value that a program may request."""
     return topic.direction in ("out", "query") and topic.key not in NOT_ASKED
 
 
 def document(version: str) -> Described:
-    """All of it, as `GET /api` answers."""
+    """Return the document that `GET /api` answers."""
     paths: Described = {}
     for topic in TOPICS:
         if asked(topic):
@@ -58,8 +59,10 @@ def document(version: str) -> Described:
 
 
 def _keys() -> Described:
-    """The types of the keys, each with its parts beside it as `Type.Part`: a schema with parts of
-    its own within is beyond most readers of such documents."""
+    """Return the schemas of all message types, with each nested type beside them as `Type.Part`.
+
+    Most readers of OpenAPI documents cannot resolve a schema with `$defs` of its own.
+    """
     found: Described = {}
     for name, schema in SCHEMAS.items():
         whole = _flat(schema, f"{name}.")
@@ -70,7 +73,7 @@ def _keys() -> Described:
 
 
 def _flat(node: Any, before: str) -> Any:
-    """The same, its references to parts led to those beside it."""
+    """Return a schema with its `$defs` references pointed to the document's components."""
     if isinstance(node, list):
         return [_flat(one, before) for one in node]
     if not isinstance(node, dict):
@@ -125,7 +128,7 @@ def _service(verb: Any) -> Described:
     }
     if verb in PAYLOADS:
         body = {"application/json": {"schema": _ref(PAYLOADS[verb])}}
-        told["requestBody"] = {"required": verb != "clear", "content": body}
+        told["requestBody"] = {"required": PAYLOADS[verb] != "Release", "content": body}
     elif verb == "stop":
         told["requestBody"] = {"content": {"application/json": {"schema": _WHICH}}}
     return told

@@ -1,4 +1,4 @@
-"""What programs get by plain HTTP: values, services, recordings, metrics, what there is."""
+"""The HTTP interface for programs: values, services, recordings, metrics, OpenAPI document."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from acsard.web.streams import as_json
 from acsard.web.who import Who, is_loopback
 
 READ_S = 10.0
-"""For a disk."""
+"""Time limit for reading from a disk."""
 
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
-"""How far a report is, as a status."""
+"""HTTP status for each state of a report."""
 
 
 class TroubleError(AcsardError):
-    """Why not: status and words."""
+    """A request that cannot be fulfilled, with its HTTP status and an explanation."""
 
     def __init__(self, status: int, text: str) -> None:
         super().__init__(text)
@@ -41,7 +41,7 @@ class TroubleError(AcsardError):
 
 
 class Programs:
-    """Answers; who asks and whether he may come in at all is known by then."""
+    """Request handlers. The caller's identity is already verified when they run."""
 
     def __init__(self, robots: Robots, calls: Calls, counts: Counts, reports: Reports) -> None:
         self._robots, self._calls, self._counts = robots, calls, counts
@@ -49,11 +49,11 @@ class Programs:
         self._document = msgspec.json.encode(openapi.document(__version__))
 
     def described(self) -> web.Response:
-        """The interface."""
+        """Return the OpenAPI document."""
         return web.Response(body=self._document, content_type="application/json")
 
     def metrics(self, viewers: int) -> web.Response:
-        """For Prometheus."""
+        """Return the metrics for Prometheus."""
         robots, counts = self._robots, self._counts
         body = metrics.text(
             robots.id, robots.state, not robots.gone, viewers, counts.all(), counts.refused()
@@ -61,14 +61,14 @@ class Programs:
         return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
 
     async def settings(self, who: Who) -> web.Response:
-        """What may be set, with its values now."""
+        """Return the settings that can be changed at run time, with their present values."""
         told = await self.value(who, "config")
         assert isinstance(told.body, bytes)
         rows = settings.rows(msgspec.json.decode(told.body))
         return web.Response(body=msgspec.json.encode(rows), content_type="application/json")
 
     async def guide(self, who: Who, guide: Guide) -> web.Response:
-        """What may be begun: a check of the board, a calibration."""
+        """Return the checks and calibrations that a maintainer may start."""
         if not who.may("maintainer"):
             self._counts.refuse("role", who.origin)
             raise TroubleError(403, f"checks and calibrations are for maintainers, not {who.role}")
@@ -77,7 +77,7 @@ class Programs:
         return web.Response(body=body, content_type="application/json")
 
     async def value(self, who: Who, key: str) -> web.Response:
-        """The last value of a key."""
+        """Return the last value of a key as JSON. Raises `TroubleError`."""
         row = row_of(key) if openapi.PLAIN.match(key) else None
         if row is None or not openapi.asked(row):
             self._counts.refuse("path", who.origin)
@@ -95,7 +95,7 @@ class Programs:
         return web.Response(body=as_json(encoding, payload), content_type="application/json")
 
     async def call(self, who: Who, verb: str, body: bytes) -> web.Response:
-        """A service."""
+        """Call a service with a JSON object as its arguments. Raises `TroubleError`."""
         try:
             given = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -115,7 +115,7 @@ class Programs:
         return web.Response(body=body, content_type="application/json", status=status)
 
     async def listed(self) -> web.Response:
-        """The recordings."""
+        """Return the list of recordings. Raises `TroubleError`."""
         place = self._place()
         try:
             rows = await in_thread(lambda: recordings.rows(place), READ_S)
@@ -124,19 +124,19 @@ class Programs:
         return web.Response(body=msgspec.json.encode(rows), content_type="application/json")
 
     async def recording(self, who: Who, name: str) -> web.StreamResponse:
-        """One of them."""
+        """Return a recording as a file to download. Raises `TroubleError`."""
         path, _ = await self._recorded(who, name)
         told = {"Content-Disposition": f'attachment; filename="{path.name}"'}
         return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
 
     async def draw(self, who: Who, name: str) -> web.Response:
-        """How far the report of one is; who asks first begins it."""
+        """Return the progress of a recording's report, and start drawing it if needed."""
         told = self._reports.ask(*await self._recorded(who, name))
         body = msgspec.json.encode(told)
         return web.Response(body=body, content_type="application/json", status=DRAWN[told.report])
 
     async def report(self, who: Who, name: str, packed: bool) -> web.Response:
-        """The report of one, as a page that has nothing to do with ours."""
+        """Return a drawn report as an HTML page in a sandboxed origin. Raises `TroubleError`."""
         self._require_operator(who)
         body = self._reports.drawn(name)
         if body is None:
@@ -152,7 +152,7 @@ class Programs:
         return web.Response(body=await in_thread(lambda: decompress(body), None), headers=headers)
 
     async def _recorded(self, who: Who, name: str) -> tuple[Path, tuple[int, int]]:
-        """Where the recording is, and its stamp."""
+        """Return the path and the change stamp of a recording. Raises `TroubleError`."""
         self._require_operator(who)
         place = self._place()
 
@@ -175,7 +175,7 @@ class Programs:
             raise TroubleError(403, f"recordings are for operators; you are {who.role}")
 
     def _place(self) -> Path:
-        """The directory of the black box; raises `TroubleError`."""
+        """Return the directory of the black box; raises `TroubleError`."""
         host = self._robots.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         if not (is_loopback(host) or host == "localhost"):
             raise TroubleError(404, "the recordings are on the robot; this page's server is not")

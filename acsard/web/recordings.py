@@ -1,4 +1,4 @@
-"""The black box as the page lists it: what is in the directory, by name, and nothing else."""
+"""The recordings in the black box's directory, as the page lists them."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from acsard.values import NS_PER_S
 
 
 class Listed(Struct, frozen=True):
-    """One recording."""
+    """One recording in the list."""
 
     name: str
     begin: float | None
-    """Seconds since 1970."""
+    """Start time in seconds since 1970, or None if it is unknown."""
     seconds: float | None
-    """How long it is; None where it has no end yet."""
+    """Duration in seconds; None if the recording has no end marker."""
     bytes: int
     events: str
-    """What happened, in a few words."""
+    """Short summary of the recorded events."""
 
 
 def rows(directory: Path) -> list[Listed]:
-    """All of them, oldest first; raises `OSError`."""
+    """Return all recordings, oldest first; raises `OSError`."""
     return [_row(path) for path in listed(directory)]
 
 
 def named(directory: Path, name: str) -> Path | None:
-    """The file of this name, if it is one of them; raises `OSError`."""
+    """Return the recording with this name, or None if it is not listed; raises `OSError`."""
     return next((path for path in listed(directory) if path.name == name), None)
 
 
 def stamp(path: Path) -> tuple[int, int]:
-    """Another when there is more in it; raises `OSError`."""
+    """Return a value that changes when the file grows or is replaced; raises `OSError`."""
     seen = path.stat()
     return seen.st_mtime_ns, seen.st_size
 
@@ -59,7 +59,7 @@ def _row(path: Path) -> Listed:
 
 
 def _begun(path: Path) -> float | None:
-    """By its name."""
+    """Return the start time in the file name, in seconds since 1970."""
     try:
         told = time.strptime(path.name.partition("-")[2].partition(".")[0], STAMP)
     except ValueError:

@@ -1,12 +1,14 @@
-"""Reports of recordings as the page has them: drawn by a process of its own, one at a time.
+"""Draws reports of recordings for the page, one at a time, in a child process.
 
-It is what `acsard log report` draws, by a child at the lowest priority that is bounded in time, in
-memory and in what it says, and ends with us or once nobody asks for it any more. What it says is
-kept in memory, packed, until another is drawn; no file is written.
+The child runs `acsard log report` at the lowest priority. Its time, memory and output are bounded.
+The child is killed when this server ends or no client asks for the report any more. The finished
+report is kept compressed in memory until another one is drawn or nobody has asked for it for 15
+minutes; no file is written.
 
-A report is a page full of strangers' words (names, sentences). It escapes them, its own policy lets
-two programs run and nothing be loaded, and the one here takes our origin away from it: whatever ran
-in it had neither the cookie nor the interface of this page.
+A report contains text of unknown origin (names, sentences). Three measures contain it. The report
+escapes the text. Its own policy allows exactly two scripts and no loading. The policy here gives
+the report an opaque origin, so a script in it could reach neither the cookie nor the interface of
+this page.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S
 
-# -P: what is installed, and not what lies in the directory that we were started in.
+# -P runs the installed package, not files in the current directory.
 COMMAND = (sys.executable, "-P", "-m", "acsard", "log", "report", "--held")
 
 POLICY = (
@@ -37,33 +39,36 @@ POLICY = (
     "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-"""Without `allow-same-origin` it has an origin that is nobody's. Which of the programs in it may
-run, the report's own policy says by their hashes: both hold."""
+"""Security policy of a report. Without `allow-same-origin` the report has an opaque origin. The
+report's own policy names the allowed scripts by their hashes, and the browser enforces both
+policies."""
 
 NICE = 19
 
 FIRST_TO_GO = b"1000"
-"""Of `oom_score_adj`: when memory runs out, ours or the computer's, it goes before the page."""
+"""Value for `oom_score_adj`: when the computer runs out of memory, the kernel kills the child
+before the page's server."""
 
 DRAW_S = 600.0
-"""A full file of the black box, an hour or four, takes minutes on a small computer."""
+"""Time limit of a drawing: a full file of the black box, one to four hours, takes minutes on a
+small computer."""
 
 ALONE_NS = 60 * NS_PER_S
-"""Nobody has asked for so long how far it is: it is given up."""
+"""A running drawing is given up if no client has asked for its progress for this long."""
 
 KEEP_NS = 900 * NS_PER_S
-"""So long a report is there to be opened."""
+"""A finished report is dropped if no client has asked for its progress for this long."""
 
 LOOK_S = 1.0
 
 BYTES = 32 << 20
-"""Of a report; one takes 5 to 8 MB."""
+"""Maximum size of a report; a typical one has 5 to 8 MB."""
 
 MEMORY = 256 << 20
-"""Of the child."""
+"""Limit of the child's data memory, bytes."""
 
 SAID = 2000
-"""Characters of what it says when it fails."""
+"""Number of characters that are kept from the end of the child's error output."""
 
 TOO_LONG = (
     f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
@@ -82,30 +87,30 @@ State = Literal["drawing", "ready", "failed", "busy"]
 
 
 class Progress(Struct, frozen=True, omit_defaults=True):
-    """How far one is."""
+    """Progress of a report."""
 
     report: State
     text: str = ""
-    """Why it failed, or what to wait for."""
+    """Reason for a failure, or the work that this request waits for."""
     percent: int = 0
     seconds: float = 0.0
-    """Since it was begun."""
+    """Time since the drawing started."""
     href: str = ""
-    """Where it is, from the page on."""
+    """URL of the finished report, relative to the page."""
 
 
 class _Drawing:
-    """One that is being drawn, or has been."""
+    """A report that is being drawn or is finished."""
 
     def __init__(self, path: Path, stamp: tuple[int, int]) -> None:
         self.path, self.stamp = path, stamp
         self.percent = 0
         self.begun_ns = self.asked_ns = clock.mono_ns()
         self.packed = b""
-        """By gzip, once it is there."""
+        """The finished report, compressed by gzip; empty until then."""
         self.failed = ""
         self.told = False
-        """That it has ended."""
+        """True once a client has been informed that the drawing ended."""
 
     @property
     def ended(self) -> bool:
@@ -113,7 +118,7 @@ class _Drawing:
 
 
 class Reports:
-    """The newest."""
+    """The newest report."""
 
     def __init__(self, command: Sequence[str] = COMMAND) -> None:
         self._command = command
@@ -121,8 +126,11 @@ class Reports:
         self._work: asyncio.Task[None] | None = None
 
     def ask(self, path: Path, stamp: tuple[int, int]) -> Progress:
-        """How far the report of this recording is, which is begun where there is none; `stamp`
-        changes with it."""
+        """Return the progress of the report of this recording, and start drawing it if needed.
+
+        `stamp` must change when the recording changes. A failed or outdated report is drawn again
+        only after a client has seen its result.
+        """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
             return Progress("busy", f"another report is being drawn: {one.path.name}")
@@ -138,12 +146,15 @@ class Reports:
         return Progress("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """The report of the recording of this name, by gzip; None where it is not there."""
+        """Return the finished report of this recording, compressed by gzip, or None."""
         one = self._one
         return one.packed or None if one is not None and one.path.name == name else None
 
     def tidy(self) -> None:
-        """To be called now and then: what nobody waits for is given up, what is old forgotten."""
+        """Give up a drawing that no client waits for, and drop an old report.
+
+        The server calls this regularly.
+        """
         one = self._one
         if one is None:
             return
@@ -152,7 +163,7 @@ class Reports:
             self.end()
 
     def end(self) -> None:
-        """No more of it."""
+        """Cancel the drawing and drop the report."""
         if self._work is not None:
             self._work.cancel()
         self._one = self._work = None
@@ -168,7 +179,7 @@ class Reports:
             one.failed = str(error)
 
     async def _drawn(self, one: _Drawing) -> bytes:
-        """Raises `_FailedError` with what the child says."""
+        """Run the child and return the report. Raises `_FailedError` with the child's message."""
         child = await asyncio.create_subprocess_exec(
             *self._command, str(one.path), stdin=DEVNULL, stdout=PIPE, stderr=PIPE,
             start_new_session=True,
@@ -189,11 +200,11 @@ class Reports:
 
 
 class _FailedError(Exception):
-    """Why it was not drawn, in words."""
+    """The reason, in words, why a report was not drawn."""
 
 
 def _why(said: str) -> str:
-    """What the child has said, as a sentence."""
+    """Return the child's error output, or its last line if it is a traceback."""
     last = said.rpartition("\n")[2]
     if last.startswith("MemoryError"):
         return TOO_MUCH
@@ -201,14 +212,14 @@ def _why(said: str) -> str:
 
 
 def _hold_down(child: Process) -> None:
-    """It takes what nobody else wants, and no more than so much of it."""
+    """Give the child the lowest CPU priority and limit its memory."""
     try:
         with suppress(OSError):
             Path(f"/proc/{child.pid}/oom_score_adj").write_bytes(FIRST_TO_GO)
         os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
         resource.prlimit(child.pid, resource.RLIMIT_DATA, (MEMORY, MEMORY))
     except ProcessLookupError:
-        pass  # it has ended already, and says why
+        pass  # it has ended already, and its output says why
 
 
 async def _body(child: Process) -> bytes:
@@ -222,7 +233,10 @@ async def _body(child: Process) -> bytes:
 
 
 async def _listened(child: Process, one: _Drawing) -> str:
-    """A number of percent a line; anything else is why it fails."""
+    """Read the child's error output.
+
+    Lines of digits are percents, other lines explain a failure.
+    """
     assert child.stderr is not None
     said = ""
     while part := await child.stderr.read(1 << 12):

@@ -1,4 +1,4 @@
-"""What a request shows of who sends it, and the headers that keep other pages out of ours."""
+"""Reads a request's address, host and token, and sets the security headers of every answer."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from acsard.web.files import File
 from acsard.web.who import Asked, Reason, tokens_in, unmapped
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
-"""What a browser writes into `Host`; it is written back into a header."""
+"""Pattern of a valid `Host` header. It is strict because the value is copied into a response
+header."""
 
 PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
-"""How the headers begin by which a proxy says that it hands on what another asked."""
+"""Prefixes of the headers that a proxy adds when it forwards a request."""
 
 NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
 
@@ -29,7 +30,7 @@ STATUS: dict[Reason, int] = {
     "path": 404,
     "malformed": 400,
 }
-"""403 for all others."""
+"""HTTP status for each refusal reason; every other reason gives 403."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -39,17 +40,18 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Server": "acsard",
 }
-"""What every answer has."""
+"""Headers of every answer."""
 
 BODY_S = 5.0
-"""For a body of a few hundred bytes; who keeps it keeps a place that others wait for."""
+"""Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
+connection."""
 
 SEND_BUFFER = 65536
-"""Of the kernel, for one client: what lies in it is old when it arrives."""
+"""Size of the kernel's send buffer for one client. A larger buffer would deliver stale data."""
 
 
 def asked_of(request: web.Request) -> Asked:
-    """What is known of it before anything in it is believed."""
+    """Return the facts of a request that decide about its admission, none of them trusted yet."""
     hosts = request.headers.getall("Host", [])
     return Asked(
         peer_of(request),
@@ -62,22 +64,25 @@ def asked_of(request: web.Request) -> Asked:
 
 
 def peer_of(request: web.Request) -> str:
-    """The address it comes from."""
+    """Return the address of the client."""
     return unmapped(request.remote or "")
 
 
 def problem(status: int, text: str) -> web.Response:
-    """What was wrong, in words."""
+    """Return an error response with an explanation."""
     return web.json_response({"error": text}, status=status)
 
 
 def own_address(request: web.Request) -> str:
-    """The address of ours that the client has reached: no name that somebody points here."""
+    """Return the local address that the client connected to.
+
+    Unlike a host name, it cannot be forged.
+    """
     return unmapped(_reached(request)[0].lower())
 
 
 def own_port(request: web.Request) -> int:
-    """The port of ours that it has reached."""
+    """Return the local port that the client connected to."""
     return _reached(request)[1]
 
 
@@ -87,8 +92,7 @@ def _reached(request: web.Request) -> tuple[str, int]:
 
 
 def tokens_shown(request: web.Request, robot: str) -> list[str]:
-    """The token in the header of a program, or those in the cookies of a browser that may be for
-    the page of this robot, the likeliest first."""
+    """Return a program's bearer token, or a browser's cookie tokens, the likeliest first."""
     kind, _, text = request.headers.get("Authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return [text.strip()]
@@ -96,7 +100,7 @@ def tokens_shown(request: web.Request, robot: str) -> list[str]:
 
 
 async def body_of(request: web.Request) -> bytes:
-    """All of it; raises `HTTPRequestTimeout` for who announces one and keeps it."""
+    """Return the whole body; raise `HTTPRequestTimeout` if it does not arrive within `BODY_S`."""
     try:
         async with asyncio.timeout(BODY_S):
             return await request.read()
@@ -105,7 +109,7 @@ async def body_of(request: web.Request) -> bytes:
 
 
 async def token_posted(request: web.Request) -> str:
-    """The token in a form or in JSON, "" where there is none; raises `HTTPBadRequest`."""
+    """Return the token in a form or in JSON, or "" if it is missing; raises `HTTPBadRequest`."""
     body = await body_of(request)
     try:
         text = body.decode(request.charset or "utf-8")
@@ -119,7 +123,7 @@ async def token_posted(request: web.Request) -> str:
 
 
 def sent(request: web.Request, file: File) -> web.Response:
-    """A file of the page's, unless the browser has it; packed where it takes that."""
+    """Return a page file, or 304 if the browser has it. Compress it if the client supports gzip."""
     headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
     if request.headers.get("If-None-Match") == file.tag:
         return web.Response(status=304, headers=headers)
@@ -130,27 +134,27 @@ def sent(request: web.Request, file: File) -> web.Response:
 
 
 def takes_gzip(request: web.Request) -> bool:
-    """The client unpacks it by itself."""
+    """Return whether the client accepts gzip."""
     return "gzip" in request.headers.get("Accept-Encoding", "")
 
 
 def keep_little(request: web.Request) -> None:
-    """Let the kernel hold little for a client that does not read."""
+    """Limit the kernel's send buffer of this connection."""
     at = None if request.transport is None else request.transport.get_extra_info("socket")
     if at is not None:
         at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
 
 async def secured(request: web.Request, response: web.StreamResponse) -> None:
-    """The headers that every answer has."""
+    """Add the security headers to an answer."""
     host = request.headers.get("Host", "")
-    # A browser of before 2022 does not take 'self' for ws too; a Host that is none of ours is
-    # refused, and not written back.
+    # Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out. A refused
+    # request may have a foreign Host, which must not be echoed.
     connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
     policy = (
         f"default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; "
         "base-uri 'none'; form-action 'self'"
     )
     response.headers.update(HEADERS)
-    response.headers.setdefault("Content-Security-Policy", policy)  # a report has its own
+    response.headers.setdefault("Content-Security-Policy", policy)  # a report sets its own
     response.headers.setdefault("Cache-Control", "no-store")

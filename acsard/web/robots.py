@@ -1,4 +1,4 @@
-"""The robot of this page: the way to it, what is known of it, and when it is not heard."""
+"""The robot of this page: the connection to its daemon, its last state, and its reachability."""
 
 from __future__ import annotations
 
@@ -24,53 +24,59 @@ from acsard.web.streams import UNREADY, Stream, Streams
 from acsard.web.trail import Trail
 
 LOOK_S = 0.1
-"""How often the newest state is looked at."""
+"""Interval at which the newest state is checked."""
 
 AGAIN_S = 1.0
-"""Until the next try to reach a daemon that is not there."""
+"""Delay before the next attempt to reach a daemon that does not answer."""
 
 ASK_S, ASK_SOON_S = 10.0, 1.0
-"""How often it is asked who it is: once it has answered, and until then."""
+"""Interval of queries for the daemon's version and limits: after an answer, and until the first
+answer."""
 
 MISSING = 3
-"""So many states that did not come are a silence; at least `SILENT_S`."""
+"""Number of consecutive missing states after which the daemon counts as silent, after `SILENT_S` at
+the earliest."""
 
 SILENT_S = 1.5
 
 WISHED_NS = 2 * NS_PER_S
-"""What was wished longer ago says nothing of now."""
+"""Maximum age of a commanded twist in the plots."""
 
 Connect = Callable[[], Client]
-"""Opens the way to the daemon, or raises `UnreachableError`; blocks."""
+"""Opens the connection to the daemon or raises `UnreachableError`; it blocks."""
 
 
 class About(Struct, frozen=True):
-    """What the daemon says of itself."""
+    """Facts that the daemon reports about itself."""
 
     version: str
     simulated: bool
     linear: float
-    """m/s, the highest."""
+    """Highest forward speed, m/s."""
     angular: float
-    """rad/s, the highest."""
+    """Highest turn rate, rad/s."""
     state_hz: float
     recordings: str
-    """The directory of the black box, "" without one."""
+    """Directory of the black box, "" if nothing is recorded."""
 
 
 class Robots:
-    """Reaches the daemon, and keeps what a new page has to know at once."""
+    """Keeps the connection to the daemon, and the data that a newly opened page needs at once."""
 
     def __init__(self, address: Address, connect: Connect, about: About, counts: Counts) -> None:
-        """`about` is what the configuration here says, until the daemon answers."""
+        """Prepare the connection.
+
+        `about` comes from the local configuration until the daemon answers.
+        """
         self.id, self.endpoint = address.robot_id, address.endpoint
         self.certificate = shown_at(address.endpoint, address.tls)
-        """The common name under which the viewers' commands go, "" without a certificate."""
+        """Common name of this server's certificate, under which the viewers' commands are sent; ""
+        without TLS."""
         self.about = about
         self.client: Client | None = None
         self.streams = Streams()
         self.gone = f"no daemon answers at {address.endpoint} yet"
-        """Why nothing is heard of the robot, in words; "" while it is."""
+        """Reason why the robot is not reachable, in words; "" while it is."""
         self._connect, self._counts = connect, counts
         self._trails = {"path": Trail(), "truth": Trail()}
         self._minute = Minute()
@@ -80,7 +86,7 @@ class Robots:
         self.state: RobotState | None = None
 
     async def run(self) -> None:
-        """Until cancelled. Raises a `MendableError` that waiting does not mend."""
+        """Follow the robot until cancelled. Raises a `MendableError` that a retry cannot fix."""
         self.client = await self._reached()
         asking = asyncio.create_task(self._ask_again_and_again())
         try:
@@ -89,15 +95,15 @@ class Robots:
             asking.cancel()
 
     def ask_anew(self) -> None:
-        """What the daemon says of itself has changed."""
+        """Query the daemon's facts again because they may have changed."""
         self._asks.set()
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
-        """Where it was in the last minutes, and truly was if that is known."""
+        """Return the robot's recent path in m, odom, and the true path of a simulator."""
         return {name: trail.points() for name, trail in self._trails.items()}
 
     def minute(self) -> Plotted:
-        """What the plots show, of the last minute."""
+        """Return the plotted values of the last minute."""
         return self._minute.plotted(clock.mono_ns())
 
     async def _reached(self) -> Client:
@@ -145,13 +151,13 @@ class Robots:
             self._counts.add("unreadable")
             return
         if before is not None and state.counters.get("lines", 0) < before.counters.get("lines", 0):
-            self._trails = {name: Trail() for name in self._trails}  # another daemon
+            self._trails = {name: Trail() for name in self._trails}  # the daemon was restarted
         self._trails["path"].add(now_ns, state.x, state.y)
         if self._minute.due(states.at_ns):
             self._minute.add(states.at_ns, state, self._wished(now_ns))
 
     def _wished(self, now_ns: int) -> Twist | None:
-        """What the robot is to do now, where somebody follows that here."""
+        """Return the commanded twist if it is recent and a viewer of this server follows it."""
         stream = self.streams.followed(self.id, "cmd_vel_out")
         raw = None if stream is None else stream.raw()
         if stream is None or raw is None or now_ns - stream.at_ns > WISHED_NS:
@@ -182,7 +188,7 @@ class Robots:
                 pass
 
     async def _ask(self) -> bool:
-        """Take what it says of itself, if it does."""
+        """Query the daemon's facts; return whether it answered."""
         client = self.client
         assert client is not None
         try:

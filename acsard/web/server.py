@@ -1,4 +1,4 @@
-"""The page's server from start to end: addresses, the way to the daemon, and the way out."""
+"""The page's server from start to shutdown: addresses, connection, background tasks."""
 
 from __future__ import annotations
 
@@ -41,41 +41,44 @@ from acsard.web.who import is_loopback
 BEAT_S, TIDY_S, TELL_S = 0.5, 1.0, 1.0
 
 NICE = 5
-"""Behind the daemon that has started us."""
+"""Niceness when the daemon starts this server: the daemon must come first."""
 
 HANDSHAKE_S = 10.0
 
 IDLE_S = 20.0
-"""A connection between two requests."""
+"""Time limit for an idle HTTP connection between two requests."""
 
 LEAVE_S = 0.3
-"""For the zeros of who drove."""
+"""Time limit at shutdown for the zero commands of viewers that were driving."""
 
 SWITCH_INTERVAL_S = 0.0005
-"""How long one thread may keep the interpreter from another: a command or a stop waits for it."""
+"""Longest time that one thread may hold the interpreter while a command or a stop waits for it."""
 
 
 class Wanted(Struct, frozen=True):
-    """What is served, where and how."""
+    """Configuration of the server."""
 
     config: Config
     address: Address
     listen: tuple[Listen, ...]
     tls: str
-    """The directory of the robot's certificate, for who comes from elsewhere."""
+    """Directory of the robot's certificate, for HTTPS; "" without one."""
     state: Path
-    """The directory of the tokens."""
+    """Directory of the access tokens."""
     file: str = ""
-    """The configuration file that was named; "" is none."""
+    """Configuration file named on the command line, or ""."""
     next_port: bool = False
-    """Take a later port where one is taken."""
+    """Whether to use a later port if the requested one is taken."""
     held: bool = False
-    """End with standard input."""
+    """Whether the server must end when its standard input closes."""
     page: Path = PAGE
 
 
 async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], log: Log) -> None:
-    """Until a signal; `announce` is told once where it listens. Raises `MendableError`s."""
+    """Serve until a signal arrives; `announce` is called once with the bound addresses.
+
+    Raises `MendableError`s.
+    """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     leaving = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
@@ -120,7 +123,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
 async def _until(
     leaving: asyncio.Event, robots: Robots, hand: Hand, page: Page, wanted: Wanted
 ) -> None:
-    """Work until told to leave, or until something ends that must not."""
+    """Work until asked to leave, or until a task ends that must not end."""
     work: list[asyncio.Future[Any]] = [
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(robots.run()),
@@ -132,7 +135,7 @@ async def _until(
     try:
         done, _ = await asyncio.wait(work, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
-            task.result()  # raises what ended it
+            task.result()  # raises the error that ended it
     finally:
         for task in work:
             task.cancel()
@@ -145,7 +148,7 @@ async def _tidy(page: Page) -> None:
 
 
 async def _tell(counts: Counts, log: Log) -> None:
-    """What is refused, a line a second at most."""
+    """Log the refusals, at most one line a second."""
     while True:
         await asyncio.sleep(TELL_S)
         if (news := counts.news()) is not None:
@@ -153,7 +156,7 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Say on standard input, a socket, that we are alive; leave when it ends."""
+    """Send signs of life to the parent on standard input (a socket), and leave when it closes."""
     holder = sys.stdin.fileno()
     os.set_blocking(holder, False)
 
@@ -172,7 +175,7 @@ async def _held(leaving: asyncio.Event) -> None:
             try:
                 os.write(holder, b".")
             except BlockingIOError:
-                pass  # who holds us does not listen now
+                pass  # the parent is not reading now
             except OSError:
                 leaving.set()
             await asyncio.sleep(BEAT_S)
@@ -181,7 +184,7 @@ async def _held(leaving: asyncio.Event) -> None:
 
 
 def _connected(address: Address) -> Client:
-    """The way to the daemon; blocks."""
+    """Return a client that is connected to the daemon; blocks."""
     session = client_session(address.endpoint, address.tls)
     return Client(session, address.robot_id, SOURCE, address.tls, address.endpoint)
 
@@ -204,7 +207,10 @@ def _about(wanted: Wanted) -> About:
 
 
 def _certified(wanted: Wanted) -> tuple[ssl.SSLContext | None, frozenset[str]]:
-    """What to show from elsewhere, and the names there; raises a `MendableError`."""
+    """Return the TLS context and the names of this machine; raises a `MendableError`.
+
+    Without an HTTPS address both are empty. Loopback names are left out of the names.
+    """
     if not any(one.secure for one in wanted.listen):
         return None, frozenset()
     require_certificate(wanted.listen, wanted.tls)

@@ -1,4 +1,4 @@
-"""The settings that can be changed while the robot runs, as rows of a form; pure."""
+"""The settings that can be changed at run time, as rows of a form. This module is pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acsard.ros.descriptors import kind_of
 
 
 class Row(Struct, frozen=True, omit_defaults=True):
-    """One of them."""
+    """One setting, with its value, its explanation and its allowed values."""
 
     key: str
     value: Any
@@ -24,7 +24,7 @@ class Row(Struct, frozen=True, omit_defaults=True):
 
 
 def rows(config: Mapping[str, Any]) -> list[Row]:
-    """Those of a configuration as `config` answers it, in its order."""
+    """Return the changeable settings in the order of `config`, a value of the key `config`."""
     return [_row(key, value) for key, value in flat(config) if live(key) is not None]
 
 

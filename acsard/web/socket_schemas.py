@@ -1,6 +1,6 @@
-"""The messages of `/ws`, both ways, as JSON Schemas for the OpenAPI document; pure.
+"""The messages of `/ws` in both directions as JSON Schemas for the OpenAPI document.
 
-What a key's message holds is the schema of its type, which stands beside them and is referred to.
+This module is pure. The value of a subscribed key refers to the schema of its message type.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from acsard.web.frames import KINDS
 Described = dict[str, Any]
 
 TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
-"""Any message that the WebSocket takes, and any that it sends."""
+"""Names of the schemas of all messages that the WebSocket accepts, and of all that it sends."""
 
 VALUE = "Value."
-"""Before the name of a key: its message as it is sent."""
+"""Prefix of the schema name of a key's message."""
 
 GUIDED = "Guided"
 
@@ -33,14 +33,14 @@ LINES = (
     told.Running, told.Ended, lines.Subject, lines.Told, lines.Doing, lines.Progress,
     lines.Question, lines.Found, lines.Result,
 )  # fmt: skip
-"""What stands in `guide`."""
+"""Types of the content of `guide`."""
 
 KEYS = {topic.key: topic.type for topic in PUBLISHED} | {IMU: "Imu"}
-"""What may be subscribed to, and its type."""
+"""Type of each key that can be subscribed to."""
 
 
 def schemas() -> Described:
-    """By name."""
+    """Return the schemas by name."""
     taken, to_robot = _components(KINDS.values())
     sent, from_robot = _components(SENT)
     said, guided = _components(LINES)
@@ -59,18 +59,18 @@ def schemas() -> Described:
 
 
 def _components(kinds: Iterable[type]) -> tuple[Described, list[Described]]:
-    """The schemas of these and their parts; references to these."""
+    """Return the schemas of `kinds` and their nested types, and references to `kinds`."""
     refs, parts = msgspec.json.schema_components(
         kinds,
         ref_template=_ref("{name}")["$ref"],
         schema_hook=lambda _: {"description": "anything"},
     )
-    plain: Described = msgspec.json.decode(msgspec.json.encode(parts))  # lists, where it has tuples
+    plain: Described = msgspec.json.decode(msgspec.json.encode(parts))  # tuples become lists
     return plain, list(refs)
 
 
 def _value(key: str, kind: str) -> Described:
-    """As `to_browser.Following` puts it together."""
+    """Return the schema of the message that `to_browser.Following` builds for a key."""
     return {
         "title": f"{VALUE}{key}",
         "description": "The newest message of this key; null for what cannot be read.",

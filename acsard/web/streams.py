@@ -1,7 +1,8 @@
-"""The newest message of a key, as JSON, for as many viewers as there are.
+"""The newest message of a key, as JSON, shared by all viewers.
 
-Zenoh's thread only puts it down; it is made JSON when the first viewer is due, once for all. What
-is subscribed to is the key as it is (msgpack): it costs the daemon one reader more, and no JSON.
+Zenoh's thread only stores the message. The first viewer whose message is due converts it to JSON,
+once for all viewers. The subscription is to the native key (msgpack), so it costs the daemon one
+more reader and no JSON encoding.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 Take = Callable[[zenoh.Sample], None]
 
 KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
-"""What may be followed."""
+"""Keys that a viewer may follow."""
 
 DECLARE_S = 3.0
 
 STATE = "state"
-"""Comes by itself, all the time. Asked for another robot's, a router's storage has the last one of
-a robot that is off for a week."""
+"""The state is published all the time, so the last one is not queried. For another robot, a
+router's storage would answer with the last state of a robot that has been off for a week."""
 
 UNREADY = (TimeoutError, zenoh.ZError, UsageError)
-"""A bus that is stuck, or a session that has ended: later there may be a way again."""
+"""Errors of a stuck bus or a closed session; a later attempt may succeed."""
 
 
 class Stream:
-    """One key of one robot: nothing else may be handed to it."""
+    """One key of one robot."""
 
     def __init__(self) -> None:
         self._taking = threading.Lock()
@@ -51,48 +52,52 @@ class Stream:
 
     @property
     def number(self) -> int:
-        """Of the newest; 0 before the first."""
+        """Number of the newest message, counted from 1; 0 before the first."""
         return self._newest[0]
 
     @property
     def at_ns(self) -> int:
-        """When the newest came, by the monotonic clock."""
+        """Arrival time of the newest message, monotonic clock."""
         return self._newest[2]
 
     def take(self, sample: zenoh.Sample) -> None:
-        """One has come."""
+        """Store a published message."""
         with self._taking:
             self._newest = (self._newest[0] + 1, sample, clock.mono_ns())
 
     def answered(self, sample: zenoh.Sample) -> None:
-        """What was asked for: only what was published since then is newer."""
+        """Store the answer to a query, unless a published (newer) message has arrived."""
         with self._taking:
             if not self._newest[0]:
                 self._newest = (1, sample, clock.mono_ns())
 
     def value(self) -> tuple[int, bytes, float]:
-        """Number, JSON and age in ms of the newest."""
+        """Return the number, the JSON text and the age in ms of the newest message."""
         number, sample, at_ns = self._newest
         if sample is not None and self._text[0] != number:
             self._text = number, as_json(*encoded(sample))
         return number, self._text[1], (clock.mono_ns() - at_ns) / 1e6
 
     def raw(self) -> tuple[str, bytes] | None:
-        """Encoding and payload of the newest."""
+        """Return the encoding and the payload of the newest message, or None before the first."""
         sample = self._newest[1]
         return None if sample is None else encoded(sample)
 
 
 class Streams:
-    """Those that somebody follows; the last to go ends one."""
+    """The streams with at least one user; a stream ends with its last user."""
 
     def __init__(self) -> None:
         self._streams: dict[tuple[str, str], Stream] = {}
         self.shares = Shares(STREAMS, STREAMS_OF_ONE)
-        """Who follows what of other robots; to be entered before and left after."""
+        """Holders of streams of other robots; the caller enters before `follow` and leaves after
+        `leave`."""
 
     async def follow(self, client: Client, robot: str, key: str) -> Stream:
-        """The stream of this key; `TimeoutError` from a locked bus."""
+        """Return the subscribed stream of a key.
+
+        Raises an error of `UNREADY` if the bus is not ready.
+        """
         name = robot, key
         stream = self._streams.get(name)
         if stream is None:
@@ -108,11 +113,11 @@ class Streams:
         return stream
 
     def followed(self, robot: str, key: str) -> Stream | None:
-        """The stream that somebody follows, if anybody does."""
+        """Return the stream if it has a user, otherwise None."""
         return self._streams.get((robot, key))
 
     async def leave(self, robot: str, key: str) -> None:
-        """One follows it no more."""
+        """Release a stream; the last user's release ends the subscription."""
         stream = self._streams.get((robot, key))
         if stream is None:
             return
@@ -124,7 +129,7 @@ class Streams:
             try:
                 await in_thread(stream.declared.undeclare, DECLARE_S)
             except (TimeoutError, zenoh.ZError):
-                pass  # the bus is stuck, or gone: what comes goes nowhere
+                pass  # the bus is stuck or closed; samples go nowhere
 
     async def _declare(self, own: Client, robot: str, key: str, stream: Stream) -> Any:
         client = own.like(robot)
@@ -141,7 +146,8 @@ class Streams:
             if not asks:
                 return heard
             try:
-                client.ask(key, of_it(stream.answered))  # what is published seldom is there at once
+                # A key that is published seldom has a value at once.
+                client.ask(key, of_it(stream.answered))
             except zenoh.ZError:
                 heard.undeclare()
                 raise
@@ -151,7 +157,7 @@ class Streams:
 
 
 def as_json(encoding: str, payload: bytes) -> bytes:
-    """A message as JSON; null for what cannot be read."""
+    """Return a message as JSON, or null if it is not readable."""
     try:
         known = detect(encoding, payload) == "json"
         told = msgspec.json.decode(payload) if known else msgspec.msgpack.decode(payload)

@@ -1,6 +1,7 @@
-"""What goes out on one WebSocket: the newest of each key when it is due, and answers at once.
+"""Sends messages on one WebSocket: the newest value of each key when it is due, and answers at
+once.
 
-While the client has not read what went before, the newest is left out; it never waits in a queue.
+While the client has not read earlier data, values are skipped; they are never queued.
 """
 
 from __future__ import annotations
@@ -22,23 +23,26 @@ from acsard.web.told import Refused
 from acsard.web.who import Reason
 
 UNREAD_BYTES = 32768
-"""More than this not yet read by the client: it gets nothing new until it has."""
+"""Limit on unread bytes; above it the client receives no new values until it has read some."""
 
 UNREAD_FRAMES = 200
-"""Answers that wait to go out; the oldest are dropped beyond."""
+"""Maximum number of waiting answers; beyond it the oldest are dropped."""
 
 CLOSES_S = 1.0
-"""For the client's answer to a close; then the connection is cut."""
+"""Time limit for the client's answer to a close; the connection is cut after that."""
 
 TELL_NS = NS_PER_S
-"""A refusal of one reason is told so often at most; all are counted."""
+"""Minimum interval between two reported refusals with the same reason. All refusals are counted."""
 
 
 class Following:
-    """A key that is sent, and when it is due."""
+    """A subscribed key with its period and next due time."""
 
     def __init__(self, robot: str, name: str, own: str, period: float) -> None:
-        """`own` is the id of the robot whose page it is: of that one the id goes without saying."""
+        """Prepare the constant part of the key's messages.
+
+        `own` is the id of the page's own robot; messages of that robot carry no id.
+        """
         self.robot, self.name, self.period = robot, name, period
         told = {"key": name} if robot == own else {"key": name, "robot": robot}
         self.head = msgspec.json.encode(told)[:-1] + b',"value":'
@@ -48,32 +52,32 @@ class Following:
 
 
 class Outgoing:
-    """To one client."""
+    """The outgoing side of one WebSocket."""
 
     def __init__(
         self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
     ) -> None:
-        """`origin` is who it is, for the log."""
+        """Store the connection; `origin` identifies the client in the log."""
         self._socket, self._transport, self._counts = socket, request.transport, counts
         self._origin = origin
         self.following: dict[tuple[str, str], Following] = {}
-        """By robot and key."""
+        """Subscribed keys by (robot, key)."""
         self._out: deque[bytes] = deque(maxlen=UNREAD_FRAMES)
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
         self._closing = False
 
     def say(self, message: object) -> None:
-        """As soon as the client reads."""
+        """Queue a message; it is sent as soon as the client reads."""
         self._out.append(msgspec.json.encode(message))
         self._news.set()
 
     def wake(self) -> None:
-        """There is something new to send, or to follow."""
+        """Wake `pump`, because there is a new message or subscription."""
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Counted, and told once a second for each reason."""
+        """Count a refusal, and report it to the client at most once a second for each reason."""
         self._counts.refuse(reason, self._origin)
         now_ns = clock.mono_ns()
         if now_ns - self._told.get(reason, -TELL_NS) >= TELL_NS:
@@ -81,7 +85,10 @@ class Outgoing:
             self.say(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:
-        """Until cancelled, or the connection closes; `look_around` says when it is due again."""
+        """Send until cancelled or until the connection closes.
+
+        `look_around(now)` is called in each round and returns the time of its next call.
+        """
         loop = asyncio.get_running_loop()
         try:
             while True:
@@ -96,13 +103,13 @@ class Outgoing:
                 finally:
                     timer.cancel()
         except ConnectionError:
-            pass  # it is closing, which `run` sees
+            pass  # closing; `Viewer.run` notices
 
     async def close(self, why: str) -> None:
         """Tell the client to end the connection; `why` is at most 120 characters.
 
-        Cut at once, it could not answer, and many programs would take that for a network that is
-        gone, whatever was said before.
+        The client gets `CLOSES_S` to answer. If the connection were cut at once, many programs
+        would report a lost network instead of the reason.
         """
         if self._closing:
             return
@@ -114,7 +121,7 @@ class Outgoing:
             await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
 
     async def _send(self, text: bytes) -> None:
-        if not self._closing:  # nothing comes after a close
+        if not self._closing:  # no data may follow a close frame
             await self._socket.send_frame(text, aiohttp.WSMsgType.TEXT)
 
     async def _send_what_waits(self) -> None:
@@ -122,13 +129,16 @@ class Outgoing:
             await self._send(self._out.popleft())
 
     async def _send_due(self, one: Following, now: float) -> float:
-        """Send it if it is time and there is news; when it is due next, by the loop's clock."""
+        """Send the value if it is due and new.
+
+        Return its next due time by the event loop's clock.
+        """
         stream = one.stream
         if stream is None:
-            return now + one.period  # `_join` says when it is there
+            return now + one.period  # `Keys._join` wakes the task when the stream exists
         if one.due > now:
             return one.due
-        # On a grid that all share: they wake up together.
+        # All keys share one time grid, so they wake the task together.
         one.due = (now // one.period + 1) * one.period
         if stream.number != one.sent:
             if self._unread() > UNREAD_BYTES:

@@ -1,6 +1,6 @@
-"""Tokens for who comes from elsewhere: made once, kept as hashes, until they end or are revoked.
+"""Access tokens for clients on other machines, stored as hashes until they expire or are revoked.
 
-A token is 32 bytes of chance, so a plain hash of it cannot be turned round.
+A token is 32 random bytes, so a plain SHA-256 hash of it cannot be reversed.
 """
 
 from __future__ import annotations
@@ -26,40 +26,44 @@ from acsard.web.who import Who
 FILE, MODE = "tokens.json", 0o600
 
 SERVICE = Path("/var/lib/acsard-web")
-"""The state directory of the service."""
+"""State directory of the systemd service."""
 
 HOUR_S, DAY_S = 3600, 86400
 
 MOST = 200
-"""Of one robot."""
+"""Maximum number of tokens of one robot."""
 
 
 class Token(Struct, frozen=True):
-    """What is kept of one."""
+    """The stored record of a token."""
 
     name: str
     role: Role
     digest: str
     made: int
-    """Seconds since 1970."""
+    """Creation time, seconds since 1970."""
     ends: int
-    """The same."""
+    """Expiry time, seconds since 1970."""
     robot: str = ""
-    """The id of the robot whose page it opens; "" is any: it was made before tokens had one."""
+    """Id of the robot whose page the token opens; "" opens any robot (tokens from before this field
+    existed)."""
 
 
 class Vault:
-    """The tokens in a file that only its owner may read; read again when it has changed. Robots of
-    one user share the file, and each sees its own tokens alone."""
+    """The tokens in a file that only its owner may read. The file is read again when it changes.
+
+    All robots of one user share the file, and each vault sees the tokens of its own robot only.
+    """
 
     def __init__(self, directory: Path, robot: str = "") -> None:
-        """`robot` is its id."""
+        """Use the token file in `directory` for the robot with this id."""
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
-        """Its stamp and its tokens: one value, since several threads look."""
+        """Change stamp of the file and its tokens, in one value because several threads replace
+        it."""
 
     def who(self, text: str) -> Who | None:
-        """Whose this token is, while it counts."""
+        """Return the owner of a token, or None if the token is unknown or has expired."""
         if not text or len(text) > 200:
             return None
         digest, found = _digest(text), None
@@ -71,19 +75,19 @@ class Vault:
         return Who(found.role, found.name, found.digest)
 
     def left_s(self, digest: str) -> int:
-        """Seconds until it ends."""
+        """Return the seconds until a token expires, 0 if it is unknown."""
         ends = [one.ends for one in self.all() if one.digest == digest]
         return max(0, int(max(ends, default=0) - time.time()))
 
     def all(self) -> list[Token]:
-        """Those of this robot, also what has ended; none where they cannot be read."""
+        """Return this robot's tokens, including expired ones; none if the file cannot be read."""
         return [one for one in self._shared() if self._ours(one)]
 
     def _ours(self, token: Token) -> bool:
         return token.robot in ("", self.robot)
 
     def _shared(self) -> list[Token]:
-        """Those of all robots that share the file."""
+        """Return the tokens of all robots that share the file."""
         try:
             seen = self.path.stat()
             stamp = seen.st_mtime_ns, seen.st_ino
@@ -91,17 +95,19 @@ class Vault:
             if stamp != read[0]:
                 read = stamp, msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except (OSError, msgspec.MsgspecError):
-            read = None, []  # there are none; or whom we cannot look up we let in no more
+            # The file is missing or unreadable. A token that cannot be checked must not be
+            # accepted.
+            read = None, []
         self._read = read
         return read[1]
 
     def counting(self) -> frozenset[str]:
-        """What those are known by that have not ended and are not revoked."""
+        """Return the digests of the tokens that are valid now."""
         now_s = time.time()
         return frozenset(one.digest for one in self.all() if one.ends > now_s)
 
     def unknown_to(self, service: Path = SERVICE) -> str:
-        """That a service on this machine does not know these; "" where none is, or it does."""
+        """Return a warning that the service on this machine reads another token file, or ""."""
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
@@ -110,8 +116,10 @@ class Vault:
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
-        """A new token, to be shown once, and what is kept of it, which ends after so many days and
-        hours; raises `UsageError`."""
+        """Create a token that expires after `days` and `hours`; return its text and its record.
+
+        The text is not stored, so show it now. Raises `UsageError`.
+        """
         with self._changing() as tokens:
             now_s = int(time.time())
             tokens[:] = [one for one in tokens if one.ends > now_s]
@@ -127,7 +135,7 @@ class Vault:
         return text, token
 
     def revoke(self, name: str) -> None:
-        """It counts no more, from now on; raises `UsageError` where there is none."""
+        """Delete a token by name, effective at once; raises `UsageError` if it does not exist."""
         with self._changing() as tokens:
             ours = [one for one in tokens if self._ours(one)]
             if all(one.name != name for one in ours):
@@ -139,7 +147,7 @@ class Vault:
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:
-        """The tokens, written when all went well; nobody else changes them meanwhile."""
+        """Yield the tokens under an exclusive lock. Write them back unless an exception occurs."""
         directory = self.path.parent
         try:
             directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -155,7 +163,7 @@ class Vault:
             raise NotPermittedError(f"no permission to write {self.path}: use sudo") from None
 
     def _kept(self) -> list[Token]:
-        """What the file holds, none where there is none; raises `UsageError`."""
+        """Return the tokens in the file, none if it does not exist; raises `UsageError`."""
         try:
             return msgspec.json.decode(self.path.read_bytes(), type=list[Token])
         except FileNotFoundError:
@@ -175,7 +183,7 @@ class Vault:
                 new.flush()
                 os.fchmod(new.fileno(), MODE)
                 owner = directory.stat()
-                if os.geteuid() == 0:  # the service reads it as a user of its own
+                if os.geteuid() == 0:  # the service reads it as its own user
                     os.fchown(new.fileno(), owner.st_uid, owner.st_gid)
                 os.fsync(new.fileno())
             os.replace(name, self.path)
@@ -185,7 +193,7 @@ class Vault:
 
 
 def place() -> Path:
-    """Where the tokens are: the service's state directory, else the user's own."""
+    """Return the token file's directory: the service's state directory or the user's own."""
     if "STATE_DIRECTORY" in os.environ:
         return Path(os.environ["STATE_DIRECTORY"].partition(":")[0])
     if os.geteuid() == 0 and SERVICE.is_dir():

@@ -1,7 +1,7 @@
-"""What `/ws` says to a page or a program; pure.
+"""The messages that `/ws` sends to a page or a program. This module is pure.
 
-One JSON object a message; what it is is told by its first field. The messages of a key alone are
-put together elsewhere (to_browser.py), since those come as JSON already.
+Each message is one JSON object, identified by its first field. Messages of subscribed keys are
+built in to_browser.py instead, because their values are already JSON.
 """
 
 from __future__ import annotations
@@ -18,48 +18,48 @@ Point = tuple[float, float]
 
 
 class Limits(Struct, frozen=True):
-    """The highest speeds: m/s and rad/s."""
+    """Highest speeds: m/s and rad/s."""
 
     linear: float
     angular: float
 
 
 class Greeting(Struct, frozen=True):
-    """Which robot it is, and who is here."""
+    """Identity of the robot and of this viewer."""
 
     robot: str
     version: str
     role: Role
     sender: str
-    """The public name that `state.sender` has while this viewer drives."""
+    """Public name that `state.sender` has while this viewer drives."""
     limits: Limits
     simulated: bool
     state_rate: float
-    """Hz"""
+    """Rate of the key `state`, Hz."""
 
 
 class Hello(Struct, frozen=True):
-    """First of all, and when that changes."""
+    """The first message, repeated whenever its content changes."""
 
     hello: Greeting
 
 
 class Way(Struct, frozen=True):
-    """Where the robot was in the last ten minutes, m in the odom frame, oldest first."""
+    """Path of the robot in the last ten minutes: m in the odom frame, oldest first."""
 
     path: Sequence[Point]
     truth: Sequence[Point]
-    """Where it truly was, of the simulator."""
+    """True path, published by a simulator only."""
 
 
 class LastMinute(Struct, frozen=True):
-    """What the plots show."""
+    """Plotted values of the last minute."""
 
     minute: Plotted
 
 
 class Answer(Struct, frozen=True):
-    """Of a call, by the number or name it was called with."""
+    """Answer to a call, with the id of that call."""
 
     answer: int | str
     ok: bool
@@ -67,51 +67,55 @@ class Answer(Struct, frozen=True):
 
 
 class Row(Struct, frozen=True):
-    """One robot."""
+    """One robot of the fleet."""
 
     robot: str
     mode: str | None
-    """As in `state`; "gone" once its daemon has said that it ends, None while nothing is heard."""
+    """Mode as in `state`; "gone" after the daemon announced its end, None before the first
+    state."""
     reason: str
     speed: float | None
-    """m/s"""
+    """Measured forward speed, m/s."""
     link: str
     age: float | None
-    """s since its state was heard, or its daemon ended."""
+    """Seconds since the last state arrived or the daemon ended."""
     version: str
-    """"" until it says."""
+    """Version of the daemon; "" until it is reported."""
 
 
 class Rows(Struct, frozen=True):
-    """The robots that are known."""
+    """All known robots."""
 
     fleet: Sequence[Row]
     note: str
-    """Why there are no more; "" where all of a router are seen."""
+    """Reason why robots may be missing; "" if all robots of a router are visible."""
 
 
 class Pong(Struct, frozen=True):
-    """As asked for, and the clock here, ms since 1970."""
+    """The number of a ping, and the time of this server in ms since 1970."""
 
     pong: float
     now: float
 
 
 class Refused(Struct, frozen=True):
-    """What does not count."""
+    """A message that was refused, and the reason."""
 
     refused: str
     reason: str
 
 
 class Gone(Struct, frozen=True):
-    """The daemon is not heard."""
+    """The daemon is not reachable, with the reason."""
 
     gone: str
 
 
 class Running(Struct, frozen=True, omit_defaults=True):
-    """What goes on, "" when nothing does, by whom, and whether that is you."""
+    """The running check or calibration, or "".
+
+    `by` started it, and `yours` is true for this viewer.
+    """
 
     running: str
     by: str = ""
@@ -119,7 +123,7 @@ class Running(Struct, frozen=True, omit_defaults=True):
 
 
 class Ended(Struct, frozen=True):
-    """Exit code, that in words, and why."""
+    """End of a check or calibration: exit code, its meaning, and the error text."""
 
     ended: int
     meaning: str
@@ -127,6 +131,6 @@ class Ended(Struct, frozen=True):
 
 
 class Guided(Struct, frozen=True):
-    """A check or a calibration: that it goes on, what it says line by line, how it ended."""
+    """A check or a calibration: that it is running, each line that it prints, and its end."""
 
     guide: Running | msgspec.Raw | Ended

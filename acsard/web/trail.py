@@ -1,4 +1,7 @@
-"""The way of the robot in the last minutes, thinned, for a page that has just been opened; pure."""
+"""The path of the robot in the last minutes, thinned, for a newly opened page.
+
+This module is pure.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +15,21 @@ LASTS_NS = 600 * NS_PER_S
 POINTS = 5000
 
 STEP_M = 0.02
-"""Nearer than this to the last point is no new one."""
+"""Minimum distance of two points; a nearer point is not stored."""
 
 JUMP_M = 1.0
-"""Further than any robot goes between two states: the pose was set."""
+"""A longer step than any robot moves between two states, so the pose was set and the path
+restarts."""
 
 
 class Trail:
-    """Points in the odom frame, m, oldest first."""
+    """The points of the path, m in the odom frame, oldest first."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[int, float, float]] = deque(maxlen=POINTS)
 
     def add(self, at_ns: int, x: float, y: float) -> None:
-        """The robot is here."""
+        """Append a position and drop points older than `LASTS_NS`."""
         while self._points and at_ns - self._points[0][0] > LASTS_NS:
             self._points.popleft()
         if self._points:
@@ -37,5 +41,5 @@ class Trail:
         self._points.append((at_ns, x, y))
 
     def points(self) -> list[tuple[float, float]]:
-        """To mm."""
+        """Return the points, rounded to mm."""
         return [(round(x, 3), round(y, 3)) for _, x, y in self._points]

@@ -1,7 +1,7 @@
-"""What comes on a connection and is no request at all: refused in words and counted, like the rest.
+"""Answers bytes on a connection that are not an HTTP request: refused with words and counted.
 
-Nothing of ours sees it, since there is nothing to hand on: aiohttp would answer with a bare line,
-and write a traceback for each into the log.
+No handler of the application sees such bytes. Without this class aiohttp would answer with a bare
+line and log a traceback for each.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ NO_HOST = "there is no `Host` in it: which name of this robot do you ask?"
 NO_REQUEST = "that is no HTTP request"
 
 MISSING = "Missing 'Host'"
-"""So aiohttp says it."""
+"""Start of aiohttp's message for a missing `Host` header."""
 
 
 class Reader(RequestHandler):
-    """Reads one connection."""
+    """Protocol handler of one connection."""
 
     def __init__(self, counts: Counts, server: Any) -> None:
-        """`server` is that of the application's runner."""
+        """Create a handler for `server`, which is the server of the application's runner."""
         super().__init__(server, loop=server._loop, **server._kwargs)
         self._counted = counts
 
@@ -38,7 +38,10 @@ class Reader(RequestHandler):
         exc: BaseException | None = None,
         message: str | None = None,
     ) -> web.StreamResponse:
-        """The answer to what could not be read; what went wrong here is aiohttp's to tell."""
+        """Answer unreadable bytes.
+
+        Errors of the application (status 500 and above) stay with aiohttp.
+        """
         if status >= 500:
             return super().handle_error(request, status, exc, message)
         nameless = (message or "").startswith(MISSING)

@@ -1,8 +1,8 @@
-"""One WebSocket: a page in a browser, or a program; a commander of its own.
+"""One WebSocket: a page in a browser or a program, and a sender of commands in its own right.
 
-What comes is taken at once and never waits for what goes out: a client that does not read still
-drives and stops. What goes out is the newest, as often as was asked for, and is left out while the
-client has not read what went before.
+Incoming messages are handled at once and never wait for outgoing ones, so a client that does not
+read can still drive and stop. Outgoing values are the newest ones at the requested rate; they are
+skipped while the client has not read earlier data.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ from acsard.web.to_browser import Outgoing
 from acsard.web.who import Who
 
 HEARTBEAT_S = 10.0
-"""A client that has not answered for half of this is gone."""
+"""Ping interval. The connection ends if the client has not answered after half of it."""
 
 CALLS_AT_ONCE = 8
 
 DROVE_NS = NS_PER_S
-"""Whose last command is older drives no more."""
+"""Maximum age of the last command for which a viewer still counts as driving."""
 
 FLEET, FLEET_S = "fleet", 1.0
 
 LOOK_S = 0.25
-"""How soon it is told that the robot is not heard any more."""
+"""Interval at which a viewer checks whether the robot became unreachable or its facts changed."""
 
 
 class Viewer:
-    """Lives as long as its connection."""
+    """One connected client; it lives as long as its connection."""
 
     def __init__(
         self,
@@ -76,7 +76,8 @@ class Viewer:
         self.who = who
         self._sender_id = sender_id(who.name)
         self.sender = public_name(self._sender_id, robots.certificate)
-        """The name that `state.sender` has while this viewer drives; all that its page learns."""
+        """Public name that `state.sender` has while this viewer drives. The page never learns the
+        secret part."""
         self._socket = socket
         self._robots, self._hand, self._calls = robots, hand, calls
         self._fleet, self._guide, self._counts = fleet, guide, counts
@@ -93,7 +94,7 @@ class Viewer:
         self._fleet_due: float | None = None
 
     async def run(self) -> None:
-        """Until it ends, by whomever."""
+        """Serve the connection until either side ends it."""
         self._greet()
         self._out.say(told.Way(**self._robots.way()))
         self._out.say(told.LastMinute(self._robots.minute()))
@@ -103,7 +104,7 @@ class Viewer:
             async for message in self._socket:
                 self._take(message)
         finally:
-            # First of all: who drove and is gone drives no more.
+            # Stop the robot first: a viewer that was driving has disconnected.
             self._release()
             self._guide.leave(self)
             pump.cancel()
@@ -113,7 +114,7 @@ class Viewer:
             self._fleet.leave(self)
 
     def end(self, why: str) -> None:
-        """Send him away; `why` is at most 120 characters."""
+        """Close the connection; `why` is sent as the close reason, at most 120 characters."""
         if self._ended:
             return
         self._ended = True
@@ -121,13 +122,12 @@ class Viewer:
         self._guide.leave(self)
         self._start(self._out.close(why))
 
-    # what comes
+    # Incoming messages.
 
     def _take(self, message: aiohttp.WSMessage) -> None:
-        """One message."""
         if self._ended:
-            return  # he has to answer the close, or is cut
-        if message.type == aiohttp.WSMsgType.ERROR:  # which aiohttp ends the connection for
+            return  # only the answer to the close matters now
+        if message.type == aiohttp.WSMsgType.ERROR:  # aiohttp closes the connection after this
             self._counts.refuse("too_big", self.who.origin)
             return
         if message.type != aiohttp.WSMsgType.TEXT:
@@ -177,7 +177,9 @@ class Viewer:
             return
         stamp_ns, before_ns = frame.stamp_ns, self._last.stamp_ns if self._last else -1
         if stamp_ns == before_ns and not frame.moves:
-            stamp_ns += 1  # some clocks stand for a while, and who lets go in it means it
+            # Some clocks stand still for a while. A zero command with an equal stamp is still a
+            # genuine release.
+            stamp_ns += 1
         if stamp_ns <= before_ns:
             self._out.refuse(
                 "cmd", "replayed", "stamp must be later than that of the command before"
@@ -197,10 +199,15 @@ class Viewer:
         self._hand.give(self._last)
 
     def _release(self) -> None:
-        """One zero of one who drove, meant now by his own clock; nobody sends him any more."""
+        """Send one zero command if this viewer was driving, stamped with the present time of its
+        own clock.
+
+        This is the last command that is sent for this viewer.
+        """
         last, self._last = self._last, None
         now_ns = clock.mono_ns()
-        # One who fell silent before has been let go of: a zero now would only be in others' way.
+        # The command timeout has already released a viewer that fell silent. A zero now would only
+        # get in the way of the next driver.
         if last is None or not last.moves or now_ns - last.given_ns > DROVE_NS:
             return
         stamp_ns = last.stamp_ns + now_ns - last.given_ns
@@ -210,7 +217,10 @@ class Viewer:
         )
 
     def _begin(self, frame: Begin) -> None:
-        """It turns wheels, and writes configurations."""
+        """Start a check or calibration for a maintainer.
+
+        The role is required because both turn wheels and write configuration files.
+        """
         if not self.who.may("maintainer"):
             self._out.refuse("begin", "role", f"it is for maintainers; you are {self.who.role}")
         elif why := self._guide.begin(self, self.who.name, frame):
@@ -218,7 +228,8 @@ class Viewer:
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
-            # Whoever sent it may be gone before it is asked for: the robot stops all the same.
+            # A stop is kept in its own set of tasks, which is not cancelled when the connection
+            # ends.
             self._start(self._answer(frame), self._stops)
         else:
             if self._calling >= CALLS_AT_ONCE:
@@ -254,7 +265,7 @@ class Viewer:
         else:
             self._keys.unsubscribe(frame)
 
-    # what goes out
+    # Outgoing messages.
 
     def _greet(self) -> None:
         about = self._about = self._robots.about
@@ -270,7 +281,7 @@ class Viewer:
         self._out.say(told.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
-        """Is the robot heard, who else is there; when to look again."""
+        """Report changes of reachability, facts and fleet; return the time of the next look."""
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone
             if self._gone:

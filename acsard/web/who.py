@@ -1,10 +1,11 @@
-"""Who speaks, by where he comes from and what his browser says of the page it shows; pure.
+"""Decides who sends a request, by its source address and the browser's headers. This module is
+pure.
 
-Who is at the machine is its maintainer. But any page in his browser may open `ws://localhost`, or
-point a name of its own at 127.0.0.1: so the name in `Host` must be a loopback one, and where the
-browser tells of a page (`Origin`), it must be ours. From beyond the machine one comes by HTTPS, to
-a name that the robot has, with a token. Nobody comes through a proxy: on the robot, with the `Host`
-rewritten, it would make a maintainer of everybody behind it.
+A client on the robot itself has the role maintainer. However, any web page in a browser there may
+open `ws://localhost`, or point a host name of its own at 127.0.0.1. So `Host` must be a loopback
+name, and `Origin`, if the browser sends it, must be this page. A client from another machine must
+use HTTPS, a host name that the robot has, and a token. Requests through a proxy are refused: a
+proxy on the robot that rewrites `Host` would turn every client behind it into a maintainer.
 """
 
 from __future__ import annotations
@@ -21,71 +22,74 @@ Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
     "too_big", "malformed", "path", "replayed", "crowded", "slow", "proxy", "stuck",
 ]  # fmt: skip
-"""What a refusal is counted under."""
+"""Reason under which a refusal is counted."""
 
 Place = Literal["here", "away"]
 
 HERE = "here"
-"""The name of who needs none."""
+"""Name of a client on the robot itself."""
 
 COOKIE = "__Host-acsard"
-"""How our cookies' names begin: by that browsers take them only with Secure, of this host, for all
-paths."""
+"""Prefix of the cookie names. Browsers accept a `__Host-` cookie only if it is Secure, without a
+Domain, and for all paths."""
 
 MOST_COOKIES = 8
-"""So many are looked at."""
+"""Maximum number of cookies that are checked for a token."""
 
 
 class Who(Struct, frozen=True):
-    """Somebody who may come in."""
+    """The identity of an admitted client."""
 
     role: Role
     name: str
     token: str = ""
-    """What his token is known by; "" for one at the machine."""
+    """Digest of the client's token; "" for a client on the robot itself."""
     address: str = ""
-    """Where he comes from."""
+    """IP address of the client."""
 
     @property
     def origin(self) -> str:
-        """Address and name, as the log tells whom it refused."""
+        """Address and name of the client for the log."""
         return f"{self.address} ({self.name})" if self.token else self.address
 
     def may(self, least: Role) -> bool:
-        """Has he at least this role?"""
+        """Return whether the client has at least this role."""
         return ROLES.index(self.role) >= ROLES.index(least)
 
 
 MAINTAINER = Who("maintainer", HERE)
-"""Who is at the machine."""
+"""The identity of a client on the robot itself."""
 
 
 class Refusal(Struct, frozen=True):
-    """Why not, and what to do instead."""
+    """The reason for a refusal, and the remedy."""
 
     reason: Reason
     text: str
 
 
 class Asked(Struct, frozen=True):
-    """What is known of a request before anything in it is believed."""
+    """The facts of a request that decide about its admission. The client may forge all headers."""
 
     peer: str
-    """The address it comes from."""
+    """Source address of the connection."""
     secure: bool
-    """By TLS."""
+    """True for TLS."""
     host: str
-    """The `Host` header."""
+    """Value of the `Host` header, "" if it is missing or malformed."""
     origin: str | None = None
-    """The `Origin` header, where there is one."""
+    """Value of the `Origin` header, if there is one."""
     site: str | None = None
-    """`Sec-Fetch-Site`."""
+    """Value of the `Sec-Fetch-Site` header, if there is one."""
     proxied: bool = False
-    """By somebody who hands it on, and says so."""
+    """True if a header says that a proxy forwarded the request."""
 
 
 def place(asked: Asked, names: Collection[str]) -> Place | Refusal:
-    """Where a request comes from; `names` are those of the robot, lower case."""
+    """Classify a request as local or remote, or refuse it.
+
+    `names` are the robot's names and addresses in lower case.
+    """
     if asked.proxied:
         return Refusal(
             "proxy",
@@ -107,7 +111,7 @@ def place(asked: Asked, names: Collection[str]) -> Place | Refusal:
 
 
 def foreign(asked: Asked) -> Refusal | None:
-    """A page that is not ours has its browser ask."""
+    """Return a refusal if a web page of another origin made the browser send this request."""
     own = f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
     strange = asked.origin is not None and asked.origin.lower() != own
     if strange or asked.site not in (None, "same-origin", "none"):
@@ -116,33 +120,42 @@ def foreign(asked: Asked) -> Refusal | None:
 
 
 def cookie_name(robot: str, port: int) -> str:
-    """What the cookie of this page is called: a browser sends those of all ports of a host to each,
-    and keeps one of each name."""
+    """Return the cookie name of this page.
+
+    The name contains the robot and the port, because a browser sends a host's cookies to all of its
+    ports and keeps only one cookie of each name.
+    """
     return f"{COOKIE}-{robot}-{port}"
 
 
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
-    """The tokens in a browser's cookies that may be for this page: its own, then those of the same
-    robot at other ports, and of before cookies were told apart."""
+    """Return the cookie tokens that may be valid for this page, the likeliest first.
+
+    The page's own cookie comes first. Cookies of the same robot at other ports follow, and cookies
+    from before the names contained robot and port.
+    """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
     names = [name for name in cookies if name == COOKIE or name.rpartition("-")[0] == ours]
     return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_COOKIES]
 
 
 def host_name(host: str) -> str:
-    """The name or address in a `Host` header, lower case, without its port."""
+    """Return the name or address in a `Host` header, in lower case, without the port."""
     if host.startswith("["):
         return host[1:].partition("]")[0].lower()
     return host.partition(":")[0].lower()
 
 
 def unmapped(address: str) -> str:
-    """An IPv4 address as such, also of one who came by it to a socket for both."""
+    """Return an address with the IPv4-mapped prefix `::ffff:` removed.
+
+    A dual-stack socket reports IPv4 clients with this prefix.
+    """
     return address.removeprefix("::ffff:") if "." in address else address
 
 
 def is_loopback(text: str) -> bool:
-    """An address of this machine for itself; no name is."""
+    """Return whether the text is a loopback IP address; a host name never is."""
     try:
         address = ipaddress.ip_address(text.partition("%")[0])
     except ValueError:

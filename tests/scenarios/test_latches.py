@@ -89,7 +89,7 @@ def test_a_plain_clear_is_refused_for_two_seconds_after_a_stop(world: World, via
     world.run(1.0)
     reply = call(world, "clear", "ann", via=via)
     assert (reply.success, world.state.mode) == (False, "stopped")
-    assert reply.message.startswith(f"a stop by {JOE} (native) came 1.0 s ago: look at the robot")
+    assert f"was stopped by {JOE} (native) 1.0 s ago: look at the robot" in reply.message
     world.run(1.0)
     assert call(world, "clear", "ann", via=via).success
     assert world.state.mode == "ready"
@@ -155,6 +155,51 @@ def test_no_delayed_clear_releases_a_stop_that_its_sender_had_not_seen(seed: int
     assert len(stops) > 3
     assert call(world, "clear", "eve", world.state.latch).success
     assert world.state.mode in ("ready", "driving")
+
+
+# an activate and a later deactivate
+
+
+def test_an_activate_read_before_a_later_deactivate_and_delivered_after_it_is_refused(
+    world: World,
+) -> None:
+    call(world, "deactivate", "ann")
+    seen = world.state.latch
+    world.run(10.0)
+    assert call(world, "activate", "ann", seen).success
+    call(world, "deactivate", "joe")
+    world.run(10.0)
+    reply = call(world, "activate", "eve", seen)
+    assert (reply.success, world.state.mode) == (False, "inactive")
+    assert f"is not in force; the robot is still switched off by {JOE} (native)" in reply.message
+    assert call(world, "activate", "ann", world.state.latch).success
+    assert world.state.mode == "ready"
+
+
+def test_an_activate_read_between_two_deactivates_does_not_undo_the_second(world: World) -> None:
+    call(world, "deactivate", "ann")
+    seen = world.state.latch
+    world.run(10.0)
+    call(world, "deactivate", "joe")
+    world.run(10.0)
+    assert not call(world, "activate", "ann", seen).success
+    assert world.state.mode == "inactive"
+
+
+@pytest.mark.parametrize("via", ["native", "rmw", "bridge"])
+def test_a_plain_activate_is_refused_for_two_seconds_after_a_deactivate(
+    world: World, via: Via
+) -> None:
+    call(world, "deactivate", "joe")
+    world.run(1.0)
+    reply = call(world, "activate", "ann", via=via)
+    assert (reply.success, world.state.mode) == (False, "inactive")
+    assert f"was switched off by {JOE} (native) 1.0 s ago: look at the robot" in reply.message
+    service = "srv/activate" if via == "native" else "/acsard/activate"
+    assert f"then call {service} again 2 s after that" in reply.message
+    world.run(1.0)
+    assert call(world, "activate", "ann", via=via).success
+    assert world.state.mode == "ready"
 
 
 # a stop and a fault

@@ -21,7 +21,7 @@ import pytest
 from acsard.config.settings import CommandsConfig, Config, ControlConfig, McuConfig, Source
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.values import NS_PER_S, Outputs
-from tests.scenarios.speakers import SHARED, STAMPED, Speaker, Way, backlog, moved
+from tests.scenarios.speakers import FOREIGN, SHARED, STAMPED, Speaker, Way, backlog, moved
 from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -305,7 +305,7 @@ def trouble(world: World, kind: str, dice: random.Random) -> str:
         world.port.blocked = True
         world.hold(linear, seconds=seconds)
         world.port.blocked = False
-        return _word(world, "fallen silent")
+        return _word(world, "the serial port sends nothing")
     if kind == "stall":
         world.send(linear)
         world.stall(seconds / 4)
@@ -468,7 +468,8 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
         if abs(span / poured - 1) > 0.011:
             break  # else it is a clock that is behind, as far as can be told: the test below
     since_ns = world.now_ns
-    world.run(age if running else 0.0)
+    # The backlog begins after the last command of before: stamps that go back are a clock set back.
+    world.run(age + span if running else 0.0)
     backlog(dice, speaker, age, span, poured)
     return moved(world, since_ns)
 
@@ -517,10 +518,14 @@ def test_a_replay_at_the_pace_it_was_sent_counts_of_one_never_heard_as_a_clock_t
 def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
     """It sends speeds for so long, then zeros, then drives."""
     speaker.hold(0.4, within)
-    # Where others may look like it, a zero counts after a second.
-    speaker.hold(0.0, 1.2 if speaker.way in SHARED else 0.5)
-    speaker.hold(0.4, 0.5)
-    return world.state.mode == "driving"
+    # A zero of an identity that programs may share counts after a second. So does one whose stamp
+    # Zenoh replaced because its clock is ahead.
+    speaker.hold(0.0, 1.2 if speaker.way in (*SHARED, "zenoh") else 0.5)
+    for _ in range(5):
+        speaker.hold(0.4, 0.1)
+        if world.state.mode == "driving":
+            return True
+    return False
 
 
 def drives_on_or_again(world: World, speaker: Speaker) -> bool:
@@ -569,7 +574,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
 def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> None:
     dice, wrong = random.Random(8), Counter[str]()
     for trial in range(count):
-        way = STAMPED[trial % len(STAMPED)]
+        way = FOREIGN[trial % len(FOREIGN)]
         ahead = dice.choice((-1, 1)) * dice.choice((0.0, 0.3, 2.0, 3600.0, 86400.0))
         step = dice.choice((-1, 1)) * dice.choice((0.1, 0.3, 1.0, dice.uniform(0.1, 10.0)))
         if way == "zenoh":  # one that is ahead is unstamped, as Zenoh replaces it
@@ -582,7 +587,7 @@ def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.92, slow(1.08)])
-@pytest.mark.parametrize("way", STAMPED)
+@pytest.mark.parametrize("way", FOREIGN)
 def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
     way: Way, rate: float
 ) -> None:
@@ -592,9 +597,9 @@ def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
     speaker.open()
     speaker.slew(rate)
     assert drives_on_or_again(world, speaker), world.state.reason
-    # Who is cut off meanwhile may have to wait until it goes evenly again: slewed as fast, and held
-    # back, look the same.
-    for cut in (0.6, 2.0, 5.0):
+    # A sender that is cut off meanwhile may have to wait until its clock goes evenly again, because
+    # a network that holds commands back looks the same. A clock that slows is forgiven 1 s in all.
+    for cut in (0.6, 2.0, 5.0) if rate > 1.0 else (0.6, 2.0):
         assert not stale_moves(world, speaker, cut), cut
         speaker.hold(0.4, 0.5)
     speaker.slew(1.0)

@@ -340,8 +340,8 @@ class World:
         return self.bus.replies.get(query.ticket, [])
 
     def call(self, service: str, payload: bytes = b"") -> ServiceReply:
-        """Return a service's answer; `clear` names the latch of `state`, as our tools do."""
-        if service == "clear" and not payload:
+        """Return a service's answer; a release names the latch of `state`, as our tools do."""
+        if service in ("clear", "activate") and not payload:
             payload = msgspec.json.encode({"latch": self.state.latch})
         (reply,) = self.ask(f"srv/{service}", payload=payload)
         return msgspec.json.decode(reply.payload, type=ServiceReply)

@@ -286,7 +286,7 @@ def test_a_question_that_nobody_answers_in_time_is_a_timeout(
     with zenoh.open(settings) as stuck:
         stuck.declare_queryable("acsard/acsar/srv/*", unanswered.append)
         with connect(endpoint) as robot, pytest.raises(NoAnswerError, match=r"within 0.3 s"):
-            robot.call("activate")
+            robot.call("deactivate")
         assert unanswered
         unanswered.clear()
 
@@ -641,8 +641,8 @@ def test_a_daemon_that_is_asked_too_much_is_asked_again_but_no_verb_is_called_ag
             asked.clear()
             # Somebody may have pressed stop since.
             with pytest.raises(ReplyError, match="busy"):
-                robot.call("activate")
-            assert asked == ["acsard/acsar/srv/activate"]
+                robot.call("deactivate")
+            assert asked == ["acsard/acsar/srv/deactivate"]
         assert kept
 
 

@@ -120,8 +120,8 @@ def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
     bus.linked()
     linked = time.monotonic()
     until(lambda: time.monotonic() > linked + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")
-    assert not robot.moved(since)
     state = bus.state()
+    assert not robot.moved(since), (mode, state)
     assert state["mode"] == mode, state
     return state
 

@@ -180,7 +180,7 @@ def test_a_stop_stops_until_clear(bus: Bus, ros: BridgeHalf) -> None:
     assert bus.state()["mode"] == "stopped"
     success, message = ros.call("acsard/clear").trigger()
     assert not success
-    assert "look at the robot, then call /acsard/clear again 2 s after it" in message
+    assert "look at the robot, then call /acsard/clear again 2 s after that" in message
     released(ros)
     assert bus.state()["mode"] == "ready"
 

@@ -349,8 +349,12 @@ while True:
     for line in lines:
         if line.startswith(b"a"):
             lies = os.path.exists(sys.argv[2])
-            # The wheels lag by two lines. Replies that never lag would be an echo.
-            says = b"ap99.00,bp99.00,cp99.00,dp99.00\\r" if lies else turning or line
+            # Replies that equal the lines would be an echo: wheel a turns a little otherwise.
+            says = turning or line
+            if says.strip(b"abcdpn0.,\\r"):
+                says = says[:6] + (b"1" if says[6:7] == b"0" else b"0") + says[7:]
+            if lies:
+                says = b"ap99.00,bp99.00,cp99.00,dp99.00\\r"
             turning, told = told, line
             os.write(master, says + b"\\n")
         print(repr(now), line.decode(errors="replace").strip() or "-", flush=True)
@@ -360,7 +364,8 @@ while True:
 class Board(Program):
     """A serial board in the container, in a process ahead of all others: its times can be trusted.
 
-    It answers each command with the speeds asked for two lines before, unless it lies.
+    Unless it lies, it answers each command with the speeds asked for two lines before. The speed of
+    wheel a is 0.01 to 0.09 off.
     """
 
     def __init__(self, container: Container) -> None:

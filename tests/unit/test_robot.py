@@ -91,10 +91,10 @@ class Bench:
     ) -> Outputs:
         """One period later (or `ms`): what happened meanwhile goes in, the outputs come out.
 
-        A `clear` names the latch of the step before, as the tools do.
+        A `clear` or `activate` names the latch of the step before, as the tools do.
         """
-        latches = self.out.latches
-        latch = latches.next.number if ask == "clear" and latches.next else None
+        held = self.out.latches.in_force
+        latch = held.number if ask in ("clear", "activate") and held else None
         self.now_ns += int((self.period_ms if ms is None else ms) * MS)
         heard = self.reply is not None and self.port_open
         self.out = self.robot.step(

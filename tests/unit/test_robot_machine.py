@@ -359,7 +359,7 @@ class RobotMachine(RuleBasedStateMachine):
         off=st.sampled_from([0, 0, 0, -1, 1, None]),
     )
     def somebody_asks(self, verb: Verb, now: bool, off: int | None) -> None:
-        """A clear names the current latch, one next to it or none."""
+        """A clear or an activate names the current latch, one next to it or none."""
         self.ask(verb, off)
         if now:
             self.step(reply=True)
@@ -411,8 +411,8 @@ class RobotMachine(RuleBasedStateMachine):
     # how it is told
 
     def ask(self, verb: Verb, off: int | None = 0) -> None:
-        held = self.latches.next
-        named = held is not None and verb == "clear" and off is not None
+        held = self.latches.in_force
+        named = held is not None and verb in ("clear", "activate") and off is not None
         latch = held.number + (off or 0) if held is not None and named else None
         self.requests.append(Request(verb, 1, latch=latch))
 

@@ -1,6 +1,7 @@
-"""`acsard calibrate` without a log: what a person is told, what is driven, what is measured.
+"""`acsard calibrate` without a log: instructions, legs and measurements of a guided drive.
 
-A way of calibrating is a generator (`gyro.py`, `tape.py` ...): it yields what to say, to ask and to
-drive (`steps.py`) and is sent the answers, so that each reads from top to bottom as what happens.
-One leg of a drive is `riding.py`: messages and keys in, commands out.
+Each method of calibration is a generator (in `tour.py`, `tape.py`, `wall.py` and `umbmark.py`). It
+yields the legs to drive and the numbers to ask for (`steps.py`) and is sent the answers, so that
+its code reads from top to bottom in the order of events. `riding.py` drives one leg: messages and
+keys go in, commands come out.
 """

@@ -1,4 +1,4 @@
-"""What was found from readings, as a calibration: settings, what they improve, what was driven."""
+"""Turns tape readings into a calibration: settings, improvement and a summary of the drives."""
 
 from __future__ import annotations
 
@@ -28,15 +28,17 @@ from acsard.config.settings import DriveConfig
 BLOCK_S = 4.0
 
 WORST_TRACK, WORST_RATIO = 0.1, 0.02
-"""Standard deviations, as shares, that are too large for the result to be of use."""
+"""Largest useful standard deviations, as fractions: of the track, and of the ratio of radii."""
 
 TURNED, STRAIGHT = np.pi, 0.5
-"""rad that the robot turned at least where a reading is one of turns, and at most where it is one
-of a straight drive."""
+"""Turns that classify a reading, rad.
+
+Above `TURNED` it counts as a reading of turns, and below `STRAIGHT` as one of a straight drive.
+"""
 
 
 def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
-    """By what was read off; raises `RefusedError`."""
+    """Return the calibration that the readings give. Raises `RefusedError`."""
     base = Base(
         drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
         drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
@@ -83,7 +85,7 @@ def _sure(told: Found) -> None:
 
 
 def _gain(readings: Sequence[Reading], base: Base, told: Found, now: Floats, rate: Rates) -> Gain:
-    """Each reading tried on what was found without it."""
+    """Return the errors of each reading, predicted with the parameters found without it."""
     sums = {name: np.zeros(3) for name in ("turn", "straight", "place")}
     one = with_one_track(told.parameters, rate)
     for number, reading in enumerate(readings):
@@ -91,7 +93,7 @@ def _gain(readings: Sequence[Reading], base: Base, told: Found, now: Floats, rat
         then = predicted(steps, reading.what, base, told.parameters).value
         truth = then + told.left[number]
         off = truth - predicted(steps, reading.what, base, now).value
-        # With one track for all rates, as the robot will have it.
+        # The robot uses one track for all turn rates.
         moved = predicted(steps, reading.what, base, one).value - then
         rest = told.without[number] - moved
         if np.isnan(rest):

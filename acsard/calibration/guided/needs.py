@@ -1,4 +1,7 @@
-"""What each way of calibrating by a guided drive needs, in words; the ways are in `ways.py`."""
+"""The equipment that each method of a guided drive needs, in words.
+
+The methods are in `ways.py`.
+"""
 
 from __future__ import annotations
 
@@ -16,4 +19,4 @@ SIMULATED = (
     "where it truly is; and gyro where [odometry] gyro is on, with its distance left empty. tape, "
     "wall and umbmark are for a real robot.",
 )
-"""The way to begin with on the simulator, and why."""
+"""The method to begin with on the simulator, and why."""

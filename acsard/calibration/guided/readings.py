@@ -1,9 +1,9 @@
-"""What a person read off with a tape -> wheel radii and effective track.
+"""Computes wheel radii and effective track from readings that a person took with a tape.
 
-Each reading tells where the robot ended, from where it last stood as it was told to: how far, how
-turned, or where in x and y. Gauss-Newton on all, as with positions (`calibration/places.py` sums
-the path). A reading is off by what a tape and an eye are, and by what skidding adds on the way; how
-much that was here, the readings say themselves, as far as they are many.
+Each reading says where the robot ended relative to the last place where it was positioned: how far,
+how much turned, or where in x and y. The fit is Gauss-Newton on all readings, as for positions
+(`calibration/places.py` sums the path). A reading is off by the error of tape and eye and by
+skidding on the way. If there are enough readings, their scatter shows how much the robot skidded.
 """
 
 from __future__ import annotations
@@ -24,21 +24,25 @@ from acsard.calibration.runs import Run
 from acsard.calibration.table import Floats
 
 What = Literal["turned", "angle", "distance", "ahead", "aside"]
-"""`turned` is an angle with its whole turns counted, `angle` one without, both rad to the left;
-the others are m."""
+"""Kind of a reading. `turned` is an angle that includes whole turns, and `angle` one that does not.
+
+Both are in rad, positive to the left. The other kinds are in m.
+"""
 
 SKIDDING = 0.015
-"""rad by which a metre of rolling turns the robot more or less than it should; of two metres, the
-root of two times that."""
+"""Heading error by skidding, rad for 1 m of rolling.
+
+It grows with the square root of the distance.
+"""
 
 STRETCH = 0.002
-"""Share by which a way is longer or shorter than it should."""
+"""Error of a distance by skidding, as a fraction of it."""
 
 UNKNOWN = 1.0
-"""Standard deviation of the mean radius, as a share, before anything was read off."""
+"""Prior standard deviation of the mean radius, as a fraction."""
 
 PRIOR_FREE = 4.0
-"""Readings that what is said here of their noise is worth."""
+"""Weight of the assumed noise (`SKIDDING`, `STRETCH`), as a number of readings."""
 
 LEAST_FREE = 3.0
 MOST_STEPS = 50
@@ -47,11 +51,11 @@ SMALL = 1e-9
 ACTIVE = [LEFT, RIGHT, TURN, RATE]
 
 TELLS = 0.2
-"""rad of a reading's standard deviation that still tell how far the robot turned."""
+"""Largest standard deviation of a usable turn reading, as a fraction of the turn."""
 
 
 class Reading(Struct, frozen=True):
-    """What was read off after some rides, one behind the other, and how well one can."""
+    """A number that a person read off after some rides, and its standard deviation (rad or m)."""
 
     rides: tuple[Run, ...]
     what: What
@@ -60,7 +64,7 @@ class Reading(Struct, frozen=True):
 
 
 class Predicted(Struct, frozen=True):
-    """By some parameters: the value of a reading, its slopes, and the variance of skidding."""
+    """The predicted value of a reading, its slopes by parameter, and the variance by skidding."""
 
     value: float
     slopes: Floats
@@ -68,8 +72,11 @@ class Predicted(Struct, frozen=True):
 
 
 class Found(Struct, frozen=True):
-    """Parameters with their covariance; and of each reading what is left, with all readings and
-    with the parameters found without it."""
+    """Parameters with their covariance, and the residuals of each reading.
+
+    `left` are the residuals of the fit to all readings; `without` are those of the fit without that
+    reading.
+    """
 
     parameters: Floats
     covariance: Floats
@@ -78,7 +85,7 @@ class Found(Struct, frozen=True):
 
 
 def joined(rides: Sequence[Run]) -> Grid:
-    """Several rides as one."""
+    """Return several rides, one after the other, as a single grid."""
     grids = [grid(ride, wheels(ride)) for ride in rides]
     ends = np.cumsum([0.0] + [float(one.t[-1]) for one in grids])
     t = np.concatenate([grids[0].t[:1]] + [g.t[1:] + e for g, e in zip(grids, ends, strict=False)])
@@ -87,7 +94,7 @@ def joined(rides: Sequence[Run]) -> Grid:
 
 
 def predicted(steps: Grid, what: What, base: Base, parameters: Floats) -> Predicted:
-    """What would be read off."""
+    """Predict the value of a reading."""
     way = path(steps, base, parameters)
     rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
     slopes = np.zeros(COUNT)
@@ -96,26 +103,28 @@ def predicted(steps: Grid, what: What, base: Base, parameters: Floats) -> Predic
         for index, bend in way.bends.items():
             slopes[index] = bend[-1]
         return Predicted(float(way.heading[-1]), slopes, swing)
-    # Along the way to where it ended, ahead, or to the left.
+    # The direction of the measurement: towards the end point, ahead, or to the left.
     along = {"ahead": 1.0 + 0j, "aside": 1j}.get(what, place / (abs(place) or 1.0))
     for index, values in way.slopes.items():
         slopes[index] = (np.conj(along) * values[-1]).real
     variance = (STRETCH * abs(place)) ** 2
     if what != "distance":
-        # A turn on the way moves the end by as much as is still to go, a third of it in the mean.
+        # A turn on the way moves the end by the rest of the way. The mean square of that is a third
+        # of the span squared.
         span = float(np.ptp(way.place.real) + np.ptp(way.place.imag))
         variance += swing * span**2 / 3
     return Predicted(float((np.conj(along) * place).real), slopes, variance)
 
 
 def found(readings: Sequence[Reading], base: Base) -> Found:
-    """Of the robot that these were read off; raises `RefusedError`."""
+    """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
     steps = [joined(reading.rides) for reading in readings]
     start = _begun(readings, steps, base)
     parameters, normal, _ = _solved(readings, steps, base, start)
     in_range(np.array([1 / parameters[TURN], parameters[LEFT], parameters[RIGHT]]))
     left, weights = _left(readings, steps, base, parameters)
-    # What chance did here, with what it was said to do; few are answered for with Student's t.
+    # Combine the scatter of these readings with the assumed noise. If there are few readings, widen
+    # it to that of Student's t.
     free = PRIOR_FREE + max(0.0, len(readings) - len(ACTIVE) + 1.0)
     scale = (PRIOR_FREE + float(weights @ left**2)) / free
     free = max(LEAST_FREE, free)
@@ -127,7 +136,10 @@ def found(readings: Sequence[Reading], base: Base) -> Found:
 
 
 def _begun(readings: Sequence[Reading], steps: Sequence[Grid], base: Base) -> Floats:
-    """Where angles are told right by whole turns: as the turns that were counted say."""
+    """Return starting parameters that agree with the first counted turn.
+
+    From there on, angles that do not count whole turns are resolved correctly.
+    """
     start = base.start()
     for reading, grid_ in zip(readings, steps, strict=True):
         if reading.what == "turned" and reading.deviation < TELLS * abs(reading.value):
@@ -146,7 +158,10 @@ def _begun(readings: Sequence[Reading], steps: Sequence[Grid], base: Base) -> Fl
 def _solved(
     readings: Sequence[Reading], steps: Sequence[Grid], base: Base, start: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Parameters and normal equations."""
+    """Return the parameters, the normal equations and the right-hand side.
+
+    Raises `RefusedError` if the readings do not determine the parameters.
+    """
     parameters, begun = start.copy(), base.start()
     for _ in range(MOST_STEPS):
         normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
@@ -190,7 +205,7 @@ def _off(reading: Reading, told: float) -> float:
 def _left(
     readings: Sequence[Reading], steps: Sequence[Grid], base: Base, parameters: Floats
 ) -> tuple[Floats, Floats]:
-    """What the parameters leave of each reading, and its weight."""
+    """Return the residual and the weight of each reading."""
     left, weights = [], []
     for reading, grid_ in zip(readings, steps, strict=True):
         told = predicted(grid_, reading.what, base, parameters)
@@ -202,7 +217,7 @@ def _left(
 def _without(
     number: int, readings: Sequence[Reading], steps: Sequence[Grid], base: Base, start: Floats
 ) -> float:
-    """What is left of one reading with the parameters found without it; nan where they are not."""
+    """Return the residual of one reading by the fit without it, or NaN if that fit fails."""
     kept = [n for n in range(len(readings)) if n != number]
     try:
         parameters, _, _ = _solved(

@@ -1,8 +1,8 @@
-"""What comes on the bus while a leg is driven -> a run, as a log would have it.
+"""Records the bus messages of a leg as a run, in the form that a log has.
 
-Every sender stamps by a clock of its own, or not at all. The samples of one key are as far apart as
-their stamps say, and the one that came soonest came at once: so no clock needs to be set, and what
-is left of the delays is found with the rest.
+Each sender stamps its messages with its own clock, or not at all. Within one key, the samples keep
+the spacing of their stamps, and the sample with the smallest delay is taken to have arrived at
+once. No clock has to be set, and the fit finds the remaining delays.
 """
 
 from __future__ import annotations
@@ -21,11 +21,14 @@ from acsard.values import NS_PER_S
 STREAMS = {"wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y")}
 
 LONGEST_S = 5.0
-"""Between two samples' stamps and their arrivals: differences of more are no clock's."""
+"""Largest variation of the delay between stamps and arrivals, s.
+
+A larger one is not due to a clock.
+"""
 
 
 class Sample(Struct, frozen=True):
-    """When it came and when it says it was made, s; and its values, as `STREAMS` names them."""
+    """A sample's arrival and its own stamp, s, and its values in the order of `STREAMS`."""
 
     came: float
     made: float | None
@@ -33,7 +36,7 @@ class Sample(Struct, frozen=True):
 
 
 class Recorder:
-    """The samples of one leg."""
+    """Recorder of the samples of one leg."""
 
     def __init__(self, joints: Sequence[str]) -> None:
         self._right = joints[0], joints[3]
@@ -41,7 +44,7 @@ class Recorder:
         self.samples: dict[str, list[Sample]] = {name: [] for name in STREAMS}
 
     def wheels(self, message: JointState, came: float) -> float:
-        """Take the wheels' speeds; the largest of them, rad/s."""
+        """Add wheel speeds and return the largest of them, rad/s."""
         speeds = dict(zip(message.name, message.velocity, strict=False))
         left, right = (
             (speeds[one] + speeds[other]) / 2 for one, other in (self._left, self._right)
@@ -50,11 +53,11 @@ class Recorder:
         return max(map(abs, speeds.values()))
 
     def gyro(self, message: Imu, came: float) -> None:
-        """Take a turn rate."""
+        """Add a turn rate."""
         self._take("gyro", message.header.stamp, came, (message.angular_velocity.z,))
 
     def place(self, message: PoseStamped | Odometry, came: float) -> None:
-        """Take a position; a heading may be there or not, and is not looked at."""
+        """Add a position. Its heading, if it has one, is ignored."""
         pose = message.pose if isinstance(message, PoseStamped) else message.pose.pose
         spot = pose.position
         self._take("places", message.header.stamp, came, (spot.x, spot.y))
@@ -64,7 +67,7 @@ class Recorder:
         self.samples[stream].append(Sample(came, made, values))
 
     def run(self) -> Run:
-        """All of it; raises `LogError` where the wheels told nothing."""
+        """Return the leg as a run. Raises `LogError` if there are too few wheel samples."""
         count = sum(map(len, self.samples.values()))
         columns: dict[str, Floats] = {"t": np.full(count, math.nan)}
         at = 0
@@ -82,7 +85,10 @@ class Recorder:
 
 
 def times(samples: Sequence[Sample]) -> Floats:
-    """By our clock, s."""
+    """Return the times of the samples by the local clock, s.
+
+    Stamps give their spacing if every sample has one and the delay varies little.
+    """
     came = np.array([sample.came for sample in samples])
     made = np.array([math.nan if s.made is None else s.made for s in samples])
     if not len(came) or np.isnan(made).any():

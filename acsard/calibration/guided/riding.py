@@ -1,7 +1,7 @@
-"""One leg: what is commanded now, from what the daemon tells and what the person presses.
+"""One leg: decides the command from the daemon's messages and from key presses.
 
-Zeros until the daemon counts them, the moves by their times, zeros until the wheels stand. What is
-not as it must be halts it, for good and with the reason: `halted`.
+It sends zeros until the daemon accepts them, then the moves by their durations, then zeros until
+the wheels stand. Any unexpected condition halts the leg for good; `halted` has the reason.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from acsard.messages.schema import RobotState
 from acsard.values import REST, Twist
 
 OPENING_S, OPENED_S = 0.4, 4.0
-"""Zeros at first for so long at least, and until they count; then it is given up."""
+"""Shortest time of zeros at first, and the time after which unaccepted zeros end the leg, s."""
 
 SILENT_S = 0.5
-"""Without a word from the daemon."""
+"""Longest silence of the daemon, s."""
 
 HELD_UP = "this computer was too busy to run the calibration: end what else runs on it"
 
 OBEYED_S = 1.5
-"""After a command has changed the robot has to do it: a ramp takes a part of that."""
+"""Time allowed for the robot to follow a changed command, s. The ramp takes a part of it."""
 
 DOUBT_S = 1.0
-"""That it does not do as it is told, before it is given up."""
+"""Time for which the robot may deviate from the command before the leg is halted, s."""
 
 LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
-"""m/s, rad/s and the share of what is commanded that it may do otherwise."""
+"""Deviation that is allowed: m/s, rad/s, and a fraction of the command in addition."""
 
 STILL = 0.02
-"""rad/s; wheels that turn slower stand."""
+"""Speed below which a wheel stands, rad/s."""
 
 STANDING_S, STANDS_S = 0.5, 6.0
-"""They have to stand for so long, and within so long."""
+"""Time for which the wheels must stand, and time within which they must come to rest, s."""
 
 LATCHED = ("inactive", "stopped", "fault", "leaving", "waiting")
-"""Modes in which no command counts."""
+"""Modes in which the daemon obeys no command."""
 
 ENTER = "\r\n"
 PRESSED = "a key was pressed"
@@ -52,22 +52,25 @@ class Phase(StrEnum):
 
 
 class Riding:
-    """A leg while it is driven; times are s of one clock."""
+    """A leg while it is driven. All times are in s of the same clock."""
 
     def __init__(
         self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str = ""
     ) -> None:
-        """`sender` is our name on each command, for a daemon that tells whose it follows."""
+        """Start a leg.
+
+        `sender` is the identity in our commands, for a daemon that reports which sender it follows.
+        """
         self._leg, self._source, self._drive, self._sender = leg, source, drive, sender
         self.phase = Phase.OPENING
         self.halted = ""
-        """Why it ended before its end."""
+        """The reason why the leg was cut short, or ""."""
         self._begun = self._heard = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
         self._waits: str | None = "a daemon that hears us"
         self._another = ""
-        """Who drives by our source in our place, in words."""
+        """Another program that drives as our source, as a sentence, or ""."""
         self._still_since: float | None = None
         self._doubted: float | None = None
 
@@ -76,7 +79,7 @@ class Riding:
         return self.phase in (Phase.DONE, Phase.HALTED)
 
     def progress(self, now: float) -> float:
-        """Share of the leg that is done; 1 when it is over."""
+        """Return the fraction of the leg that is done; 1 when it is over."""
         if self.over:
             return 1.0
         if self._number < 0:
@@ -85,11 +88,15 @@ class Riding:
         return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
 
     def key(self, pressed: str, now: float) -> None:
-        """A key was pressed; the hand that has just pressed Enter may still lie on it."""
+        """Handle a key press.
+
+        Enter is ignored at first, because the finger that started the leg may still rest on the
+        key.
+        """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
         if self.phase is Phase.MOVING and now - self._stepped > SILENT_S / 2:
-            self._halt(HELD_UP)  # it may have been pressed because the robot had stopped
+            self._halt(HELD_UP)  # the person may have pressed it because the robot had stopped
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
             self._settle(now)
@@ -97,7 +104,7 @@ class Riding:
             self._halt(PRESSED)
 
     def state(self, state: RobotState, now: float) -> None:
-        """The daemon tells how the robot is."""
+        """Handle a `state` message of the daemon."""
         self._heard = now
         if state.mode in LATCHED:
             self._halt(f"the robot is {state.mode}: {state.reason}")
@@ -111,7 +118,7 @@ class Riding:
             self._doubt(self._objection(state, now), now)
 
     def wheels(self, fastest: float, now: float) -> None:
-        """The fastest wheel turns at so many rad/s."""
+        """Handle wheel feedback: the fastest wheel turns at `fastest` rad/s."""
         self._heard = now
         if fastest > STILL:
             self._still_since = None
@@ -119,10 +126,11 @@ class Riding:
             self._still_since = now
 
     def step(self, now: float) -> Twist:
-        """What is to be commanded at this time."""
+        """Return the command for this time."""
         held_up, self._stepped = now - self._stepped, now
-        # Who was not let run cannot tell whether the daemon spoke; and the robot has braked, the
-        # time of a move may be over, and what comes next would not begin where it should.
+        # After a pause of this process, it is unknown whether the daemon was silent. The robot has
+        # braked meanwhile, and the time of a move may be over, so that the next one would begin at
+        # the wrong place.
         if held_up > SILENT_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP)
         elif now - self._heard > SILENT_S:
@@ -153,7 +161,8 @@ class Riding:
             return
         move = self._leg.moves[self._number]
         self._command = Twist(move.linear, move.angular)
-        # From when the last one was to end: what comes late is not driven on top.
+        # Count from the planned end of the last move, so that a late step does not lengthen the
+        # drive.
         self._ends, self._changed = self._ends + move.seconds, now
 
     def _settle(self, now: float) -> None:
@@ -167,7 +176,11 @@ class Riding:
             self._halt("the wheels do not come to rest though zero is commanded")
 
     def _doubt(self, why: str, now: float) -> None:
-        """A machine that is busy for a moment sends late, and the robot slows down: that passes."""
+        """Halt the leg if a deviation lasts for `DOUBT_S`.
+
+        A computer that is busy for a moment sends late, so that the robot slows down; this is
+        tolerated.
+        """
         if not why:
             self._doubted = None
         elif self._doubted is None:
@@ -176,8 +189,11 @@ class Riding:
             self._halt(why)
 
     def _objection(self, state: RobotState, now: float) -> str:
-        """What speaks against its doing as it is told, by its wheels: a gyro sees what skidding
-        leaves of a turn, which is no disobedience."""
+        """Return why the robot does not follow the command, or "".
+
+        The wheels decide this, not a gyro: a gyro shows the turn that remains after skidding, which
+        is not disobedience.
+        """
         if waits := self._missing(state):
             return f"the daemon does not follow us, it waits for {waits}"
         if now - self._changed < OBEYED_S:
@@ -200,7 +216,7 @@ class Riding:
         return ""
 
     def _driven_by_another(self, state: RobotState) -> bool:
-        """Another program drives by our source, a second calibration say: it came first."""
+        """Return whether another program drives as our source, for example a second calibration."""
         other = bool(self._sender) and state.sender not in ("", self._sender)
         self._another = (
             f"another program drives the robot as {self._source}, {state.sender}: a calibration or "
@@ -211,11 +227,12 @@ class Riding:
         return bool(self._another)
 
     def _missing(self, state: RobotState) -> str:
-        """What our commands wait for before they count; "" when they do."""
+        """Return the condition that our commands wait for, or "" if they are accepted."""
         for one in state.sources:
             if one.name == self._source:
                 heard = one.age is not None and one.age < OPENING_S
-                # Of several senders it names the others as waiting, and we are the one it follows.
+                # With several senders, the daemon lists the others as waiting although it follows
+                # us.
                 followed = state.mode == "driving" and state.sender == self._sender != ""
                 waits_for = "" if followed else one.waits_for
                 return waits_for if heard else waits_for or "a command"

@@ -1,8 +1,8 @@
-"""How fast and how far this robot is driven, so that it stays on 3 m x 3 m and within its limits.
+"""Speeds and distances of the drive, so that the robot stays on 3 m x 3 m and within its limits.
 
-How far it truly turns is what is looked for: an effective track of once to two and a half times the
-geometric one is allowed for. So whatever goes somewhere is driven there and back, or along a line
-that the robot was set on, or turns that have been measured before.
+The true turns are unknown, since they are what the calibration measures. The plan allows for an
+effective track of 1 to 2.5 times the geometric one. Each drive therefore goes there and back,
+follows a line that the robot was set on, or comes after turns that were measured.
 """
 
 from __future__ import annotations
@@ -15,77 +15,88 @@ from acsard.calibration.guided.steps import GuideError, Move
 from acsard.config.settings import Config, DriveConfig
 
 ROOM = 3.0
-"""m, each way."""
+"""Side of the free floor, m."""
 
 MOST_S = 90.0
-"""Of driving in all."""
+"""Longest driving time in all, s."""
 
 SLOW, FASTEST_WHEEL = 0.3, 0.5
-"""m/s that it drives, and that the faster side's wheels roll at most."""
+"""Usual speed of the robot, and largest rolling speed of the faster side's wheels, m/s."""
 
 BODY, EDGE = 0.75, 0.1
-"""A robot reaches as far from its middle as this times its wheel separation, and half a wheel
-radius more; m to the edge of the room."""
+"""Robot size and margin.
+
+The robot reaches `BODY` wheel separations plus half a wheel radius from its middle. `EDGE` is the
+margin to the edge of the floor, m.
+"""
 
 LONGEST, SHORTEST = 2.0, 0.8
-"""m straight ahead: as far as it may, and at least."""
+"""Longest and shortest straight drive, m."""
 
 LEAST_SPEED, LEAST_TURN = 0.05, 0.2
-"""m/s and rad/s that the limits must allow."""
+"""Speed in m/s and turn rate in rad/s that the limits must at least allow."""
 
 STOPS_IN = 0.1
-"""m that it may roll on when a leg ends."""
+"""Distance that the robot may roll on when a leg ends, m."""
 
 WIDEST = 2.5
-"""Effective over geometric track that is allowed for; the least is 1."""
+"""Largest ratio of effective to geometric track that the plan allows for. The smallest is 1."""
 
 
 class Setup(Struct, frozen=True):
-    """The robot and its room: m, m/s, rad/s."""
+    """The robot and its drive plan, in m, m/s and rad/s."""
 
     drive: DriveConfig
     speed: float
-    """Straight ahead."""
+    """Speed straight ahead, m/s."""
     length: float
-    """Of the straight drive."""
+    """Length of the straight drive, m."""
     reach: float
-    """From the robot's middle to its outermost point."""
+    """Distance from the robot's middle to its outermost point, m."""
     turning: float
-    """The fastest turn that may be commanded."""
+    """Fastest turn that may be commanded, rad/s."""
     wheel: float
-    """The fastest that a side may roll."""
+    """Fastest rolling speed of one side, m/s."""
 
     @property
     def from_edge(self) -> float:
-        """Where the robot's middle is to stand for the straight drive, from the near edge."""
+        """Distance of the robot's middle from the near edge before the straight drive, m."""
         return self.reach + EDGE
 
     @property
     def to_middle(self) -> float:
-        """From the end of the straight drive back to the middle of the room."""
+        """Distance from the end of the straight drive back to the middle of the floor, m."""
         return self.from_edge + self.length - ROOM / 2
 
     def ahead(self, metres: float) -> Move:
-        """Straight ahead, or back for less than 0."""
+        """Return a straight move; a negative distance goes backwards."""
         return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
 
     def spin(self, rate: float, seconds: float) -> Move:
-        """On the spot, at a rate in rad/s that is true for wheels that do not skid."""
+        """Return a turn on the spot.
+
+        `rate` is in rad/s and would be the true rate if the wheels did not skid.
+        """
         return Move(seconds, 0.0, self.command(rate))
 
     def arc(self, rate: float, metres: float) -> Move:
-        """Ahead, or back for less than 0, while it turns."""
+        """Return a curve; a negative distance goes backwards. `rate` is as in `spin`."""
         way = self.ahead(metres)
         return Move(way.seconds, way.linear, self.command(rate))
 
     def turn(self, angle: float, rate: float, track: float) -> Move:
-        """On the spot by an angle, rad, at a true rate in rad/s or what can be had of it; `track`:
-        effective over geometric."""
+        """Return a turn on the spot by a true angle.
+
+        Args:
+            angle: the true angle in rad, positive to the left.
+            rate: the wanted true rate in rad/s; the limits may reduce it.
+            track: the ratio of effective to geometric track.
+        """
         told = abs(self.command(rate * track))
         return Move(abs(angle) * track / (told * self._believed), 0.0, math.copysign(told, angle))
 
     def command(self, rate: float) -> float:
-        """The command that turns the wheels against each other so fast, as far as they may."""
+        """Return the angular command for a turn rate without skidding, within the limits, rad/s."""
         most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * self._believed)
         return max(-most, min(most, rate)) / self._believed
 
@@ -95,7 +106,10 @@ class Setup(Struct, frozen=True):
 
 
 def setup(config: Config) -> Setup:
-    """For this robot; raises `GuideError` when it is too large or held too slow."""
+    """Return the plan for this robot.
+
+    Raises `GuideError` if it is too large or its limits are too low.
+    """
     drive, limits = config.drive, config.limits
     speed = min(SLOW, limits.linear_speed, math.sqrt(2 * STOPS_IN * limits.linear_deceleration))
     wheel = min(FASTEST_WHEEL, 0.9 * limits.wheel_speed * drive.wheel_radius)

@@ -1,4 +1,7 @@
-"""Turns on the spot, first until a person says so, then by what that told; and what is read off."""
+"""Turns on the spot and the readings after them.
+
+A person ends the first turn with a key. The later turns use the track that the first one showed.
+"""
 
 from __future__ import annotations
 
@@ -12,37 +15,43 @@ from acsard.calibration.guided.steps import GuideError, Leg, Part, ask
 from acsard.config.settings import DriveConfig
 
 READ_M = 0.002
-"""Standard deviation of a distance of a few decimetres, and of setting the robot to a line."""
+"""Standard deviation of a distance of a few decimetres, and of placing the robot on a line, m."""
 
 FIRST = 1.2
-"""rad/s that the wheels turn against each other, as if they did not skid, in the first turn."""
+"""Rate of the first turn as it would be without skidding, rad/s."""
 
 LATE = 1.1
-"""A first turn that takes longer than this times the slowest has been missed."""
+"""Timeout of the first turn, as a multiple of the duration with the widest track.
+
+Beyond it, the person has missed the end of the turn.
+"""
 
 MOST_SPIN_S = 24.0
-"""For some turns on the spot."""
+"""Longest time for several turns on the spot, s."""
 
 BELIEVABLE = 0.85, 3.0
-"""Effective track over the geometric one: what lies beyond was misread."""
+"""Credible ratios of effective to geometric track. Outside them, a reading must be wrong."""
 
 
 def once_round(setup: Setup, words: str) -> Leg:
-    """A turn to the left that a key ends."""
+    """Return a leg that turns to the left until a key is pressed."""
     longest = LATE * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST)) * setup.drive.wheel_separation_multiplier
     return Leg(words, (setup.spin(FIRST, longest / rate),), by_key=True)
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """As many whole turns at this rate as there is time for; at least one."""
+    """Return the number of whole turns that fit into `MOST_SPIN_S`, from 1 to `most`."""
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
 
 
 def effective(reading: Reading, drive: DriveConfig) -> float:
-    """Effective over geometric track, about, by one reading of turns; raises `GuideError`."""
-    # Of wheels and a track as measured, so that what is configured does not matter.
+    """Return the approximate ratio of effective to geometric track by one reading of turns.
+
+    Raises `GuideError` if it is not credible.
+    """
+    # Use the measured radius and separation without the configured multipliers.
     base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
     told = predicted(joined(reading.rides), "turned", base, base.start()).value
     track = told / reading.value
@@ -56,8 +65,11 @@ def effective(reading: Reading, drive: DriveConfig) -> float:
 
 
 def slant(near: float, far: float, apart: float) -> float:
-    """rad of a robot that is `near` and `far` from a line, at two points so far apart; raises
-    `RefusedError`."""
+    """Return the angle in rad of a robot relative to a line.
+
+    `near` and `far` are the distances from the line to two points of the robot that are `apart` m
+    from each other. Raises `RefusedError` if that is impossible.
+    """
     share = (far - near) / apart
     if abs(share) > 0.98:
         raise RefusedError(
@@ -68,11 +80,14 @@ def slant(near: float, far: float, apart: float) -> float:
 
 
 def millimetres(words: str, least: float, most: float) -> Part[float]:
-    """A length, asked in mm, in m."""
+    """Ask for a length in mm and return it in m."""
     length = yield from ask(words, "mm", least, most)
     return length / 1000.0
 
 
 def deviation(apart: float) -> float:
-    """rad, of the difference of two slants; each is of two distances."""
+    """Return the standard deviation of the difference of two slants, rad.
+
+    Each has two distances.
+    """
     return 2 * READ_M / apart

@@ -1,4 +1,4 @@
-"""What a way of calibrating yields: legs to be driven, numbers to be asked for."""
+"""The steps that a method of calibration yields: legs to drive and numbers to ask for."""
 
 from __future__ import annotations
 
@@ -15,27 +15,30 @@ T = TypeVar("T")
 
 
 class GuideError(AcsardError):
-    """It cannot go on; the text says why and what to do. Nothing has been written."""
+    """End of a guided drive that cannot continue. The text says why and what to do.
+
+    Nothing has been written.
+    """
 
 
 class Move(Struct, frozen=True):
-    """A command held for so long."""
+    """A command that is held for a time."""
 
     seconds: float
     linear: float = 0.0
-    """m/s"""
+    """Linear speed, m/s."""
     angular: float = 0.0
-    """rad/s, left is +."""
+    """Turn rate, rad/s, positive to the left."""
 
 
 class Leg(Struct, frozen=True):
-    """Moves that a person starts by Enter, and any key ends."""
+    """A series of moves that a person starts with Enter and stops with any key."""
 
     words: str
-    """What the person has to see to before, and what the robot will do."""
+    """Instructions to the person, and an announcement of the moves."""
     moves: tuple[Move, ...]
     by_key: bool = False
-    """A key is how the last move is meant to end, and its time only how it ends otherwise."""
+    """Whether a key press is the normal end of the last move, whose duration is then a timeout."""
 
     @property
     def seconds(self) -> float:
@@ -43,28 +46,31 @@ class Leg(Struct, frozen=True):
 
 
 class Ask(Struct, frozen=True):
-    """A number that the person reads off, within bounds."""
+    """A number within bounds that the person reads off."""
 
     words: str
     unit: str
     least: float
     most: float
     usual: float | None = None
-    """What Enter alone stands for."""
+    """The number that Enter alone stands for, or None."""
 
 
 Step = Leg | Ask
 
 Way = Generator[Step, Any, Calibration]
-"""Sent a `Run` for each `Leg`, a number for each `Ask`; raises `GuideError`, `LogError` and
-`RefusedError`."""
+"""A method of calibration.
+
+It is sent a `Run` for each `Leg` and a number for each `Ask`. Raises `GuideError`, `LogError` and
+`RefusedError`.
+"""
 
 Part = Generator[Step, Any, T]
-"""A piece of a way."""
+"""A part of a method, with a result of its own."""
 
 
 def ride(leg: Leg) -> Part[Run]:
-    """What the wheels and sensors told of a leg."""
+    """Yield a leg and return its recording."""
     run: Run = yield leg
     return run
 
@@ -72,6 +78,6 @@ def ride(leg: Leg) -> Part[Run]:
 def ask(
     words: str, unit: str, least: float, most: float, usual: float | None = None
 ) -> Part[float]:
-    """What was read off."""
+    """Yield a question and return the number that the person read off."""
     number: float = yield Ask(words, unit, least, most, usual)
     return number

@@ -1,4 +1,4 @@
-"""With a tape measure alone, beside a straight line on the floor."""
+"""Calibration with a tape measure alone, beside a straight line on the floor."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from acsard.calibration.guided.steps import Leg, Move, Part, Way, ask, ride
 from acsard.calibration.tape import LEAST_M
 
 TAPE_M = 0.005
-"""Standard deviation of the long distance, with that of where its ends are."""
+"""Standard deviation of the long distance, including the position of its ends, m."""
 
 RATES = 0.6, 1.2
-"""rad/s that the robot truly turns."""
+"""True rates of the later turns, rad/s."""
 
 MOST_TURNS = 3
 STANDING = Move(1.0)
 
 
 def straight(setup: Setup) -> Leg:
-    """The first leg."""
+    """Return the first leg, straight ahead."""
     return Leg(
         f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
         "middle (a joint of tiles, a board, chalk). Set the robot to the right of the line, about "
@@ -42,12 +42,12 @@ def straight(setup: Setup) -> Leg:
 
 
 def back(setup: Setup) -> Leg:
-    """To the middle."""
+    """Return the leg back to the middle of the floor."""
     return Leg("It drives back to the middle.", (setup.ahead(-setup.to_middle), STANDING))
 
 
 def first_turn(setup: Setup) -> Leg:
-    """Until the person says that it is round."""
+    """Return the first turn, which a person ends with a key."""
     return once_round(
         setup,
         "It turns to the left, on the spot. Press SPACE when it has turned once round and looks "
@@ -56,7 +56,7 @@ def first_turn(setup: Setup) -> Leg:
 
 
 def spin(setup: Setup, number: int, track: float) -> Leg:
-    """The turns after the first one: slowly to the right, fast to the left."""
+    """Return one of the later turns: number 0 is slow to the right, number 1 fast to the left."""
     rate, side = RATES[number], (-1, 1)[number]
     count = turns(setup, rate, track, MOST_TURNS)
     move = setup.turn(side * 2 * math.pi * count, rate, track)
@@ -65,7 +65,7 @@ def spin(setup: Setup, number: int, track: float) -> Leg:
 
 
 def longest_s(setup: Setup, track: float) -> float:
-    """Of driving, s, with this effective over geometric track."""
+    """Return the driving time in s for a ratio of effective to geometric track."""
     legs = (straight(setup), back(setup), first_turn(setup))
     return sum(leg.seconds for leg in legs) + sum(
         spin(setup, number, track).seconds for number in (0, 1)
@@ -73,7 +73,7 @@ def longest_s(setup: Setup, track: float) -> float:
 
 
 def way(setup: Setup) -> Way:
-    """All of it."""
+    """Calibrate with a tape measure."""
     apart = yield from millimetres(
         "How far apart are the front left and the rear left wheel, axle to axle?", 50, 2000
     )
@@ -101,7 +101,7 @@ def way(setup: Setup) -> Way:
 
 
 def _along(apart: float) -> Part[float]:
-    """rad to the left of the line's direction."""
+    """Ask for two distances and return the robot's angle to the line, rad, positive to the left."""
     front = yield from millimetres("Front left wheel to the line, at a right angle to it?", 0, 1500)
     rear = yield from millimetres("Rear left wheel to the line?", 0, 1500)
     return slant(front, rear, apart)

@@ -1,4 +1,4 @@
-"""With a sensor of turns or places: legs that go there and back, whatever the track is."""
+"""Calibration with a gyro or with positions: legs that go there and back, whatever the track is."""
 
 from __future__ import annotations
 
@@ -11,26 +11,29 @@ from acsard.calibration.solve import calibrate
 from acsard.calibration.tape import LEAST_M, Tape
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""rad/s that the wheels turn against each other, as if they did not skid."""
+"""Rates of turns and curves as they would be without skidding, rad/s."""
 
 SPIN_S = 7.5
 CURVE_M = 1.2
 
 TURN_RAD = 5.0
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Of each turn on the spot and of the curve behind it: rates as above."""
+"""Rates of each turn on the spot and of the curve after it, rad/s, without skidding."""
 
 STANDING_S, PAUSE_S, SHORT_S = 2.5, 1.4, 0.7
-"""At first, in between, and where only the robot has to stop; a gyro's bias is seen at rest."""
+"""Pauses in s: at first, in between, and where the robot only has to stop.
+
+The gyro bias is measured in the longer ones.
+"""
 
 STRAIGHT = "straight"
-"""The run that a tape is for."""
+"""Name of the run that the tape measures."""
 
 REST = Move(PAUSE_S)
 
 
 def straight(setup: Setup) -> Leg:
-    """Along a line."""
+    """Return the first leg, along a straight line."""
     return Leg(
         f"Set the robot {setup.from_edge:.2f} m (its middle) from the near edge of a free floor of "
         f"{ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, looking to the far edge. Mark "
@@ -41,7 +44,7 @@ def straight(setup: Setup) -> Leg:
 
 
 def spins(setup: Setup) -> Leg:
-    """About the middle, for a gyro."""
+    """Return turns and curves about the middle, for a gyro."""
     curve = _curve(setup)
     moves = [REST, setup.ahead(-setup.to_middle), REST]
     for rate in (FAST, -FAST, SLOW, -SLOW):
@@ -56,7 +59,10 @@ def spins(setup: Setup) -> Leg:
 
 
 def petals(setup: Setup) -> Leg:
-    """From the middle, for positions: they see a turn on the spot by what is driven behind it."""
+    """Return turns and curves from the middle, for positions.
+
+    Positions show a turn on the spot only by the curve that follows it.
+    """
     curve = _curve(setup)
     moves = [Move(SHORT_S), setup.ahead(-setup.to_middle), Move(SHORT_S)]
     for rate, bend in PETALS:
@@ -70,7 +76,7 @@ def petals(setup: Setup) -> Leg:
 
 
 def _curve(setup: Setup) -> float:
-    """m along a curve from the middle that stays in the room, whichever way it bends."""
+    """Return the length of a curve from the middle that stays on the floor in any direction, m."""
     return min(CURVE_M, ROOM / 2 - setup.from_edge)
 
 
@@ -81,17 +87,17 @@ def _there_and_back(setup: Setup, rate: float, metres: float) -> list[Move]:
 
 
 def spinning_s(setup: Setup, track: float) -> float:
-    """Of driving with a gyro, s, whatever the effective track is."""
+    """Return the driving time with a gyro, s. It does not depend on the effective track."""
     return straight(setup).seconds + spins(setup).seconds
 
 
 def petals_s(setup: Setup, track: float) -> float:
-    """The same for positions."""
+    """Return the driving time with positions, s. It does not depend on the effective track."""
     return straight(setup).seconds + petals(setup).seconds
 
 
 def gyro(setup: Setup) -> Way:
-    """Turns by a gyro, and a tape for how far."""
+    """Calibrate with a gyro for turns and a tape for the distance."""
     first = yield from ride(straight(setup))
     metres = yield from ask(
         "How far is that wheel from its mark now, in a straight line? Enter alone: not measured",
@@ -103,7 +109,7 @@ def gyro(setup: Setup) -> Way:
 
 
 def positions(setup: Setup) -> Way:
-    """Positions of any source."""
+    """Calibrate with positions of any source."""
     first = yield from ride(straight(setup))
     turns = yield from ride(petals(setup))
     return calibrate(_log(first, turns), setup.drive)

@@ -1,8 +1,8 @@
-"""UMBmark: a square each way round, and how far its end is from its start.
+"""UMBmark: drives a square in both directions and measures how far its end is from its start.
 
 Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile Robots (1995).
-Where they have two formulas for small errors, the same positions go into the general fit here: the
-effective track of a robot that skids is no small error.
+They use two formulas for small errors. Here the same measurements go into the general fit, because
+the effective track of a robot that skids is not a small error.
 """
 
 from __future__ import annotations
@@ -25,20 +25,23 @@ from acsard.calibration.tape import LEAST_M
 
 SIDE_M = 1.2
 TURN = 0.9
-"""rad/s that the robot truly turns."""
+"""True turn rate at the corners, rad/s."""
 
 STANDING = Move(0.6)
 TAPE_M = 0.005
 
 BY_EYE = 0.07
-"""rad, of a robot that looks as before."""
+"""Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of where it ended from its marks; it is set on them with one of its own."""
+"""Standard deviation of the end position relative to the marks, m.
+
+It includes the error of placing the robot on them.
+"""
 
 
 def straight(setup: Setup) -> Leg:
-    """For the size of the wheels."""
+    """Return a straight leg, which measures the size of the wheels."""
     return Leg(
         f"Set the robot {setup.from_edge:.2f} m (its middle) from the near edge of a free floor of "
         f"{ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, looking to the far edge. Mark "
@@ -48,7 +51,7 @@ def straight(setup: Setup) -> Leg:
 
 
 def first_turn(setup: Setup) -> Leg:
-    """Until the person says that it is round."""
+    """Return the first turn, which a person ends with a key."""
     return once_round(
         setup,
         "It turns to the left, on the spot. Press SPACE just when it has turned once round and "
@@ -57,7 +60,10 @@ def first_turn(setup: Setup) -> Leg:
 
 
 def square(setup: Setup, side: int, track: float) -> Leg:
-    """Four sides of a square, with a quarter turn behind each."""
+    """Return the square: four sides, each followed by a quarter turn.
+
+    `side` is 1 for left, -1 for right.
+    """
     which, other = ("left", "right") if side > 0 else ("right", "left")
     turn = setup.turn(side * math.pi / 2, TURN, track)
     edge = length(setup)
@@ -71,18 +77,18 @@ def square(setup: Setup, side: int, track: float) -> Leg:
 
 
 def length(setup: Setup) -> float:
-    """Of the square's side, m."""
+    """Return the length of the square's side, m."""
     return min(SIDE_M, ROOM - 2 * (setup.from_edge + 2 * EDGE))
 
 
 def longest_s(setup: Setup, track: float) -> float:
-    """Of driving, s, with this effective over geometric track."""
+    """Return the driving time in s for a ratio of effective to geometric track."""
     legs = (straight(setup), first_turn(setup), *(square(setup, side, track) for side in (1, -1)))
     return sum(leg.seconds for leg in legs)
 
 
 def way(setup: Setup) -> Way:
-    """All of it."""
+    """Calibrate by UMBmark."""
     apart = yield from millimetres("How wide is the robot, from side to side?", 50, 2000)
     first = yield from ride(straight(setup))
     metres = yield from ask(
@@ -102,7 +108,7 @@ def way(setup: Setup) -> Way:
 
 
 def _end(driven: Run, apart: float) -> Part[list[Reading]]:
-    """Where a square ended, from where it began."""
+    """Ask where a square ended relative to its start and return the readings."""
     words = "How far ahead of its mark is the middle of its {} side (behind it: less than 0)?"
     left = yield from millimetres(words.format("left"), -1500, 1500)
     right = yield from millimetres(words.format("right"), -1500, 1500)

@@ -1,4 +1,4 @@
-"""With a wall that the robot is squared against, and a tape measure."""
+"""Calibration with a tape measure and a wall that the robot is set square against."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from acsard.calibration.tape import LEAST_M
 
 TAPE_M = 0.005
 GAP_M = 0.2
-"""m from the wall that it comes back to."""
+"""Distance from the wall to which the robot returns, m."""
 
 OUT_M = 0.9
-"""Before the turns on the spot."""
+"""Distance that the robot drives before the turns on the spot, m."""
 
 HALF, FAST = 0.8, 1.2
-"""rad/s that the robot truly turns."""
+"""True turn rates of the half turns and of the fast turns, rad/s."""
 
 MOST_TURNS = 2
 STANDING = Move(0.6)
@@ -37,7 +37,7 @@ SQUARE = (
 
 
 def out(setup: Setup) -> Leg:
-    """Away from the wall."""
+    """Return the first leg, away from the wall."""
     return Leg(
         f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the middle of "
         f"that. It drives {setup.length:.2f} m away from the wall.",
@@ -46,7 +46,7 @@ def out(setup: Setup) -> Leg:
 
 
 def first_turn(setup: Setup) -> Leg:
-    """Until the person says that it is round."""
+    """Return the first turn, which a person ends with a key."""
     return once_round(
         setup,
         "It turns to the left, on the spot. Press SPACE when it has turned once round and looks "
@@ -55,12 +55,12 @@ def first_turn(setup: Setup) -> Leg:
 
 
 def home(setup: Setup) -> Leg:
-    """Back, as it came."""
+    """Return the leg backwards to the wall."""
     return Leg("It drives back towards the wall.", (setup.ahead(GAP_M - setup.length), STANDING))
 
 
 def there_and_back(setup: Setup, side: int, track: float) -> Leg:
-    """Out, half a turn, and home again ahead."""
+    """Return a leg away from the wall, half a turn, and back forwards."""
     half = setup.turn(side * math.pi, HALF, track)
     which = "left" if side > 0 else "right"
     return Leg(
@@ -74,7 +74,7 @@ def there_and_back(setup: Setup, side: int, track: float) -> Leg:
 
 
 def spun(setup: Setup, track: float) -> Leg:
-    """Out, some turns, and back."""
+    """Return a leg away from the wall, some turns, and back."""
     count = turns(setup, FAST, track, MOST_TURNS)
     around = setup.turn(-2 * math.pi * count, FAST, track)
     return Leg(
@@ -88,14 +88,14 @@ def spun(setup: Setup, track: float) -> Leg:
 
 
 def longest_s(setup: Setup, track: float) -> float:
-    """Of driving, s, with this effective over geometric track."""
+    """Return the driving time in s for a ratio of effective to geometric track."""
     legs = [out(setup), first_turn(setup), home(setup), spun(setup, track)]
     legs += [there_and_back(setup, side, track) for side in (1, -1)]
     return sum(leg.seconds for leg in legs)
 
 
 def way(setup: Setup) -> Way:
-    """All of it."""
+    """Calibrate with a wall."""
     apart = yield from millimetres(
         "How far apart are the robot's rear corners, where they touch the wall?", 50, 2000
     )
@@ -122,8 +122,13 @@ def way(setup: Setup) -> Way:
 
 
 def _off(apart: float, end: str) -> Part[float]:
-    """rad to the left of where it should look, at a right angle to the wall."""
+    """Ask for the distances of two corners from the wall and return the heading error.
+
+    The result is in rad, positive to the left, and 0 if the robot is square to the wall. `end` is
+    the end of the robot that faces the wall.
+    """
     left = yield from millimetres(f"From the wall to the robot's {end} left corner?", 0, 2500)
     right = yield from millimetres(f"And to its {end} right corner?", 0, 2500)
-    # What lies to the left goes to the wall as the back does, and away from it as the front does.
+    # If the robot looks too far to the left, its left corner is closer to the wall when its back
+    # faces the wall, and farther from it when its front does.
     return slant(left, right, apart) if end == "rear" else slant(right, left, apart)

@@ -1,4 +1,4 @@
-"""**The** table of the ways to calibrate by a guided drive."""
+"""The table of methods of calibration by a guided drive."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from acsard.calibration.guided.setup import WIDEST, Setup
 from acsard.calibration.guided.steps import Way
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
-"""More turns in the time there is make a lesser one take longer, here and there."""
+"""Ratios of effective to geometric track for which the driving time is computed.
+
+The time is not monotonic: a smaller track lets more whole turns fit into the time allowed.
+"""
 
 
 class Kind(Struct, frozen=True):
-    """One way."""
+    """A method of calibration."""
 
     needs: str
     begin: Callable[[Setup], Way]
     longest_s: Callable[[Setup, float], float]
-    """Of driving, s, with an effective over geometric track."""
+    """Driving time in s by the setup and the ratio of effective to geometric track."""
     person: bool
-    """Somebody has to read off numbers."""
+    """Whether a person has to read off numbers."""
 
     def told(self, setup: Setup) -> str:
-        """How long it drives, in words."""
+        """Return the longest driving time as a sentence."""
         most = max(self.longest_s(setup, track) for track in TRACKS)
         return f"It drives for at most {most:.0f} s in all."
 

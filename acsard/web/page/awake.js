@@ -1,10 +1,11 @@
-// The screen stays on while this page moves something: one that locks lets go of the stick and ends a leg.
+// Keeps the screen on while this page moves something. A screen that locks releases the stick and ends a
+// calibration leg.
 
 const movers = new Set();
 let lock = null;
 let turn = Promise.resolve();
 
-/** `mover` begins or ends to move something. */
+/** Register that `mover` starts (`on`) or stops moving something. */
 export function awake(mover, on) {
   if (on === movers.has(mover)) return;
   if (on) movers.add(mover);
@@ -12,7 +13,8 @@ export function awake(mover, on) {
   take();
 }
 
-/** One after the other: a lock that is still asked for cannot be given back yet. */
+/** Request or release the wake lock. The calls run one after the other, because a lock that is still being
+ *  requested cannot be released. */
 function take() {
   turn = turn.then(async () => {
     const wanted = movers.size > 0 && !document.hidden;
@@ -20,10 +22,10 @@ function take() {
       if (wanted && (lock?.released ?? true)) lock = await navigator.wakeLock?.request("screen");
       else if (!movers.size) await lock?.release();
     } catch {
-      // No HTTPS, or a battery that is low: the screen locks as it always does.
+      // Without HTTPS or with a low battery the browser refuses, and the screen locks as usual.
     }
   });
 }
 
-// The browser gives it back when the page is hidden.
+// The browser releases the lock when the page is hidden, so request it again.
 document.addEventListener("visibilitychange", take);

@@ -1,11 +1,11 @@
-// How this page comes in: the invitation that becomes a cookie, and why it is not let in.
+// Access to the page: exchanges an invitation for a cookie, and explains why access is refused.
 
-const AGAIN = 1000; // ms until an invitation that nobody has answered is shown again
-const SHUT = [401, 403, 429]; // who is not let in by these is not let in by asking again
+const AGAIN = 1000; // ms before the next attempt, while the robot does not answer an invitation
+const SHUT = [401, 403, 429]; // HTTP statuses for which a repeated request is pointless
 
-/** Who comes by an invitation has its token behind the #: it becomes a cookie, and is wiped once that
- *  is so, or never will be. Returns why it did not, "" where there was none; `waiting(why)` is told
- *  while the robot does not answer. */
+/** Exchange the token of an invitation (behind the # of the URL) for a cookie. The token is removed from the
+ *  URL once it was accepted or finally rejected. Returns the reason for a rejection, or "" without one or
+ *  without an invitation. `waiting(why)` is called while the robot does not answer. */
 export async function invited(waiting) {
   const token = new URLSearchParams(location.hash.slice(1)).get("token");
   if (!token) return "";
@@ -21,19 +21,19 @@ export async function invited(waiting) {
 
 async function shown(token) {
   const headers = { "Content-Type": "application/json" };
-  // Where it leads to is this page: not to be fetched once more.
+  // The redirect leads to this page, which need not be fetched again.
   const how = { method: "POST", headers, body: JSON.stringify({ token }), redirect: "manual" };
   return asked("token", how, 5000, (answer) => (answer.type === "opaqueredirect" ? { status: 303, error: "" } : null));
 }
 
-/** Why a WebSocket is refused, which no browser tells its page: {why, shut}, `shut` where asking again
- *  changes nothing. */
+/** Return why a WebSocket is refused, as {why, shut}, because no browser reports this. `shut` means that a
+ *  repeated attempt is pointless. */
 export async function refusal() {
   const { status, error, full } = await asked("api/whoami", {}, 2000);
   return { why: error || full || "", shut: SHUT.includes(status) };
 }
 
-/** What was answered, with its status: 0 where nothing was. */
+/** Return the JSON answer with its status, or status 0 if there was no answer. */
 async function asked(path, how, within, special = () => null) {
   try {
     const answer = await fetch(path, { ...how, signal: AbortSignal.timeout(within) });

@@ -1,11 +1,12 @@
-// Stick, keys and gamepad -> one hand. Whatever takes the finger or the eye away lets go.
+// Connects stick, keys and gamepad to one hand. The robot stops when the operator's finger or view leaves the
+// control.
 
 import { awake } from "./awake.js";
 import { Hand, twist, ZERO } from "./hand.js";
 
 export const SOURCE = "teleop";
 const LOOK = 10;
-const TWICE = 50; // ms after letting go
+const TWICE = 50; // ms between the first and the second zero command
 const KEYS = {
   ArrowUp: [0, 1], KeyW: [0, 1], ArrowDown: [0, -1], KeyS: [0, -1],
   ArrowLeft: [-1, 0], KeyA: [-1, 0], ArrowRight: [1, 0], KeyD: [1, 0],
@@ -20,20 +21,20 @@ export class Drive {
   #told;
   #timer = null;
   #again = null;
-  #by = null; // "stick", "keys" or "pad": who pressed is who lets go
+  #by = null; // the input that drives: "stick", "keys" or "pad"; only that one can release
   #push = [0, 0];
   #pressed = new Set();
   #pointer = null;
-  #stamp = 0; // of the last command, ms since 1970
+  #stamp = 0; // stamp of the last command, ms since 1970
   #padHeld = false;
-  #padStrange = false; // and that was said
+  #padStrange = false; // the hint about an unknown gamepad was shown
   state = null;
-  heard = -Infinity; // when that was true, by performance.now()
+  heard = -Infinity; // time at which `state` was true, by performance.now()
   sender = "";
   limits = { linear: 0, angular: 0 };
   limit = 0.2;
   allowed = false;
-  shown = true; // the view with the stick
+  shown = true; // the view with the stick is visible
 
   constructor(link, stick, knob, told) {
     this.#link = link;
@@ -47,7 +48,7 @@ export class Drive {
     return this.#hand.held;
   }
 
-  /** Let go, whoever holds; `why` is said. */
+  /** Release the active input and send a zero command; `why` is shown to the operator. */
   release(why = "") {
     this.#by = this.#pointer = null;
     this.#pressed.clear();
@@ -84,9 +85,10 @@ export class Drive {
   #end(why) {
     clearInterval(this.#timer);
     this.#timer = null;
-    // A daemon that reads late drops what comes on the heels of another command. Told twice, it
-    // has heard it, and then it is silence: who goes on with zeros keeps others from driving.
-    // Timers of a page that is hidden or stands still run late, and somebody else drives by then.
+    // A daemon that reads late drops a command that closely follows another one, so the zero is sent twice.
+    // Then this page is silent, because a sender that repeats zeros keeps other senders from driving. A
+    // hidden or stalled page runs its timers late. By then another person may drive, so the second zero is
+    // left out.
     clearTimeout(this.#again);
     const last = performance.now() + 3 * TWICE;
     this.#again = setTimeout(() => !document.hidden && performance.now() < last && this.#send(ZERO), TWICE);
@@ -95,8 +97,9 @@ export class Drive {
     this.#told(why);
   }
 
-  /** What lets go goes whatever waits before it. Some browsers' clocks stand for 100 ms: of two
-   *  with one stamp the second, a zero maybe, would be taken for a repetition. */
+  /** Send a command. A release bypasses a congested connection. Some browsers' clocks stand still for 100 ms,
+   *  so the stamp always grows: of two commands with one stamp, the daemon would drop the second, maybe a
+   *  zero, as a replay. */
   #send(cmd) {
     this.#stamp = Math.max(performance.timeOrigin + performance.now(), this.#stamp + 0.001);
     const message = { cmd, stamp: this.#stamp, steady: true };
@@ -122,8 +125,8 @@ export class Drive {
     addEventListener("keyup", (event) => this.#key(event, false));
     addEventListener("focusin", (event) => this.#by === "keys" && busy(event) && this.release());
     addEventListener("blur", () => this.release("let go: the window lost the focus"));
-    // For this one the browser waits before it goes elsewhere; the next comes when it has, and on a
-    // busy machine late.
+    // The browser waits for this handler before it navigates. The next event, pagehide, may come late on a
+    // busy machine.
     addEventListener("beforeunload", () => this.release("let go: the page is being left"));
     addEventListener("pagehide", () => this.release());
     document.addEventListener("freeze", () => this.release());
@@ -133,7 +136,7 @@ export class Drive {
     setInterval(() => this.#pad(), 50);
   }
 
-  /** A finger beside the one that drives, wherever: a hand that does two things lets go. */
+  /** A second finger on anything but STOP releases the stick. */
   #second(event) {
     if (this.#pointer !== null && !event.target.closest?.("#stick, #stop")) this.release("let go: one finger drives");
   }
@@ -150,7 +153,7 @@ export class Drive {
     if (!this.#hand.held) this.release();
   }
 
-  /** A mouse tells the end of one button beside another one by a move. */
+  /** A mouse reports a change of a second button by a move event, so check the buttons on each move. */
   #moved(event) {
     if (event.buttons === 1) this.#move(event);
     else this.release("let go: another button is down");
@@ -163,11 +166,11 @@ export class Drive {
   }
 
   #key(event, down) {
-    // Of a key that is let go beside one of these some systems say nothing.
+    // With a modifier key down, some systems do not report the release of another key.
     if (down && this.#by === "keys" && (event.metaKey || event.ctrlKey || event.altKey))
       return this.release("let go: another key is down");
     if (!(event.code in KEYS)) return;
-    // A key that is let go is let go, wherever the focus is by then and whatever else is down.
+    // Handle a key release no matter where the focus is and which other keys are down.
     if (!down && !this.#pressed.delete(event.code)) return;
     if (down && (!this.shown || busy(event))) return;
     event.preventDefault();
@@ -181,7 +184,8 @@ export class Drive {
   }
 
   #pad() {
-    // Of others nobody knows which axis is which: a trigger at rest may read as full lock.
+    // Only the standard mapping is used. On other gamepads the axes are unknown, and a trigger at rest may
+    // read as full lock.
     const pads = [...(navigator.getGamepads?.() ?? [])].filter((one) => one?.connected);
     const pad = pads.find((one) => one.mapping === "standard");
     const strange = !pad && pads.length > 0;
@@ -198,14 +202,15 @@ export class Drive {
   }
 }
 
-/** Keys mean something else to what has the focus, or with others; to a slider the arrows alone. */
+/** Return whether a key belongs to the focused control or to a shortcut. A slider uses the arrow keys only.
+ *  */
 function busy(event) {
   if (event.ctrlKey || event.altKey || event.metaKey) return true;
   const slider = event.target.matches?.("input[type=range]") && event.code?.startsWith("Key");
   return !slider && event.target.matches?.("input, select, textarea");
 }
 
-/** The axis that is pushed farther; nothing within the play of a spring. */
+/** Return the axis that is pushed farther, or 0 within the slack of its spring. */
 function farther(one = 0, other = 0) {
   const most = Math.abs(one) > Math.abs(other) ? one : other;
   return Math.abs(most) < 0.12 ? 0 : most;

@@ -1,5 +1,5 @@
-// A check of the board or a calibration: what the command tells and asks, and what the person beside
-// the robot answers. The command runs at the robot, and ends with this page's connection.
+// A board check or a calibration: shows the command's output and questions, and sends the operator's answers.
+// The command runs on the robot's computer and ends when this page's connection ends.
 
 import { awake } from "./awake.js";
 import { made, text } from "./views.js";
@@ -12,15 +12,15 @@ const LABELS = {
 };
 const NAMES = { check: "Check of the board", calibrate: "Calibration" };
 const LOOKS = { PASS: "", WARN: "warning", FAIL: "error", SKIPPED: "skipped" };
-const LIFE = 100; // ms between two signs of life while it goes on: 900 without one end what moves
+const LIFE = 100; // ms between two signs of life while the command runs; after 900 ms without one, the command stops the wheels
 const MODIFIERS = ["Shift", "Control", "Alt", "AltGraph", "Meta", "Tab"];
 
 export class Guide {
   #link;
-  #running = false; // ours
+  #running = false; // this page started the running command
   #question = null;
-  #rides = false; // a leg: a key stops it
-  #busy = ""; // who else goes through one
+  #rides = false; // a leg is under way, and a key press stops it
+  #busy = ""; // who else runs a check or calibration, in words
 
   constructor(link) {
     this.#link = link;
@@ -29,10 +29,10 @@ export class Guide {
     $("check").addEventListener("click", () => this.#begin({ begin: "check", port: $("check-port").value }));
     $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#way() }));
     $("way").addEventListener("change", () => this.#ways());
-    // As STOP does: a finger that stays down, or slides off, has pressed too.
+    // Act on pointerdown, like STOP: a finger that stays down or slides off has also pressed.
     for (const [name, act] of [["guide-halt", () => this.#key()], ["guide-leave", () => this.leave()]]) {
       $(name).addEventListener("pointerdown", act);
-      $(name).addEventListener("click", (event) => event.detail === 0 && act()); // by Enter
+      $(name).addEventListener("click", (event) => event.detail === 0 && act()); // Enter or Space key
     }
     $("guide-close").addEventListener("click", () => this.#close());
     $("guide-question").addEventListener("submit", (event) => event.preventDefault());
@@ -40,17 +40,17 @@ export class Guide {
     addEventListener("keydown", (event) => this.#pressed(event));
   }
 
-  /** Somebody goes through one, here or elsewhere. */
+  /** Whether a check or a calibration is running, from this page or another one. */
   get going() {
     return this.#running || Boolean(this.#busy);
   }
 
-  /** End what goes on, as Ctrl-C does. */
+  /** End the running command, like Ctrl-C. */
   leave() {
     if (this.#running) this.#link.urge({ press: "leave" });
   }
 
-  /** What may be begun, as `api/guide` says; or why nothing. */
+  /** Show the options that `api/guide` returned, or the reason why there are none. */
   choices({ ways, way, advice, ports, note, error }) {
     text("guide-note", [error ?? note, this.#busy].filter(Boolean).join(" "));
     for (const id of ["check-card", "calibrate-card"]) $(id).hidden = Boolean(error);
@@ -58,7 +58,7 @@ export class Guide {
     options($("check-port"), ports.map(({ port, what }) => [port, what ? `${port} (${what})` : port]));
     const first = !$("way").options.length;
     options($("way"), [["", "a gyro where the robot has one, else a tape"], ...Object.entries(ways).map(([way, needs]) => [way, `${way}: ${needs}`])]);
-    if (first) $("way").value = way; // whoever has chosen keeps what he chose
+    if (first) $("way").value = way; // keep a choice that the operator has made
     text("advice", advice);
     this.#ways();
   }
@@ -171,7 +171,7 @@ export class Guide {
       return button;
     };
     if (answers.length > 1 || answers[0] === "start") return answers.map((one) => answer(one));
-    // What has to be seen to is ticked before it goes on.
+    // A safety confirmation needs a tick before the operator can go on.
     const tick = made("input");
     const go = answer(answers[0], "Go on");
     tick.type = "checkbox";
@@ -209,7 +209,8 @@ export class Guide {
     this.#link.urge({ press: "key" });
   }
 
-  /** As at the terminal: any key stops a robot that drives, Escape ends it all. Space is STOP, everywhere. */
+  /** Keys work as at a terminal: Escape ends the command, and any other key ends a leg. Space is STOP
+   *  everywhere. */
   #pressed(event) {
     if (!this.#running || event.repeat || MODIFIERS.includes(event.key)) return;
     if (event.key === "Escape") this.leave();
@@ -239,7 +240,7 @@ export class Guide {
   }
 }
 
-/** What a terminal says of its keys, as it is here. */
+/** Replace a terminal's key hints by the names of the page's buttons. */
 export function worded(words) {
   return words
     .replace('then type "lifted".', "then tick this.")
@@ -249,8 +250,8 @@ export function worded(words) {
     .replace("any key stops it", "any key or the button stops it");
 }
 
-/** The number that was typed; null where nothing was and something is usual; what it cannot be goes as
- *  it is, and is refused. */
+/** Return the typed number, or null for an empty answer to a question with a default. Other text is returned
+ *  as it is, and the command rejects it. */
 export function typed(words, usual) {
   if (words.trim() === "") return usual === undefined ? "" : null;
   const value = number(words);
@@ -263,7 +264,7 @@ function options(select, rows) {
   if (rows.some(([value]) => value === before)) select.value = before;
 }
 
-/** Where the eye and the screen reader are to be, when the view is shown. */
+/** Move the focus of the eye and of the screen reader, if this view is visible. */
 function focus(id) {
   if (!$("set").hidden) $(id).focus({ preventScroll: false });
 }

@@ -1,20 +1,22 @@
-// What a hand on the stick sends and when. Pure: times in ms come in, commands go out.
+// Decides which commands a held stick sends, and when. This module is pure: times in ms come in, commands go
+// out.
 //
-// A hold opens with zeros until the robot follows us, so that no press is the first thing that a
-// robot hears of this browser; then what is wished goes at 20 Hz; letting go is one zero (which
-// `drive.js` says a second time), then silence. A hold that ended by itself takes a new press: nobody's finger drives twice.
+// A hold begins with zeros until the robot follows this sender, because the daemon must hear a zero from a
+// new sender before it lets the sender drive. Then the wished velocity is sent at 20 Hz. A release sends one
+// zero (`drive.js` repeats it once), then nothing. A hold that ended by itself needs a new press, so a finger
+// that was left on the stick never drives again by accident.
 
 export const PERIOD = 50;
 export const OPENING = 20;
-export const PATIENCE = 2000; // for the robot to follow
-export const GRACE = 500; // for it to follow again
-export const HICCUP = 250; // between two looks: the robot has braked meanwhile, so it opens anew
-export const FROZEN = 1000; // the page stood still, and the finger may be long gone
+export const PATIENCE = 2000; // for the robot to follow after a press
+export const GRACE = 500; // for the robot to follow again after an interruption
+export const HICCUP = 250; // between two looks; after a longer gap the robot has braked, so the hold opens again with zeros
+export const FROZEN = 1000; // after a longer gap the page stood still, and the finger may be gone
 
 const NEVER = ["inactive", "stopped", "fault", "leaving"];
 export const ZERO = { linear_x: 0, angular_z: 0 };
 
-/** Why the robot does not follow `sender`, in words; "" when it does. */
+/** Return why the robot does not follow `sender`, in words, or "" if it does. */
 export function objection(state, source, sender) {
   if (!state) return "nothing is heard of the robot";
   const ours = state.sources.find((one) => one.name === source);
@@ -27,7 +29,7 @@ export function objection(state, source, sender) {
 }
 
 export class Hand {
-  phase = "idle"; // opening, driving
+  phase = "idle"; // "idle", "opening" or "driving"
   #wish = ZERO;
   #begun = 0;
   #looked = 0;
@@ -49,7 +51,7 @@ export class Hand {
     this.#wish = { linear_x: linear, angular_z: angular };
   }
 
-  /** Let go; the zero to send, or null if nothing was held. */
+  /** Release the stick; return the zero command to send, or null if it was not held. */
   release() {
     if (!this.held) return null;
     this.phase = "idle";
@@ -62,8 +64,8 @@ export class Hand {
     this.#sent = -Infinity;
   }
 
-  /** What to send now, and why the hold has ended if it has: {send, ended}. `heard` is when
-   *  `state` was true. */
+  /** Return the command to send now and, if the hold has ended, the reason: {send, ended}. `heard` is the
+   *  time at which `state` was true. */
   look(now, state, heard, source, sender) {
     if (!this.held) return {};
     if (now - this.#looked > FROZEN) return { send: this.release(), ended: "the page stood still: press again" };
@@ -71,7 +73,7 @@ export class Hand {
     this.#looked = now;
     const why = objection(state, source, sender);
     if (state && NEVER.includes(state.mode)) return { send: this.release(), ended: why };
-    // What was true before it opened says nothing of how this goes.
+    // A state from before the hold opened cannot confirm it.
     if (!why && heard > this.#begun) {
       this.#fine = now;
       this.phase = "driving";
@@ -86,12 +88,12 @@ export class Hand {
   }
 }
 
-/** A push of the stick, x right and y up within 1 -> m/s and rad/s. */
+/** Convert a push of the stick (x right and y up, within 1) to m/s and rad/s. */
 export function twist(x, y, limit, limits) {
   const far = Math.hypot(x, y);
   if (far < 0.08) return [0, 0];
   const scale = far > 1 ? 1 / far : 1;
-  // A robot that may only turn has no part of its speed to go by.
+  // A robot that can only turn has a linear limit of 0.
   const share = limits.linear > 0 ? limit / limits.linear : 0;
   const turn = Math.min(limits.angular, Math.max(0.4, limits.angular * share));
   return [y * scale * limit, -x * scale * turn];

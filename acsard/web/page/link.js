@@ -1,10 +1,10 @@
-// The WebSocket: opens again by itself, measures the way there and back, and says how old is what
-// is shown.
+// The WebSocket connection: reconnects by itself, measures the round trip, and knows how old the shown data
+// may be.
 
 const AGAIN = [300, 600, 1200, 2500, 5000];
-const BEAT = 1000; // between two pings
-const STOOD = 150; // ms that the browser's clock may fall behind the wall clock between two pings
-const SILENT = 3000; // without an answer for so long the way is cut, whatever the socket says
+const BEAT = 1000; // ms between two pings
+const STOOD = 150; // ms by which the browser's clock may fall behind the wall clock between two pings
+const SILENT = 3000; // ms without any message after which the connection is cut, whatever the socket reports
 
 export class Link extends EventTarget {
   #socket = null;
@@ -13,15 +13,16 @@ export class Link extends EventTarget {
   #answers = new Map();
   #number = 0;
   #heard = 0;
-  #ahead = null; // of performance.now(), how far the wall clock was ahead at the last ping
-  #asked = null; // a ping that has no answer yet, since when
+  #ahead = null; // lead of the wall clock over performance.now() at the last ping, ms
+  #asked = null; // send time of the ping that has no answer yet
   #timer = null;
   #refused;
-  #shut = false; // for good
+  #shut = false; // closed for good
   open = false;
-  way = null; // there and back, ms
+  way = null; // round trip, ms
 
-  /** `refused()` is asked when the robot takes no connection: true ends the asking. */
+  /** `refused()` is called when the robot rejects a connection; true means that another attempt is pointless.
+   *  */
   constructor(refused) {
     super();
     this.#refused = refused;
@@ -31,26 +32,26 @@ export class Link extends EventTarget {
     this.#connect();
     this.beat();
     document.addEventListener("visibilitychange", () => document.hidden || this.open || this.#connect());
-    // A browser may keep a page that was left, with its connection, and wake it when somebody goes
-    // back to it: the robot would take it for one who looks.
+    // A browser may freeze a page with its open connection when the user leaves it, and resume it later. The
+    // robot would count the frozen page as a viewer.
     addEventListener("pagehide", () => this.#end("the page was left"));
     addEventListener("pageshow", (event) => event.persisted && this.#connect());
   }
 
-  /** How far what is shown may lag behind, ms: the last way there and back, or what is waited for. */
+  /** Possible age of the shown data in ms: the last round trip, or the time that a ping has waited. */
   get lag() {
     return Math.max(this.way ?? 0, this.#asked === null ? 0 : performance.now() - this.#asked);
   }
 
-  /** Ping so often, ms: pings are the signs that somebody is here. */
+  /** Ping every `every` ms; pings are also the signs of life of this page. */
   beat(every = BEAT) {
     clearInterval(this.#timer);
     this.#timer = setInterval(() => this.#ping(), every);
     this.#ping();
   }
 
-  /** Follow a key at most `rate` times a second, also after a new connection; of another `robot`
-   *  than the page's own, if it is named. */
+  /** Subscribe to a key at most `rate` times a second, again after each reconnection. `robot` names a robot
+   *  other than the page's own. */
   subscribe(key, rate, robot) {
     const asked = { subscribe: key, rate, robot };
     this.#wanted.set(key, asked);
@@ -62,19 +63,21 @@ export class Link extends EventTarget {
     if (this.#wanted.delete(key)) this.send({ unsubscribe: key, robot: asked.robot });
   }
 
-  /** True when it was handed on: nothing is kept for later, and nothing is added to a jam. */
+  /** Send a message if the connection is open and not congested, and return whether it was sent. Nothing is
+   *  queued. */
   send(message) {
     if (!this.open || this.#socket.bufferedAmount > 4096) return false;
     this.#socket.send(JSON.stringify(message));
     return true;
   }
 
-  /** The same whatever waits before it: what stops something. */
+  /** Send a message even over a congested connection; use it for messages that stop something. */
   urge(message) {
     if (this.open) this.#socket.send(JSON.stringify(message));
   }
 
-  /** Ask for a service (of another `robot`, if it is named); the answer, or why there is none. */
+  /** Call a service, on another `robot` if it is named. Resolves to the answer, or to the reason why there is
+   *  none. */
   call(verb, payload, robot) {
     const id = ++this.#number;
     return new Promise((done) => {
@@ -106,7 +109,7 @@ export class Link extends EventTarget {
       const was = this.open;
       this.#down(event.reason);
       if (!was) this.#shut = await this.#refused();
-      if (document.hidden) return; // again when somebody looks
+      if (document.hidden) return; // reconnect when the page is visible again
       setTimeout(() => this.#connect(), AGAIN[Math.min(this.#tries++, AGAIN.length - 1)]);
     };
   }
@@ -114,7 +117,7 @@ export class Link extends EventTarget {
   #take(message) {
     this.#heard = performance.now();
     if ("pong" in message) {
-      // What is asked again before the answer has more than one.
+      // A ping that was repeated before its answer gets several answers; only the first counts.
       if (message.pong !== this.#asked) return;
       this.way = performance.now() - this.#asked;
       this.#asked = null;
@@ -136,8 +139,8 @@ export class Link extends EventTarget {
     const before = this.#ahead;
     this.#ahead = Date.now() - performance.now();
     if (!this.open) return;
-    // While a computer sleeps, performance.now() may stand. Commands stamped by it would look late
-    // for ever, so they need a connection of their own, which gives them a new sender.
+    // performance.now() may stand still while a computer sleeps. Commands stamped by it would then always
+    // look late, so the page reconnects, which gives it a new sender id.
     const stood = before !== null && Math.abs(this.#ahead - before) > STOOD;
     if (stood || performance.now() - this.#heard > SILENT) {
       this.#end(stood ? "this device slept, or its clock was set" : "no answer");
@@ -148,7 +151,8 @@ export class Link extends EventTarget {
     this.send({ ping: this.#asked });
   }
 
-  /** At once: a close needs an answer too, which a cut way or a frozen page does not have. */
+  /** Drop the connection without waiting for the answer to a close, which a dead link or a frozen page never
+   *  gives. */
   #end(reason) {
     const socket = this.#socket;
     if (!socket) return;
@@ -157,7 +161,7 @@ export class Link extends EventTarget {
     this.#down(reason);
   }
 
-  /** What was asked by it has no answer any more. */
+  /** Mark the link as down and fail all calls that wait for an answer. */
   #down(reason) {
     this.open = false;
     this.way = null;

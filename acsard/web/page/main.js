@@ -1,4 +1,4 @@
-// The page: one link, one hand, and the views.
+// The page: one link, one drive control, and the views.
 
 import { invited, refusal } from "./door.js";
 import { Drive, SOURCE } from "./drive.js";
@@ -15,7 +15,8 @@ import * as views from "./views.js";
 import { figure, milliseconds, said as clickable, signed, yaw } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
-/** Another robot than the page's own: seen and stopped here; to drive or set it, it has its own page. */
+/** Id of another robot that this page shows. It can be watched and stopped here; its own page drives and
+ *  configures it. */
 const OTHER = new URLSearchParams(location.search).get("robot") || undefined;
 const VIEWS = ["drive", "status", "events", "set", "robots"].filter((name) => !(OTHER && name === "set"));
 const words = (told) => clickable(told, OTHER);
@@ -31,14 +32,14 @@ const recordings = new Recordings($("recordings"), $("no-recordings"));
 const plots = new Minute();
 let view = "drive";
 let state = null;
-let heard = -Infinity; // when what `state` says was true, by performance.now()
+let heard = -Infinity; // time at which `state` was true, by performance.now()
 let hello = null;
 let wished = null;
-let tried = false; // to connect
-let seen = false; // a state, whatever has become of it
-let silent = ""; // why nothing is heard, as the page's server says
-let uninvited = ""; // why the invitation did not let us in
-let period = 0; // s from one state of another robot's to the next
+let tried = false; // a connection was attempted
+let seen = false; // a state was received at some time
+let silent = ""; // why the robot is silent, as reported by the page's server
+let uninvited = ""; // why the invitation was rejected
+let period = 0; // seconds between two states of another robot
 
 function open(name) {
   view = VIEWS.includes(name) ? name : "drive";
@@ -68,7 +69,7 @@ function stop() {
   stopping.press();
 }
 
-/** STOP without the link: there may be no place for one more page. */
+/** Send STOP by HTTP, without the WebSocket: the server may have refused this page's connection. */
 async function posted() {
   try {
     const body = JSON.stringify({ robot: OTHER });
@@ -82,7 +83,7 @@ async function posted() {
 
 async function asked(verb, payload) {
   const told = await link.call(verb, payload);
-  views.alarm(told.ok ? "" : words(told.text)); // which is seen in every view
+  views.alarm(told.ok ? "" : words(told.text)); // the alarm is visible in every view
   said(told.ok ? told : { ok: true, text: "" });
 }
 
@@ -91,7 +92,7 @@ async function set(payload) {
   configured();
 }
 
-/** At the stick; what the banner says is not said twice. */
+/** Show a message at the stick. A reason that the banner already shows is not repeated. */
 function told(why) {
   views.text("told", why && why === state?.reason ? "not driving: why stands above" : words(why));
 }
@@ -133,7 +134,7 @@ function limited() {
   $("most").textContent = `${drive.limit.toFixed(2)} m/s`;
 }
 
-/** For how long a state is fresh, ms: one that is published seldom for longer. */
+/** How long a state counts as fresh, ms; the time grows with the interval between two states. */
 function lasts() {
   return Math.max(500, OTHER ? 2500 * (period || 1) : 2500 / (hello?.state_rate || 10));
 }
@@ -150,24 +151,24 @@ function looked() {
 }
 
 function stated({ detail }) {
-  // What was true long before this page came is nothing that it has measured.
+  // A state from long before this page opened says nothing about the present.
   if (!state && detail.age > 2 * lasts()) return;
   const since = state ? (milliseconds(detail.value.stamp) - milliseconds(state.stamp)) / 1000 : 0;
   if (since > 0) period = Math.min(since, 10);
-  // What was said of a stop is not true any more once that is cleared.
+  // A message about a stop is outdated once the stop is cleared.
   if (LATCHED.includes(state?.mode) && !LATCHED.includes(detail.value.mode)) views.text("told", "");
   seen = true;
   state = drive.state = detail.value;
   heard = drive.heard = performance.now() - detail.age;
   silent = "";
-  // A check that goes on does not end with the daemon's stop.
+  // The daemon's stop does not end a running check, so it confirms STOP only if none is running.
   if (LATCHED.includes(state.mode) && !guide.going) stopping.heard(heard - link.lag);
   views.banner(state, hello?.role === "viewer", OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
-  const { linear, angular } = state; // null while no feedback comes
+  const { linear, angular } = state; // null without feedback from the board
   views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
   views.text("turn", `${figure(angular, 2)} of ${figure(wished?.angular, 2)} rad/s`);
   const late = state.figures.period_lateness?.last_minute;
@@ -192,13 +193,13 @@ function greeted({ detail }) {
   $("limit").max = String(hello.limits.linear);
   limited();
   views.text("hint", hint(hello.role, OTHER));
-  if (uninvited) views.text("told", uninvited); // let in all the same, by an earlier one
+  if (uninvited) views.text("told", uninvited); // an earlier token still gave access
   uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);
   if (OTHER) elsewhere();
 }
 
-/** What this page is to a robot that is not its own. */
+/** Explain that this page shows a robot other than its own. */
 function elsewhere() {
   const back = views.made("a", "", `Back to ${hello.robot}`);
   back.href = "./";
@@ -207,7 +208,7 @@ function elsewhere() {
   $("other").hidden = false;
 }
 
-/** The robot takes no connection: say why. True where asking again changes nothing. */
+/** Show why the robot rejects the connection. Returns true if another attempt is pointless. */
 async function refused() {
   const { why, shut } = await refusal();
   if (link.open) return false;
@@ -257,29 +258,29 @@ link.addEventListener("down", ({ detail }) => {
   drive.release("let go: the connection is gone");
   tried = true;
   heard = -Infinity;
-  views.lost(detail.reason || (state ? "it is tried again" : "")); // what stands there else is of before
+  views.lost(detail.reason || (state ? "it is tried again" : "")); // the text shown before is outdated
   state = drive.state = wished = null;
 });
 
 for (const name of VIEWS) $(`tab-${name}`).addEventListener("click", () => open(name));
 document.querySelector("nav").addEventListener("keydown", (event) => {
   const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-  if (!step || view === "drive") return; // there the arrows drive
+  if (!step || view === "drive") return; // in this view the arrow keys drive
   open(VIEWS[(VIEWS.indexOf(view) + step + VIEWS.length) % VIEWS.length]);
   $(`tab-${view}`).focus();
 });
 $("stop").addEventListener("pointerdown", stop);
-$("stop").addEventListener("click", (event) => event.detail === 0 && stop()); // by Enter
+$("stop").addEventListener("click", (event) => event.detail === 0 && stop()); // Enter or Space key
 addEventListener("keydown", (event) => {
   if (event.code !== "Space") return;
   event.preventDefault();
   if (!event.repeat) stop();
 }, true);
 addEventListener("keyup", (event) => event.code === "Space" && event.preventDefault(), true);
-// The daemon refuses if a stop came after the state that this person sees.
+// The daemon refuses if a stop or a "deactivate" came after the state that this person sees.
 $("clear").addEventListener("click", () => (stopping.over(), asked("clear", { latch: state?.latch })));
 addEventListener("pagehide", () => stopping.over());
-$("activate").addEventListener("click", () => asked("activate"));
+$("activate").addEventListener("click", () => asked("activate", { latch: state?.latch }));
 $("deactivate").addEventListener("click", () => asked("deactivate"));
 $("reset").addEventListener("click", () => asked("reset_odometry"));
 $("nearer").addEventListener("click", () => map.zoom(1.4));
@@ -287,7 +288,8 @@ $("farther").addEventListener("click", () => map.zoom(1 / 1.4));
 $("recentre").addEventListener("click", () => map.recentre());
 $("erase").addEventListener("click", () => map.erase());
 $("limit").addEventListener("input", limited);
-// A finger or mouse that has set it leaves the arrows to the stick; who came here by Tab has them.
+// After a mouse or a finger has set the slider, the arrow keys drive again. A user who reached it by Tab
+// keeps them.
 for (const name of ["pointerup", "click", "change"])
   $("limit").addEventListener(name, ({ target }) => target.matches(":focus-visible") || target.blur());
 $("again").addEventListener("click", () => location.reload());
@@ -300,9 +302,9 @@ open("drive");
 for (const [key, rate] of [["state", 10], ["odom", 20], ["cmd_vel_out", 10], ["wheel_states", 5], ["events", 5]])
   link.subscribe(key, rate, OTHER);
 setInterval(looked, 100);
-// A recording grows, and a new one begins, while they are looked at.
+// Refresh the list, because recordings grow and new ones begin while it is visible.
 setInterval(() => view === "events" && !document.hidden && listed(), 5000);
-// A link that is opened where this page is already changes no more than what is behind the #.
+// Opening an invitation where this page is already open only changes the part behind the #, so reload.
 addEventListener("hashchange", () => location.reload());
 uninvited = await invited(views.lost);
 link.start();

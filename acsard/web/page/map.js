@@ -1,4 +1,5 @@
-// The map: trail, robot, a grid in metres. Drag moves, wheel and pinch zoom, ◎ follows again.
+// The map: path, robot, and a grid in metres. Dragging moves it, wheel and pinch zoom it, ◎ follows the robot
+// again.
 
 const MOST = 20000;
 
@@ -7,7 +8,7 @@ export class PathMap {
   #pose = null;
   #truth = null;
   #trail = [];
-  #zoom = 90; // pixels a metre
+  #zoom = 90; // pixels per metre
   #centre = [0, 0];
   #follow = true;
   #fingers = new Map();
@@ -30,7 +31,7 @@ export class PathMap {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.redraw());
   }
 
-  /** The path so far, [[x, y], …] in m. */
+  /** Set the path so far, [[x, y], …] in m. */
   trail(points) {
     this.#trail = points.slice(-MOST);
     this.redraw();
@@ -41,13 +42,13 @@ export class PathMap {
     if (this.#follow) this.#centre = [x, y];
     const last = this.#trail.at(-1);
     const way = last ? Math.hypot(x - last[0], y - last[1]) : Infinity;
-    if (last && way > 1) this.#trail.push([NaN, NaN]); // the pose was set, nobody drove there
+    if (last && way > 1) this.#trail.push([NaN, NaN]); // a jump: the pose was set, so break the line
     if (way > 0.02) this.#trail.push([x, y]);
     if (this.#trail.length > MOST) this.#trail.splice(0, MOST / 10);
     this.redraw();
   }
 
-  /** Where the simulated robot really is. */
+  /** Set the true position of a simulated robot, m. */
   truth(x, y) {
     this.#truth = [x, y];
   }
@@ -161,7 +162,7 @@ function robot(paper, [x, y], yaw, size, look) {
   paper.restore();
 }
 
-/** A cleared canvas as sharp as the screen: [context, width, height] in CSS pixels. */
+/** Return a cleared canvas in the screen's resolution: [context, width, height], in CSS pixels. */
 export function sized(canvas) {
   const { clientWidth: width, clientHeight: height } = canvas;
   const sharp = devicePixelRatio || 1;
@@ -173,7 +174,7 @@ export function sized(canvas) {
   return [paper, width, height];
 }
 
-/** The page's colours as they are now, light or dark. */
+/** Return a function that reads the page's present colours, light or dark. */
 export function colours() {
   const style = getComputedStyle(document.documentElement);
   return (name) => style.getPropertyValue(name).trim();

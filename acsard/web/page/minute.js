@@ -1,5 +1,5 @@
-// The plots of the last minute: they begin with what the page's server has kept, and what is not
-// known of it is said.
+// The plots of the last minute. They begin with the data that the page's server has kept, and the page says
+// which part is missing.
 
 import { GAP, Plot, SPAN } from "./plot.js";
 
@@ -8,8 +8,8 @@ const WHEELS = ["front right", "front left", "rear left", "rear right"].map((nam
 const LATE = [{ name: "99 %", colour: "--accent" }, { name: "most", colour: "--bad" }];
 
 export class Minute {
-  #before = performance.now(); // nothing is known of before then
-  #wished = -Infinity; // and until then not always what was wished
+  #before = performance.now(); // nothing is known from before this time
+  #wished = -Infinity; // the wished speeds have gaps before this time
 
   constructor() {
     const plot = (name, ...rest) => new Plot(document.getElementById(`plot-${name}`), ...rest);
@@ -19,7 +19,7 @@ export class Minute {
     this.late = plot("late", LATE, { low: 0, high: 1 });
   }
 
-  /** `kept`: a column for each line, as long as `age`, ms, of what was known at `now`. */
+  /** Add the server's data: a column for each line, as long as `age` (ms before `now`). */
   begin(now, kept) {
     const times = kept.age.map((age) => now - age);
     this.speed.begin(times, kept.linear, kept.wished_linear);
@@ -39,7 +39,7 @@ export class Minute {
     for (const plot of [this.speed, this.turn, this.wheels, this.late]) plot.draw(now);
   }
 
-  /** What they lack, in words; "" when it is all there. */
+  /** Return which part of the last minute is missing, in words, or "". */
   lacks(now) {
     const recent = now - SPAN + GAP;
     const clock = (at) => new Date(Date.now() - now + at).toLocaleTimeString();

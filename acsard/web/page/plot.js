@@ -1,15 +1,16 @@
-// One plot of the last minute: lines over time, the scale at the left, now at the right, and below
-// it which line is which and what it says now.
+// One plot of the last minute: lines over time, the scale at the left, the present at the right, and below it
+// a legend with the present values.
 
 import { colours, sized } from "./map.js";
 import { made } from "./views.js";
 import { signed } from "./words.js";
 
 export const SPAN = 60000;
-export const GAP = 2000; // with nothing known for so long a line is broken
+export const GAP = 2000; // a line is broken where its values are missing for longer, ms
 const ROOM = 44;
 
-// Dash and shift of each line, px. Drawn in this order, of four that lie on each other each is seen.
+// Dash pattern and offset of each line, px. With this drawing order, four lines on top of each other all stay
+// visible.
 const LOOKS = [[[], 0], [[12, 12], 0], [[4, 8], 0], [[5, 19], 5]];
 
 export class Plot {
@@ -17,7 +18,7 @@ export class Plot {
   #lines;
   #floor;
 
-  /** `lines`: [{name, colour}], as many as each `add` has values; `floor`: the least range. */
+  /** `lines`: [{name, colour}], one for each value of `add`; `floor`: the smallest range of the scale. */
   constructor(canvas, lines, floor) {
     this.#canvas = canvas;
     this.#lines = lines.map((line) => ({ ...line, points: [], sample: made("canvas"), said: made("span") }));
@@ -27,7 +28,7 @@ export class Plot {
     canvas.after(made("p", "legend", ...legend));
   }
 
-  /** Values at `now`, ms; null leaves a line as it is. */
+  /** Add one value per line at `now`, ms; null adds nothing to its line. */
   add(now, ...values) {
     values.forEach((value, n) => {
       if (value === null || value === undefined) return;
@@ -37,8 +38,8 @@ export class Plot {
     });
   }
 
-  /** What is known of before, in the place of what stands there of the same time: times, and a
-   *  column for each line, null where nothing is known. */
+  /** Insert earlier values and replace the points of the same time span: times in ms, and a column for each
+   *  line with null where a value is unknown. */
   begin(times, ...columns) {
     if (!times.length) return;
     columns.forEach((column, n) => {
@@ -60,7 +61,7 @@ export class Plot {
     const x = (at) => ROOM + ((at - now + SPAN) / SPAN) * (width - ROOM - 6);
     const y = (value) => 8 + ((top - value) / (top - bottom)) * (height - 18);
     const first = Math.min(now, ...this.#lines.flatMap((line) => line.points.slice(0, 1).map((point) => point[0])));
-    paper.fillStyle = look("--ground"); // nothing is known of then
+    paper.fillStyle = look("--ground"); // shade the time before the first value
     if (first > now - SPAN) paper.fillRect(ROOM, 8, x(first) - ROOM, height - 18);
     paper.font = "11px system-ui, sans-serif";
     paper.fillStyle = look("--quiet");
@@ -71,7 +72,7 @@ export class Plot {
       paper.moveTo(ROOM, y(value));
       paper.lineTo(width - 6, y(value));
       paper.stroke();
-      // Where two are nearly one, the words of the one that is not zero are left out.
+      // Leave out a label that would overlap the label of zero.
       if (value && Math.abs(y(value) - y(0)) < 14) continue;
       paper.fillText(signed(value / (value ? 1.08 : 1), Math.abs(top) < 10 ? 2 : 0), 6, y(value) + 4);
     }

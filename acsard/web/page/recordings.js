@@ -1,4 +1,4 @@
-// The black box: each recording with its download, and its report, which the robot draws when asked.
+// The recordings of the black box: each with its download and its report, which the robot draws on request.
 
 import { made } from "./views.js";
 import { began, lasted } from "./words.js";
@@ -8,7 +8,7 @@ const AGAIN = 1000;
 export class Recordings {
   #list;
   #none;
-  #reports = new Map(); // by name: its place in the row, which outlives the row
+  #reports = new Map(); // by name: the element with the report's button, kept when the row is rebuilt
   #shown = "";
 
   constructor(list, none) {
@@ -16,10 +16,11 @@ export class Recordings {
     this.#none = none;
   }
 
-  /** `barred` is why this one may not fetch them, "" for who may; `trouble` why there are none. */
+  /** Show the list. `barred` is the reason why this user may not download, or ""; `trouble` is the reason why
+   *  the list is empty. */
   show(files, barred, trouble = "") {
     const shown = JSON.stringify([files, barred, trouble]);
-    if (shown === this.#shown) return; // what has the focus keeps it
+    if (shown === this.#shown) return; // do not rebuild an unchanged list, so the focus stays
     this.#shown = shown;
     this.#none.textContent = trouble || "none here";
     this.#none.hidden = files.length > 0;
@@ -64,7 +65,7 @@ export class Recordings {
   }
 }
 
-/** How far it is; who asks first has it begun. */
+/** Request the progress of a report; the first request starts the drawing. */
 async function ask(name) {
   try {
     const way = `api/recordings/${encodeURIComponent(name)}/report`;

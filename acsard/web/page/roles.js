@@ -1,4 +1,4 @@
-// What each role may: nothing looks as if it could be pressed that would be refused.
+// Permissions of each role. A control that the robot would refuse is shown as disabled.
 
 const ROLES = ["viewer", "operator", "maintainer"];
 
@@ -6,21 +6,21 @@ export function may(role, least) {
   return ROLES.indexOf(role) >= ROLES.indexOf(least);
 }
 
-/** Why not, in words; "" for who may. */
+/** Return why the role is not sufficient, in words, or "" if it is. */
 export function barred(role, least) {
   if (may(role, least)) return "";
   return role ? `for who is ${least}; you are ${role}` : "no connection yet";
 }
 
-/** What stands at the stick while nobody holds it: how to drive, or why that is not for this one;
- *  `other` is a robot that is seen by the page of another one. */
+/** Return the hint at the stick while it is not held: how to drive, or why this user cannot. `other` is the
+ *  id of a robot that is not the page's own. */
 export function hint(role, other) {
   if (other) return `To drive ${other}, open its own page.`;
   return may(role, "operator") ? "Hold and push to drive; let go to stop." : "You may watch and stop, not drive.";
 }
 
-/** Switch off what this role may not, and say why on it and in what describes it; or all of it, for
- *  another reason. `role` is "" while nobody knows. */
+/** Disable the controls that this role may not use and explain why, on the control and in its description.
+ *  `reason` disables all of them for that reason. `role` is "" while it is unknown. */
 export function permit(role, reason = "") {
   document.getElementById("barred").textContent = reason || barred(role, "operator");
   for (const one of document.querySelectorAll("[data-least]")) {

@@ -1,4 +1,4 @@
-// What may be set while the robot runs: a row for each, its range beside it.
+// The settings that can be changed while the robot runs: one row each, with its range.
 
 import { made } from "./views.js";
 import { number } from "./words.js";
@@ -7,14 +7,14 @@ export class Settings {
   #form;
   #call;
 
-  /** `call(payload)` sets, and says what became of it. */
+  /** `call(payload)` changes a setting and shows the outcome. */
   constructor(form, call) {
     this.#form = form;
     this.#call = call;
     form.addEventListener("submit", (event) => event.preventDefault());
   }
 
-  /** Rows of {key, value, what, when, low, high, choices}. */
+  /** Show rows of {key, value, what, when, low, high, choices}. */
   show(rows) {
     if (this.#form.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;
     this.#form.replaceChildren(...rows.map((row, n) => this.#row(row, `set-${n}`)));
@@ -23,7 +23,7 @@ export class Settings {
   #row(row, id) {
     const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
     const list = Array.isArray(row.value) ? "; commas between them and no space, which is STOP" : "";
-    // A narrow screen breaks a name where its words end.
+    // Allow a narrow screen to break a key at its dots and underscores.
     const name = row.key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
     const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}${list}`));
     label.htmlFor = id;
@@ -41,7 +41,8 @@ export class Settings {
   }
 }
 
-/** What was typed, of the kind that stands there now; what it cannot be goes as it is, and is refused. */
+/** Convert the typed text to the type of the present value. Text that does not fit is returned as it is, and
+ *  the daemon rejects it. */
 export function read(typed, before) {
   if (Array.isArray(before)) return typed.split(",").map(one);
   return typeof before === "number" ? one(typed) : typed;

@@ -1,20 +1,20 @@
-// STOP: sent until the robot has it, since a link may be dead and not know it yet. Never much later
-// than it was pressed: by then somebody may have cleared it and be driving.
+// STOP: repeated until the robot confirms it, because a dead link is not noticed at once. It is not repeated
+// for long: later another person may have cleared the stop and be driving.
 
-const URGENT = 30000; // ms after the press, by whichever clock comes first: one is set, one may sleep
-const PAUSE = 300; // between two
+const URGENT = 30000; // ms after the press, by the clock that gets there first: one may be set, the other may sleep
+const PAUSE = 300; // ms between two attempts
 const UNSURE = "STOP was not confirmed: look at the robot, and press it again";
 
 export class Stopping {
   #send;
   #tell;
   #press = 0;
-  #waits = false; // for the robot to have it
-  #since = Infinity; // when it was pressed, by performance.now()
+  #waits = false; // waiting for the robot's confirmation
+  #since = Infinity; // time of the press, by performance.now()
   #arrived = false;
 
-  /** `send()` asks once and gives {ok, text, lost}, `lost` where nobody answered; `tell(words)` is
-   *  what a person sees. */
+  /** `send()` sends one request and resolves to {ok, text, lost}; `lost` means that there was no answer.
+   *  `tell(words)` shows a message to the operator. */
   constructor(send, tell) {
     this.#send = send;
     this.#tell = tell;
@@ -28,7 +28,7 @@ export class Stopping {
     this.#arrived = false;
     for (;;) {
       const told = await this.#send();
-      if (press !== this.#press) return; // a newer one tells
+      if (press !== this.#press) return; // a newer press took over
       if (this.#ends(told)) return;
       this.#tell(`STOP: ${told.text}; it is sent again`);
       await new Promise((done) => setTimeout(done, PAUSE));
@@ -37,12 +37,13 @@ export class Stopping {
     }
   }
 
-  /** The robot said at that time that it is stopped: as good as an answer, where there was none. */
+  /** Note that the robot reported itself as stopped at the time `at`. This counts as the answer if the answer
+   *  was lost. */
   heard(at) {
     if (at > this.#since) this.#arrived = true;
   }
 
-  /** Nothing is sent any more of what was pressed: somebody clears it, or the page goes. */
+  /** Give up the pending STOP, because the operator clears it or leaves the page. */
   over() {
     ++this.#press;
     if (this.#waits) this.#tell(UNSURE);

@@ -1,10 +1,10 @@
-// What the other views show: rows made of what the bus says. Text goes in as text, never as HTML.
+// Fills the views from the messages of the bus. Text is inserted as text, never as HTML.
 
 import { age, ago, clock, reason, said, signed } from "./words.js";
 
 const LEVELS = ["", "warning", "error", "warning"];
 
-/** An element with its children; strings become text. */
+/** Return an element with its children; strings become text nodes. */
 export function made(name, look, ...children) {
   const element = document.createElement(name);
   if (look) element.className = look;
@@ -50,8 +50,9 @@ export function happened(list, told, elsewhere) {
   list.replaceChildren(...rows);
 }
 
-/** A card for each robot, which opens it; those that stay are not made anew, or nobody could press
- *  them. `own` is the id of the page's own, `here` of the one that this page clears. */
+/** Show a card with a link for each robot. Existing cards are updated in place, because a replaced card
+ *  cannot be pressed. `own` is the id of the page's own robot, `here` the id of the robot that this page can
+ *  clear. */
 export function cards(list, robots, own, here) {
   const before = new Map([...list.children].map((card) => [card.dataset.robot, card]));
   const shown = robots.map((one) => {
@@ -82,7 +83,7 @@ function empty(robot, own) {
   return card;
 }
 
-/** Mode and why, in words, and what doubts there are. */
+/** Show the mode, the reason and any warnings. */
 export function banner(state, viewer, elsewhere) {
   document.body.dataset.mode = state.mode;
   text("mode", state.mode.toUpperCase());
@@ -94,21 +95,21 @@ export function banner(state, viewer, elsewhere) {
   doubt.hidden = !doubt.textContent;
 }
 
-/** The robot's computer is there, and nothing is known of the robot yet. */
+/** Show that the robot's computer answers but has reported nothing about the robot yet. */
 export function waiting() {
   document.body.dataset.mode = "waiting";
   text("mode", "WAITING");
   text("reason", "for the robot: nothing is heard of it yet");
 }
 
-/** What stands there is old: nobody knows whether it still drives. */
+/** Show that the data is old and that the robot may or may not be driving. */
 export function unheard(why) {
   document.body.dataset.mode = "waiting";
   text("mode", "NOT HEARD");
   text("reason", why || "nothing is heard of the robot; what is shown is of before");
 }
 
-/** Nothing is known any more: what was shown last is not what is. */
+/** Show that the connection is lost, and blank the values that are no longer known. */
 export function lost(why) {
   document.body.dataset.mode = "waiting";
   text("mode", "NO CONNECTION");
@@ -116,15 +117,15 @@ export function lost(why) {
   for (const name of ["speed", "turn", "who"]) text(name, "–");
 }
 
-/** How old what is shown is, ms; beyond `fresh` it is stale. And the way to the robot and back.
- *  `none` is said while nothing is known; `seen`: something was, and is still shown. */
+/** Show the age of the data (`old`, ms; stale above `fresh`) and the round trip (`way`, ms). `none` is shown
+ *  while there is no data; `seen` means that older data is still on the page. */
 export function freshness(old, fresh, way, none, seen) {
   const stale = old > fresh;
   document.body.classList.toggle("stale", stale && seen);
   text("age", old === Infinity ? none : stale ? `STALE ${age(old)}` : way === null ? "live" : `live · ${age(way)}`);
 }
 
-/** What must be seen in every view, until `words` are "". */
+/** Show a message in every view until `words` is "". */
 export function alarm(words) {
   text("alarm", words);
   document.getElementById("alarm").hidden = !words;

@@ -1,22 +1,22 @@
-// Figures and times as a person reads them. Pure.
+// Formats numbers and times for people. This module is pure.
 
 export function signed(value, decimals) {
   const text = value.toFixed(decimals);
   return Number(text) === 0 ? (0).toFixed(decimals) : text.replace("-", "−");
 }
 
-/** A measurement, or a dash where there is none. */
+/** Format a measurement, or a dash if it is unknown. */
 export function figure(value, decimals) {
   return value === null || value === undefined ? "–" : signed(value, decimals);
 }
 
-/** A number as people type it, "−1,5" too; NaN for none. */
+/** Parse a typed number, also in the form "−1,5"; NaN if it is not a number. */
 export function number(typed) {
   const plain = typed.trim().replace("−", "-").replace(",", ".");
   return plain === "" ? NaN : Number(plain);
 }
 
-/** A stamp {sec, nanosec} as the clock on the wall, with the day if that is not today's. */
+/** Format a stamp {sec, nanosec} as local time, with the date unless it is today. */
 export function clock(stamp, now) {
   const at = new Date(milliseconds(stamp));
   return at.toDateString() === now.toDateString() ? at.toLocaleTimeString() : at.toLocaleString();
@@ -33,7 +33,7 @@ export function ago(seconds) {
   return seconds < 7200 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;
 }
 
-/** Seconds since 1970 as day and time. */
+/** Format seconds since 1970 as local date and time. */
 export function began(seconds) {
   return typeof seconds === "number" ? new Date(seconds * 1000).toLocaleString() : "";
 }
@@ -47,22 +47,22 @@ export function age(ms) {
   return ms < 1000 ? `${Math.round(ms)} ms` : `${(ms / 1000).toFixed(1)} s`;
 }
 
-/** Heading of a quaternion about z, rad. */
+/** Return the heading of a quaternion about z, rad. */
 export function yaw(q) {
   return 2 * Math.atan2(q.z, q.w);
 }
 
-/** A reason without the mode that stands above it already. */
+/** Return the reason without the mode, which the banner shows above it. */
 export function reason(state, elsewhere) {
   const before = `${state.mode}: `;
   return said(state.reason.startsWith(before) ? state.reason.slice(before.length) : state.reason, elsewhere);
 }
 
-/** What a program is told to call is a button: here, or on the own page of the robot `elsewhere`. */
+/** Replace service names by button names: of this page, or of the own page of the robot `elsewhere`. */
 export function said(text, elsewhere = "") {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
     ? { "call srv/clear": `Clear is ${there}`, "srv/clear": `Clear ${there}`, "call srv/activate": `Switch on is ${there}` }
-    : { "call srv/clear": "press Clear", "srv/clear": "Clear", "call srv/activate": "Set has Switch on" };
+    : { "call srv/clear": "press Clear", "srv/clear": "Clear", "then call srv/activate": "then press Switch on", "call srv/activate": "Set has Switch on" };
   return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
 }

@@ -40,9 +40,13 @@ def clear(life: Lifecycle, seconds: float, number: int | None = None) -> str:
     return life.clear(number, ns(seconds), at(seconds))
 
 
+def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool:
+    return life.activate(number, ns(seconds), at(seconds))
+
+
 def number(life: Lifecycle) -> int:
-    assert life.latches.next is not None
-    return life.latches.next.number
+    assert life.latches.in_force is not None
+    return life.latches.in_force.number
 
 
 def mode(life: Lifecycle) -> Mode:
@@ -62,9 +66,9 @@ def test_the_robot_starts_waiting_for_its_link_or_switched_off() -> None:
 
 def test_activate_reports_whether_the_robot_was_off() -> None:
     life = ready(active=False)
-    assert life.activate()
+    assert activate(life, 1.0)
     assert mode(life) is Mode.READY
-    assert not life.activate()
+    assert not activate(life, 2.0)
 
 
 STOP = Latch(7, WALL_NS, "ann", "stopped by ann", kept=True)
@@ -206,8 +210,8 @@ def test_a_clear_without_a_number_is_refused_right_after_a_stop(since_s: float) 
         clear(life, 1.0 + since_s)
     age = {0.1: "0.1", 0.4: "0.4", 1.999: "1.9"}[since_s]
     assert str(caught.value) == (
-        f"a stop by ann came {age} s ago: look at the robot, then call srv/clear again 2 s after "
-        "it, or with the latch of the state that you have looked at"
+        f"the robot was stopped by ann {age} s ago: look at the robot, then call srv/clear again "
+        "2 s after that, or with the latch of the state that you have looked at"
     )
     assert mode(life) is Mode.STOPPED
 
@@ -223,22 +227,42 @@ def test_the_two_seconds_count_from_the_last_stop() -> None:
     life = ready()
     stop(life, 1.0)
     stop(life, 4.0, "joe")
-    with pytest.raises(RefusedError, match=r"a stop by joe came 0\.5 s ago"):
+    with pytest.raises(RefusedError, match=r"stopped by joe 0\.5 s ago"):
         clear(life, 4.5)
 
 
 def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
     life = ready()
     stop(life, 1.0)
-    with pytest.raises(RefusedError, match=r"came 0\.5 s ago"):
+    with pytest.raises(RefusedError, match=r"stopped by ann 0\.5 s ago"):
         life.clear(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
 
 
-def test_the_two_seconds_of_a_kept_stop_count_by_the_wall_clock() -> None:
+@pytest.mark.parametrize("wall_s", [-3e8, 0.0, 1.5, 3e8])
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
+    kept: bool, wall_s: float
+) -> None:
+    """The clock of a computer that boots may be years away from the time of the stop."""
+    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", kept)
+    life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
+    for step_s in (10.0, 10.01, 11.5):
+        life.begin(Instant(ns(step_s), WALL_NS + ns(wall_s)))
+    for asked_s, age in ((9.9, "0.1"), (11.5, "1.5")):
+        with pytest.raises(RefusedError) as caught:
+            life.clear(None, ns(asked_s), Instant(ns(11.5), WALL_NS + ns(wall_s)))
+        assert str(caught.value) == (
+            f"the daemon started {age} s ago and the robot is still stopped by ann: look at the "
+            "robot, then call srv/clear again 2 s after that, or with the latch of the state that "
+            "you have looked at"
+        )
+    assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
+
+
+def test_a_named_clear_releases_a_stop_from_the_start_at_once() -> None:
     life = Lifecycle(active=True, latches=Latches(stop=STOP))
-    with pytest.raises(RefusedError, match=r"a stop by ann came 1\.5 s ago"):
-        life.clear(None, ns(0.2), at(1.5))
-    assert life.clear(None, ns(0.3), at(2.0))
+    life.begin(at(10.0))
+    assert life.clear(STOP.number, ns(9.9), at(10.0))
 
 
 def test_a_clear_that_names_an_earlier_stop_is_refused_by_name_of_the_later_one() -> None:
@@ -383,19 +407,107 @@ def test_a_robot_that_was_off_is_off_after_stop_and_clear() -> None:
     assert life.why == f"switched off by joe at {AT}:01 UTC; call srv/activate"
 
 
-def test_the_first_deactivate_is_the_one_that_is_reported() -> None:
+def off(seconds: float = 1.0, by: str = "joe") -> Lifecycle:
     life = ready()
-    life.deactivate("joe", at(1.0))
-    before = life.latches
+    life.deactivate(by, at(seconds))
+    return life
+
+
+def test_each_deactivate_has_a_new_number_and_the_last_is_the_one_that_is_reported() -> None:
+    life = off()
+    first = number(life)
     life.deactivate("ann", at(2.0))
+    assert number(life) > first
+    assert life.why == f"switched off by ann at {AT}:02 UTC; call srv/activate"
+
+
+@pytest.mark.parametrize("since_s", [0.1, 0.4, 1.999])
+def test_an_activate_without_a_number_is_refused_right_after_a_deactivate(since_s: float) -> None:
+    life = off()
+    age = {0.1: "0.1", 0.4: "0.4", 1.999: "1.9"}[since_s]
+    with pytest.raises(RefusedError) as caught:
+        activate(life, 1.0 + since_s)
+    assert str(caught.value) == (
+        f"the robot was switched off by joe {age} s ago: look at the robot, then call srv/activate "
+        "again 2 s after that, or with the latch of the state that you have looked at"
+    )
+    assert mode(life) is Mode.INACTIVE
+    assert activate(life, 1.0 + LOOK_FIRST_S)
+    assert (mode(life), life.latches) == (Mode.READY, Latches())
+
+
+def test_the_two_seconds_of_a_plain_activate_count_from_the_first_step() -> None:
+    life = Lifecycle(active=True, latches=Latches(inactive=OFF))
+    life.begin(Instant(ns(10.0), 0))
+    with pytest.raises(RefusedError, match=r"the daemon started 1\.5 s ago and the robot is still"):
+        activate(life, 11.5)
+    assert activate(life, 12.0)
+
+
+def test_an_activate_with_the_number_switches_the_robot_on_at_once() -> None:
+    life = off()
+    assert activate(life, 1.1, number(life))
+    assert mode(life) is Mode.READY
+
+
+@pytest.mark.parametrize("by", ["the number before", "0"])
+def test_an_activate_that_names_another_latch_is_refused(by: str) -> None:
+    life = off()
+    seen = number(life) if by != "0" else 0
+    life.deactivate("ann", at(5.0))
+    with pytest.raises(RefusedError) as caught:
+        activate(life, 20.0, seen)
+    assert str(caught.value) == (
+        f"latch {seen} is not in force; the robot is still switched off by ann: look at it, then "
+        "call srv/activate again"
+    )
+    assert mode(life) is Mode.INACTIVE
+
+
+@pytest.mark.parametrize("asked_s", [0.5, 1.0])
+@pytest.mark.parametrize("named", [True, False])
+def test_an_activate_that_arrived_before_the_deactivate_is_refused(
+    asked_s: float, named: bool
+) -> None:
+    life = off()
+    with pytest.raises(RefusedError):
+        life.activate(number(life) if named else None, ns(asked_s), at(9.0))
+    assert mode(life) is Mode.INACTIVE
+
+
+def test_an_activate_of_the_same_step_as_the_deactivate_is_refused() -> None:
+    life = off()
+    with pytest.raises(RefusedError, match="at the same time or later"):
+        life.activate(number(life), ns(1.001), at(1.0))
+
+
+def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> None:
+    life = ready()
+    before = life.latches
+    assert not activate(life, 1.0)
+    assert not activate(life, 1.0, 7)
     assert life.latches is before
+
+
+def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
+    life = ready(active=False)
+    with pytest.raises(RefusedError, match="latch 7 is not in force; the robot is still switched"):
+        activate(life, 1.0, 7)
+    assert activate(life, 1.0, 0)
+
+
+def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None:
+    assert Latches(STOP, FAULT, OFF).in_force is FAULT
+    assert Latches(STOP, None, OFF).in_force is STOP
+    assert Latches(None, None, OFF).in_force is OFF
+    assert Latches().in_force is None
 
 
 def test_a_robot_that_starts_switched_off_can_be_switched_off_by_a_client_too() -> None:
     life = ready(active=False)
     life.deactivate("joe", at(1.0))
     assert life.latches.inactive is not None
-    assert life.activate()
+    assert activate(life, 9.0)
     assert (life.mode, life.latches) == (Mode.READY, Latches())
 
 
@@ -466,7 +578,16 @@ REQUESTS: dict[str, Do] = {
     "clear from before": lambda life, now: life.clear(
         life.latches.next.number if life.latches.next else 0, 0, at(now)
     ),
-    "activate": lambda life, _: life.activate(),
+    "activate by number": lambda life, now: activate(
+        life, now, life.latches.inactive.number if life.latches.inactive else 0
+    ),
+    "activate without a number": activate,
+    "activate by the number before": lambda life, now: activate(
+        life, now, life.latches.inactive.number - 1 if life.latches.inactive else 9
+    ),
+    "activate from before": lambda life, now: life.activate(
+        life.latches.inactive.number if life.latches.inactive else 9, 0, at(now)
+    ),
     "deactivate": lambda life, now: life.deactivate("joe", at(now)),
 }
 
@@ -501,15 +622,16 @@ class Edge(NamedTuple):
 def explore() -> list[Edge]:
     """Return every edge of the machine: each trigger, soon and late, in each reachable state."""
     edges: list[Edge] = []
-    seen: set[tuple[State, bool]] = set()
+    seen: set[tuple[State, bool, bool]] = set()
     queue = deque((Lifecycle(active), 10.0) for active in (True, False))
     while queue:
         life, now = queue.popleft()
-        # A stop older than two seconds is a state of its own: a plain clear differs there.
-        recent = now - life._stopped_ns / NS_PER_S < LOOK_FIRST_S
-        if (state_of(life), recent) in seen:
+        # A latch older than two seconds is a state of its own: a plain request differs there.
+        stopped = now - life._stopped_ns / NS_PER_S < LOOK_FIRST_S
+        switched_off = now - life._off_ns / NS_PER_S < LOOK_FIRST_S
+        if (state_of(life), stopped, switched_off) in seen:
             continue
-        seen.add((state_of(life), recent))
+        seen.add((state_of(life), stopped, switched_off))
         for name, do in TRIGGERS.items():
             for pause_s in PAUSES:
                 after, then, refused = copy(life), now + pause_s, False
@@ -598,7 +720,22 @@ def test_nothing_but_activate_ends_inactive() -> None:
         for edge in EDGES
         if edge.before.inactive > edge.after.inactive or edge.before.dormant > edge.after.dormant
     }
-    assert ends == {"activate"}
+    assert ends == {"activate by number", "activate without a number"}
+
+
+def test_an_activate_that_names_another_latch_or_came_before_it_switches_nothing_on() -> None:
+    for edge in EDGES:
+        if edge.trigger in ("activate by the number before", "activate from before"):
+            assert edge.before == edge.after
+
+
+def test_a_plain_activate_is_refused_until_two_seconds_after_a_deactivate() -> None:
+    soon = {
+        edge.refused
+        for edge in EDGES
+        if edge.trigger == "activate without a number" and edge.mode is Mode.INACTIVE
+    }
+    assert soon == {True}
 
 
 def test_a_refused_request_changes_nothing() -> None:
@@ -639,10 +776,20 @@ def test_latches_stay_the_same_object_until_one_changes() -> None:
         assert (before is after) == (before == after)
 
 
-def test_switching_on_and_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> None:
+def test_switching_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> None:
     for edge in EDGES:
-        if edge.trigger in ("activate", "deactivate"):
+        if edge.trigger == "deactivate":
             before = edge.before
             assert edge.refused == (before.leaving or before.fault or before.stopped)
-            if not edge.refused:
-                assert edge.after.inactive == (edge.trigger == "deactivate")
+            assert edge.refused or edge.after.inactive
+
+
+def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> (
+    None
+):
+    for edge in EDGES:
+        late = edge.trigger == "activate without a number" and edge.pause_s > LOOK_FIRST_S
+        if edge.trigger == "activate by number" or late:
+            before = edge.before
+            assert edge.refused == (before.leaving or before.fault or before.stopped)
+            assert edge.refused or not (edge.after.inactive or edge.after.dormant)

@@ -42,7 +42,7 @@ SENTENCES = [
     (
         Wait("late", "high", 0.25),
         "commands of high come too late, by more than 0.25 s: the network holds them up, or the "
-        "sender's clock was set",
+        "sender's clock was set; if this goes on, look at the network, then restart the sender",
     ),
     (Wait("higher", "high"), "high has the higher priority: until it is silent"),
     (Wait("equal", "right"), "right, of the same priority, came first: until it is silent"),

@@ -20,7 +20,7 @@ from acsard.messages.schema import JointState, TwistStamped
 from acsard.messages.schema import Twist as TwistMessage
 from acsard.messages.signature import public_name
 from acsard.ros.attachments import Attachment
-from acsard.values import Command, Pose, Request, Twist, WheelSpeeds
+from acsard.values import Command, Pose, Request, Twist, Verb, WheelSpeeds
 from tests.each import each
 
 KINEMATICS = Kinematics(DriveConfig())
@@ -531,22 +531,24 @@ def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
 # services
 
 
-@pytest.mark.parametrize("verb", ["stop", "activate", "deactivate", "reset_odometry"])
+@pytest.mark.parametrize("verb", ["stop", "deactivate", "reset_odometry"])
 @pytest.mark.parametrize("payload", [b"", b"{}", b"\xff garbage"])
 def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes) -> None:
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
+@pytest.mark.parametrize("verb", ["clear", "activate"])
 @pytest.mark.parametrize("form", ["json", "msgpack"])
-def test_clear_takes_the_number_of_a_latch(form: Format) -> None:
+def test_clear_and_activate_take_the_number_of_a_latch(form: Format, verb: Verb) -> None:
     payload = encode({"latch": 1_800_000_000_123}, form)
-    request = Receiver.request("clear", 7, "", payload, 5)
-    assert request == Request("clear", 7, asked_ns=5, latch=1_800_000_000_123)
+    request = Receiver.request(verb, 7, "", payload, 5)
+    assert request == Request(verb, 7, asked_ns=5, latch=1_800_000_000_123)
 
 
+@pytest.mark.parametrize("verb", ["clear", "activate"])
 @pytest.mark.parametrize("payload", [b"", b"{}", b'{"latch": null}', b"\x80"])
-def test_clear_may_come_without_a_number(payload: bytes) -> None:
-    assert Receiver.request("clear", 7, "", payload) == Request("clear", 7)
+def test_clear_and_activate_may_come_without_a_number(payload: bytes, verb: Verb) -> None:
+    assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
 @pytest.mark.parametrize(
@@ -554,9 +556,10 @@ def test_clear_may_come_without_a_number(payload: bytes) -> None:
     [b"\xff garbage", b'{"latch": "5"}', b'{"latch": -1}', b'{"latch": 5.5}', b'{"stop": 5}',
      b'{"latch": 9007199254740992}', b'{"latch": true}'],
 )  # fmt: skip
-def test_clear_refuses_any_other_payload(payload: bytes) -> None:
+@pytest.mark.parametrize("verb", ["clear", "activate"])
+def test_clear_and_activate_refuse_any_other_payload(payload: bytes, verb: Verb) -> None:
     with pytest.raises(DecodeError):
-        Receiver.request("clear", 7, "", payload)
+        Receiver.request(verb, 7, "", payload)
 
 
 @pytest.mark.parametrize("form", ["json", "msgpack"])

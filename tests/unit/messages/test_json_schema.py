@@ -26,7 +26,8 @@ from acsard.values import GyroDoes, Role
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 INCOMING = {
-    "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Clear", "Settings", "DoorState"
+    "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
+    "DoorState"
 }  # fmt: skip
 OUTGOING = set(SCHEMAS) - INCOMING
 
@@ -80,7 +81,7 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
     for topic in TOPICS:
         said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
     out = said["out"] | said["service"] | said["query"] | {"Imu"}  # that of the simulator
-    came = said["in"] | {"SetPose", "Clear", "Settings"}
+    came = said["in"] | {"SetPose", "Release", "Settings"}
     assert {name.removesuffix("In") for name in INCOMING} == came
     assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in came & out}
     assert out | {"Config"} == OUTGOING
@@ -173,7 +174,7 @@ def taken(name: str, value: object) -> bool:
     """Whether the daemon takes it where that type comes in."""
     key = {"J": "wheel_cmd/app", "T": "cmd/app", "I": "imu"}.get(name[0], "set_pose")
     payload = msgspec.json.encode(value)
-    if name == "Clear":
+    if name == "Release":
         return _decodes(lambda: Receiver.request("clear", 1, "application/json", payload))
     if key == "set_pose":
         return _decodes(lambda: Receiver.request("set_pose", 1, "application/json", payload))
@@ -217,12 +218,12 @@ def _decodes(call: Any) -> bool:
         ("SetPose", {"x": 1, "y": 2.0, "yaw": 0}, True),
         ("SetPose", {"x": 1, "y": 2.0}, False),
         ("SetPose", {"x": 1, "y": 2.0, "yaw": 0, "z": 0}, False),
-        ("Clear", {"latch": 5}, True),
-        ("Clear", {"latch": None}, True),
-        ("Clear", {}, True),
-        ("Clear", {"latch": -1}, False),
-        ("Clear", {"latch": 2**53}, False),
-        ("Clear", {"number": 5}, False),
+        ("Release", {"latch": 5}, True),
+        ("Release", {"latch": None}, True),
+        ("Release", {}, True),
+        ("Release", {"latch": -1}, False),
+        ("Release", {"latch": 2**53}, False),
+        ("Release", {"number": 5}, False),
     ],
 )  # fmt: skip
 def test_the_schema_takes_what_the_daemon_takes(name: str, value: object, good: bool) -> None:

@@ -1,0 +1,481 @@
+"""Plays a plan: senders over their networks, operators, the board and the host, in true time.
+
+`Run.play` returns what was covered. It raises `BrokenError` at the first promise that does not
+hold, also for an exception of the product.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import json
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import msgspec
+
+from tests.simulate.plan import Plan
+from tests.simulate.pose import PoseWitness
+from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
+from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.roads import NS, Message, messages, sample
+
+MOST_HELD = 2000
+"""Entries of the largest container of a daemon: a thousand clocks and as many numbers."""
+
+
+class Result(NamedTuple):
+    """What a run came to."""
+
+    seed: int
+    finding: str
+    """The promise that did not hold, when and how; "" if all did."""
+    promise: str
+    at_ns: int
+    simulated_s: float
+    cpu_s: float
+    counts: Counter[str]
+
+
+def played(plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> Result:
+    """Play a plan in this process. `log` gets all that each step showed."""
+    began = time.process_time()
+    run = Run(plan, log)
+    try:
+        run.play()
+        finding, promise, at_ns = "", "", run.true_ns
+    except BrokenError as error:
+        finding, promise, at_ns = str(error), error.promise, error.at_ns
+    simulated_s = (run.true_ns - run.slept_ns) / NS
+    cpu_s = time.process_time() - began
+    return Result(plan["seed"], finding, promise, at_ns, simulated_s, cpu_s, run.counts)
+
+
+class Run:
+    """One plan, one robot."""
+
+    def __init__(self, plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> None:
+        self.plan, self.log = plan, log
+        self.slept_ns = 0
+        self.resumed_ns = START_NS
+        """Monotonic time of the last resume: before it nothing can have arrived."""
+        self.witness = Witness(plan["config"])
+        self.pose = PoseWitness(plan["config"])
+        self.counts: Counter[str] = self.witness.counts
+        self.failure: BrokenError | None = None
+        self._todo: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = 0
+        self._calls: dict[int, Callable[[bytes], None]] = {}
+        self._ticket = 0
+        self._active: list[tuple[str, tuple[Any, ...]]] = []
+        self._fed_ns = 0
+        self._stalled_ns = -NS
+        self._epilogue = False
+        self._moved_ns = -1
+        self.product = Product(plan["config"], self._see)
+        self.product.fed = self._fed
+
+    # time
+
+    @property
+    def true_ns(self) -> int:
+        return self.product.now_ns - START_NS + self.slept_ns
+
+    def _at(self, at_ns: int, do: Callable[[], None]) -> None:
+        self._order += 1
+        heapq.heappush(self._todo, (at_ns, self._order, do))
+
+    def _run_to(self, true_ns: int) -> None:
+        """Do all that is due by then, at its own time."""
+        while self._todo and self._todo[0][0] <= true_ns:
+            at_ns, _, do = heapq.heappop(self._todo)
+            self._pass(at_ns)
+            do()
+            self._raise()
+        self._pass(true_ns)
+        self._raise()
+
+    def _pass(self, true_ns: int) -> None:
+        self.product.run_until(true_ns + START_NS - self.slept_ns)
+
+    def _raise(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def _arrival(self, true_ns: int) -> int:
+        """Return the robot's time at which something arrives that the network brings now."""
+        return max(self.resumed_ns, min(self.product.now_ns, true_ns + START_NS - self.slept_ns))
+
+    # the play
+
+    def play(self) -> Counter[str]:
+        """Play the plan to its end; raise `BrokenError` for a promise that does not hold."""
+        try:
+            self._begin()
+            self._run_to(int(self.plan["seconds"] * NS))
+            self._end()
+        except BrokenError:
+            raise
+        except Exception as error:
+            kind = f"{type(error).__name__}: {error}"
+            raise BrokenError("no exception ever", self.true_ns, kind) from error
+        return self.counts
+
+    def _begin(self) -> None:
+        plan, seen = self.plan, Counter[str]()
+        self._active = [(name, tuple(values)) for name, *values in plan["board"]]
+        self.product.board(self._active)
+        for sender in plan["senders"]:
+            self.counts[f"way {sender['way']}"] += 1
+            for shape in sender["congestion"]:
+                self.counts[f"congestion {shape[2]}"] += 1
+            if sender["way"] in ("header", "bridged"):
+                seen[f"header native/{sender['source']}" if sender["way"] == "header"
+                     else "session of the bridge"] += 1  # fmt: skip
+            else:
+                for own in (sender["id"], f"session of {sender['id']}"):
+                    seen[own] += 1
+            self.witness.churns |= sender["churn"]
+            queue = messages(sender, plan["seed"], plan["seconds"], START_NS + WALL_OFFSET_NS)
+            queue.reverse()
+            if queue:
+                self._next(sender, queue)
+        self.witness.shared_clocks = {name for name, count in seen.items() if count > 1}
+        for event in plan["events"]:
+            self.counts[f"event {event['do']} {event.get('verb', '')}".strip()] += 1
+            self._at(int(event["at"] * NS), lambda event=event: self._do(event))  # type: ignore[misc]
+
+    def _next(self, sender: dict[str, Any], queue: list[Message]) -> None:
+        message = queue.pop()
+
+        def arrive() -> None:
+            self._deliver(sender, message)
+            if queue:
+                self._next(sender, queue)
+
+        self._at(message.arrives_ns, arrive)
+
+    def _deliver(self, sender: dict[str, Any], message: Message) -> None:
+        if not self.product.alive:
+            return
+        at_ns = self._arrival(message.arrives_ns)
+        one = sample(sender, message, self.plan["config"], self.product.wall_ns)
+        true_ns = at_ns - START_NS + self.slept_ns
+        self.witness.command(sender, message, one, true_ns)
+        self.product.deliver(at_ns, one.key, one.payload, **one.options)
+
+    # operators
+
+    def _call(self, event: dict[str, Any]) -> None:
+        if event["lost"]:
+            return
+        latch, read_ns = None, None
+        if event.get("named") and self.product.alive:
+            latch, read_ns = self.product.state()["latch"], self.true_ns
+        sent_ns, end_ns = self.true_ns, int(self.plan["seconds"] * NS)
+        due_ns = sent_ns + int(event["late"] * NS)
+        for extra_ns in (0, 700_000_000) if event["twice"] else (0,):
+            if due_ns + extra_ns < end_ns or self._epilogue:
+                self._at(
+                    due_ns + extra_ns,
+                    lambda due=due_ns + extra_ns: self._ask(event, due, sent_ns, latch, read_ns),  # type: ignore[misc]
+                )
+
+    def _ask(
+        self,
+        event: dict[str, Any],
+        due_ns: int,
+        sent_ns: int,
+        latch: int | None,
+        read_ns: int | None,
+    ) -> None:
+        product, verb, witness = self.product, event["verb"], self.witness
+        if not product.alive:
+            return
+        at_ns = self._arrival(due_ns)
+        true_ns = at_ns - START_NS + self.slept_ns
+        via, payload = event["via"], b""
+        if verb in ("set", "set_pose") or latch is not None:
+            via = "native"
+        if latch is not None:
+            payload = json.dumps({"latch": latch}).encode()
+        elif verb == "set":
+            payload = json.dumps({"settings": event["settings"]}).encode()
+        elif verb == "set_pose":
+            x, y, yaw = event["pose"]
+            payload = json.dumps({"x": x, "y": y, "yaw": yaw}).encode()
+        attachment = msgspec.msgpack.encode({"sender": event["by"]})
+        if via == "rmw":
+            gid = hashlib.sha256(event["by"].encode()).digest()[:16]
+            attachment = struct.pack("<qqB16s", 1, 1_800_000_000 * NS, 16, gid)
+        elif via == "bridge":
+            attachment = b""
+        if verb == "stop":
+            witness.stopped(true_ns, sent_ns)
+            if event.get("put"):
+                product.deliver(at_ns, "stop", b"", via="native", attachment=attachment)
+                return
+        self._ticket += 1
+        ticket, was = self._ticket, product.state()["mode"]
+
+        def answered(reply: bytes) -> None:
+            success, text = _read_reply(reply, via)
+            self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
+            if not success:
+                return
+            match verb:
+                case "clear":
+                    witness.cleared(true_ns, read_ns, text, event["by"])
+                case "activate":
+                    if was == "inactive":
+                        witness.arming(true_ns)
+                    witness.inactive_ns = None
+                case "deactivate":
+                    if witness.inactive_ns is None:
+                        witness.inactive_ns = self.true_ns
+                case "set":
+                    if not text.startswith("nothing new"):
+                        witness.set_limits(self.true_ns, event["settings"])
+                case "set_pose" | "reset_odometry":
+                    self.pose.placed()
+
+        self._calls[ticket] = answered
+        product.ask(at_ns, verb, ticket, payload, via, attachment)
+
+    # the board and the host
+
+    def _do(self, event: dict[str, Any]) -> None:
+        product, witness = self.product, self.witness
+        lasts_ns = min(
+            int(event.get("for", 0.0) * NS),
+            max(0, int(self.plan["seconds"] * NS) - self.true_ns),
+        )
+        after_ns = self.true_ns + lasts_ns
+        match event["do"]:
+            case "call":
+                self._call(event)
+            case "board":
+                name, *values = event["fault"]
+                self.counts[f"board {name}"] += 1
+                fault = (name, tuple(values))
+                self._active.append(fault)
+                self._troubled(name)
+                product.board(list(self._active))
+                self._at(after_ns, lambda: self._mended(fault))
+            case "reset":
+                product.reset(int(event["deaf"] * NS))
+                self.pose.doubt()
+                self._troubled("reset")
+                deaf_ns = int(event["deaf"] * NS)
+                if deaf_ns > 12 * NS // 10:
+                    self._at(self.true_ns + deaf_ns, lambda: witness.arming(self.true_ns))
+            case "unplug":
+                product.unplug()
+                self.pose.doubt()
+                self._at(after_ns, lambda: self._plug(event["new"]))
+            case "block":
+                product.block(True)
+                self._at(after_ns, lambda: product.block(False))
+            case "tear":
+                product.tear(event["taken"])
+            case "stall" | "stall in step":
+                self._stalled_ns = after_ns
+                if event["do"] == "stall":
+                    product.stall(lasts_ns / NS)
+                else:
+                    product.stall_in_step(lasts_ns / NS)
+            case "suspend":
+                self._suspend(lasts_ns)
+            case "wall":
+                product.step_wall(event["by"])
+            case "disk":
+                product.disk.fill(True)
+                self._at(after_ns, lambda: product.disk.fill(False))
+            case "restart":
+                if product.alive:
+                    self._restart(event, after_ns)
+
+    def _troubled(self, name: str) -> None:
+        self.witness.troubles[name] = self.true_ns
+
+    def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
+        self._active.remove(fault)
+        self._troubled(fault[0])
+        self.product.board(list(self._active))
+
+    def _plug(self, new: bool) -> None:
+        if not self.product.plugged:
+            self.product.plug(new)
+            self.witness.arming(self.true_ns)
+
+    def _suspend(self, lasts_ns: int) -> None:
+        """The host sleeps: its monotonic clock stands, and its USB ports lose their power."""
+        product, true_ns = self.product, self.true_ns
+        if not product.alive or not product.plugged:
+            return
+        product.unplug()
+        product.reset(2 * NS)
+        self.pose.doubt()
+        self._troubled("suspend")
+        self.slept_ns += lasts_ns
+        self.resumed_ns = product.now_ns
+        product.step_wall(lasts_ns / NS)
+        self.witness.suspended(true_ns + lasts_ns)
+        self._at(self.true_ns + 20_000_000, lambda: self._plug(False))
+
+    def _restart(self, event: dict[str, Any], after_ns: int) -> None:
+        product, witness = self.product, self.witness
+        product.end(event["way"])
+        behind = product.disk.behind
+        if behind:
+            witness.stops.clear()
+            witness.fault_ns = witness.inactive_ns = None
+            witness.limits = dict(witness.file)
+        self._calls.clear()
+
+        def start() -> None:
+            self.resumed_ns = product.now_ns
+            if product.disk.full:
+                witness.stopped(self.true_ns, self.true_ns)
+            product.start()
+            witness.new_life(self.true_ns)
+            self.pose.doubt()
+
+        self._at(after_ns + 1000, start)
+
+    # what the product shows
+
+    def _fed(self, at_ns: int) -> None:
+        true_ns = at_ns - START_NS + self.slept_ns
+        gap_ns = true_ns - self._fed_ns
+        if gap_ns > 11 * NS // 10 and self._stalled_ns < self._fed_ns:
+            self.witness.arming(true_ns)
+        self._fed_ns = true_ns
+
+    def _see(self, seen: Seen) -> None:
+        if self.failure is not None:
+            return
+        try:
+            self._judge(seen)
+        except BrokenError as error:
+            self.failure = error
+
+    def _judge(self, seen: Seen) -> None:
+        witness, offset = self.witness, self.slept_ns - START_NS
+        true_ns = seen.at_ns + offset
+        for ticket, reply in self.product.replies():
+            answered = self._calls.pop(ticket, None)
+            if answered is not None:
+                answered(reply)
+        witness.pending = self.product.disk.full and bool(self._calls)
+        if witness.pending:
+            self.pose.placed()
+        for name, _ in self._active:
+            witness.troubles[name] = true_ns
+        witness.step(true_ns, seen.mode, seen.reason)
+        for at_ns, line in seen.lines:
+            witness.line(at_ns + offset, line, self._fed_ns)
+            if any(witness.last):
+                self._moved_ns = at_ns + offset
+        if seen.estimates:
+            lies = {name for name, _ in self._active}
+            self.pose.see(true_ns, seen.estimates, self.product.truth(), offset, lies)
+        self.pose.end_step()
+        if self.log is not None:
+            self.log(
+                {
+                    "at": seen.at_ns, "mode": seen.mode, "reason": seen.reason,
+                    "lines": [[at, line.decode("latin-1")] for at, line in seen.lines],
+                    "odometry": seen.estimates,
+                }
+            )  # fmt: skip
+
+    # the end: the faults are over, and a lawful sender must be able to drive
+
+    def _end(self) -> None:
+        self._epilogue = True
+        product, end_ns = self.product, self.true_ns
+        if not product.alive:
+            self._run_to(max(at for at, _, _ in self._todo) if self._todo else end_ns)
+        self._run_to(self.true_ns + NS // 2)
+        if not product.plugged:
+            self._plug(False)
+        product.disk.fill(False)
+        self._check_counts()
+        size, kind = product.largest()
+        self.counts["largest container"] = max(self.counts["largest container"], size)
+        if size > MOST_HELD:
+            raise BrokenError("memory is bounded", self.true_ns, f"a {kind} of {size} entries")
+        self._run_to(
+            self.true_ns + int((2.5 + self.plan["config"]["sim"].get("boot_time", 0)) * NS)
+        )
+        for _ in range(3):
+            state = product.state()
+            verb = "clear" if state["latch"] else "activate" if state["mode"] == "inactive" else ""
+            if verb:
+                self._call({"verb": verb, "named": True, "by": "op", "via": "native",
+                            "late": 0.0, "lost": False, "twice": False})  # fmt: skip
+            self._run_to(self.true_ns + NS // 10)
+        self._drive_lawfully()
+
+    def _check_counts(self) -> None:
+        """Every command that arrived was accepted or refused, and is counted."""
+        counters = self.product.state()["counters"]
+        counted = counters.get("commands", 0) + counters.get("commands_first_contact", 0)
+        counted += sum(n for name, n in counters.items() if name.startswith("command_"))
+        expected = self.witness.delivered - self.product.dropped
+        if counted != expected:
+            text = f"{expected} arrived, {counted} are counted: {counters}"
+            raise BrokenError("every command is counted", self.true_ns, text)
+
+    def _drive_lawfully(self) -> None:
+        plan, begin_ns = self.plan, self.true_ns
+        source = plan["config"]["commands"]["sources"][0]["name"]
+        sender = {
+            "name": "lawful", "id": "lawful/1", "way": "client", "source": source, "wheels": False,
+            "form": "json", "ahead": 0.0, "drift": 0.0, "clock": [], "churn": False, "delay": 0.002,
+        }  # fmt: skip
+        own = [
+            one
+            for one in plan["senders"]
+            if one["way"] in ("client", "page")
+            and not (one["churn"] or one["junk"] or one["id"] in self.witness.shared_clocks)
+        ]
+        number = 10**6
+        if plan["lawful"] != "a new client" and own:
+            sender = own[0]
+        zeros_s = self.witness.pause_ns / NS + 1.0
+        speed = 0.5 * self.witness.limits["linear_speed"]
+        turn = 0.25 * self.witness.limits["angular_speed"]
+        end_ns = begin_ns + int((zeros_s + 3.0) * NS)
+        while self.true_ns < end_ns:
+            zero = self.true_ns - begin_ns < zeros_s * NS
+            now_ns = self.true_ns
+            t = now_ns / NS
+            number += 1
+            v, w = (0.0, 0.0) if zero else (speed, turn)
+            stamp_ns = (
+                START_NS + WALL_OFFSET_NS + int((t + sender["ahead"] + sender["drift"] * t) * NS)
+            )
+            delay_ns = int(sender["delay"] * NS)
+            message = Message(now_ns, now_ns + delay_ns, v, w, stamp_ns, number, "")
+            self._at(now_ns + delay_ns, lambda m=message: self._deliver(sender, m))  # type: ignore[misc]
+            self._run_to(now_ns + 50_000_000)
+        mode, reason = self.witness.mode, self.witness.reason
+        moving = self.true_ns - self._moved_ns < NS // 5
+        if mode != "driving" or not moving:
+            raise BrokenError("a lawful sender drives", self.true_ns, f"{mode}: {reason}")
+        self.counts["lawful drives"] += 1
+        self._run_to(self.true_ns + NS)
+
+
+def _read_reply(reply: bytes, via: str) -> tuple[bool, str]:
+    if via == "native":
+        found = msgspec.json.decode(reply)
+        return found["success"], found["message"]
+    # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
+    length = struct.unpack_from("<I", reply, 8)[0]
+    return bool(reply[4]), reply[12 : 12 + length - 1].decode()

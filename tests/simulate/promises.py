@@ -1,0 +1,522 @@
+"""The promises of the product as predicates, judged from an omniscient view.
+
+`Witness` knows when each command was really sent, which stop and clear arrived when, and reads the
+lines on the wire with code of its own. It shares nothing with the product: each rule is written
+from the pages (`deploy/clients/README.md`, the README) and allows whatever they allow. The first
+predicate that does not hold raises `BrokenError` with its name.
+
+Times are true ns from the start. A suspended robot's own clock stands, the true one does not.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_right
+from collections import Counter, deque
+from typing import Any
+
+from tests.simulate.roads import FOREIGN, NS, Message, Sample
+
+LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
+ZERO = (0.0, 0.0, 0.0, 0.0)
+MODES = {"leaving", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
+
+MARGIN_NS = 30_000_000
+"""Allowed beside a time limit: two periods at the lowest rate of the plans and a line's way."""
+
+RAMP_NS = 300_000_000
+"""Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
+
+EARLY_NS = 60_000_000
+"""A delay that falls by more than this is a backlog that pours in."""
+
+HARMLESS = {
+    "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
+    "stalls", "sparse_replies", "echo",
+}  # fmt: skip
+"""Troubles of the board that are no reason to latch a fault."""
+
+
+class BrokenError(AssertionError):
+    """A promise did not hold."""
+
+    def __init__(self, promise: str, at_ns: int, text: str) -> None:
+        super().__init__(f"{promise} at {at_ns / NS:.3f} s: {text}")
+        self.promise, self.at_ns, self.text = promise, at_ns, text
+
+
+class Wish:
+    """A command that arrived, and what the omniscient view thinks of it."""
+
+    __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
+
+    def __init__(self, arrived_ns: int, v: float, w: float) -> None:
+        self.arrived_ns, self.v, self.w = arrived_ns, v, w
+        self.fresh = self.certain = self.shared = False
+        self.identity = ""
+        self.armed_ns = -1
+        """Arrival of the zero by which this sender is armed, -1 for none."""
+
+
+class Clock:
+    """The true delays of one sender's messages, as far as the robot can have learned them."""
+
+    def __init__(self) -> None:
+        self.least_ns: int | None = None
+        self.recent: deque[tuple[int, int]] = deque()
+        self.stamp_ns = 0
+        self.loose = False
+        """It was adjusted or its sender paused: the pages promise nothing about its age."""
+
+
+class Sender:
+    """Zeros and speeds of one identity on one source."""
+
+    def __init__(self) -> None:
+        self.zeros: list[int] = []
+        """Arrivals of the zeros that no speed has followed."""
+        self.armed_ns = -1
+
+
+class Witness:
+    """Holds every line and every step against what really happened."""
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        self.config = config
+        drive = config.get("drive", {})
+        self.radius = drive.get("wheel_radius", 0.05)
+        self.half = drive.get("wheel_separation", 0.3) / 2
+        wheels = config["mcu"].get("wheels") or {
+            "front_right": "+a", "front_left": "+b", "rear_left": "+c", "rear_right": "+d",
+        }  # fmt: skip
+        self.motors = [
+            ("abcd".index(wheels[w][1]), -1 if wheels[w][0] == "-" else 1)
+            for w in ("front_right", "front_left", "rear_left", "rear_right")
+        ]
+        self.file = dict(config["limits"])
+        self.limits = dict(config["limits"])
+        commands = config["commands"]
+        self.neutral_first = commands.get("neutral_first", True)
+        self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
+        self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
+        self.file_pause_ns = int(commands.get("pause", 1.0) * NS)
+        rate = config["control"].get("rate", 100.0)
+        self.period_ns = int(NS / rate)
+        quiet = max(0.1, 4 / rate, 3 * config["mcu"].get("reply_period", 0.0))
+        self.quiet_ns = int(quiet * NS)
+        self.counts: Counter[str] = Counter()
+        self.shared_clocks: set[str] = set()
+        """Clocks that several senders of the plan stamp by."""
+        self.churns = False
+        self.stops: list[dict[str, Any]] = []
+        self.fault_ns: int | None = None
+        self.inactive_ns: int | None = None
+        self.troubles: dict[str, int] = {}
+        """Board faults and when each was last active."""
+        self.pending = False
+        """An answer waits for the disk, so it is not known yet what is in force."""
+        self.mode = self.reason = ""
+        self._decoded: dict[bytes, tuple[float, ...]] = {}
+        self.new_life(0)
+
+    # what happened
+
+    def new_life(self, at_ns: int) -> None:
+        """Note that the daemon started."""
+        self.timeout = dict(self.file_timeout)
+        self.pause_ns = self.file_pause_ns
+        for name, value in self.file.items():
+            kept = not name.endswith("_deceleration") and "jerk" not in name
+            self.limits[name] = min(value, self.limits[name]) if kept else value
+        self.before = dict(self.limits)
+        self.changed_ns = at_ns
+        self.softest = dict(self.limits)
+        self.born_ns = self.learned_ns = at_ns
+        self.armed_since_ns = at_ns
+        self.clocks: dict[str, Clock] = {}
+        self.senders: dict[tuple[str, str], Sender] = {}
+        self.wishes: deque[tuple[str, Wish]] = deque()
+        self.last: tuple[float, ...] = ZERO
+        self.last_ns = at_ns
+        self.wished_ns = at_ns
+        self.coasting: tuple[int, float] | None = None
+        self.delivered = 0
+        if not self.config["control"].get("auto_activate", True):
+            self.inactive_ns = at_ns
+        self.mode = ""
+
+    def command(
+        self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int
+    ) -> None:
+        """Take note of a command that reached the daemon."""
+        self.delivered += 1
+        source = sender["source"]
+        if source not in self.priority or message.junk not in ("", "cancels", "stranger"):
+            known = self.senders.get((source, sample.identity))
+            if known is not None:
+                self._arm(known, arrived_ns)
+                known.zeros.clear()
+            return
+        if message.junk == "stranger":
+            return
+        if message.junk == "cancels":
+            v, w = 0.0, 0.0
+        else:
+            v, w = message.v, message.w
+        zero = v == w == 0.0 and message.junk == ""
+        wish = Wish(arrived_ns, v, w)
+        wish.identity, wish.shared = sample.identity, sample.shared
+        wish.fresh = self._fresh(sender, message, sample, arrived_ns)
+        wish.certain = (
+            not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
+        )
+        known = self.senders.setdefault((source, sample.identity), Sender())
+        if zero:
+            if not sample.shared:
+                known.armed_ns = arrived_ns
+            known.zeros.append(arrived_ns)
+            del known.zeros[:-4000]
+        else:
+            self._arm(known, arrived_ns)
+            known.zeros.clear()
+        wish.armed_ns = known.armed_ns
+        self.wishes.append((source, wish))
+
+    def _arm(self, known: Sender, now_ns: int) -> None:
+        """Arm a shared identity by the latest zero that the pause has passed behind."""
+        place = bisect_right(known.zeros, now_ns - self.pause_ns)
+        if place:
+            known.armed_ns = max(known.armed_ns, known.zeros[place - 1])
+
+    def _fresh(
+        self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int
+    ) -> bool:
+        """Return whether the pages allow the robot to obey this command, by its true age."""
+        if not sample.clock:
+            return True
+        age = arrived_ns - message.sent_ns
+        timeout_ns: int = self.timeout[sender["source"]]
+        clock = self.clocks.setdefault(sample.clock, Clock())
+        if sample.clock in self.shared_clocks:
+            clock.loose = True
+        foreign = sender["way"] in FOREIGN
+        if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
+            clock.loose = True
+        if foreign and sender["clock"]:
+            clock.loose = True
+        clock.stamp_ns = message.stamp_ns
+        least, recent = clock.least_ns, clock.recent
+        clock.least_ns = age if least is None else min(least, age)
+        while recent and recent[0][0] < arrived_ns - 3 * NS:
+            recent.popleft()
+        prompt: int = int(sender["delay"] * NS)
+        allowed = max(timeout_ns, 0) + EARLY_NS + MARGIN_NS
+        if foreign:
+            minutes = (arrived_ns - self.learned_ns) / NS / 60
+            allowed += int((1.0 + minutes) * NS)
+        if clock.loose or age <= prompt + allowed:
+            fresh = True
+        elif least is None or self._falls(recent, age, arrived_ns, min(timeout_ns, 2 * NS)):
+            fresh = False
+        else:
+            fresh = age <= least + allowed
+        recent.append((arrived_ns, age))
+        return fresh
+
+    def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
+        """Return whether the delays cannot have looked constant for the time of a proof."""
+        window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]
+        if not window or window[0][0] > now_ns - proof_ns + MARGIN_NS:
+            return recent[0][0] > now_ns - proof_ns if recent else True
+        middle = now_ns - proof_ns // 2
+        first = [d for at, d in window if at < middle]
+        second = [d for at, d in window if at >= middle] + [age]
+        return bool(first) and min(first) - min(second) > EARLY_NS
+
+    def arming(self, at_ns: int) -> None:
+        """Note an event after which every sender must send a zero."""
+        self.armed_since_ns = max(self.armed_since_ns, at_ns)
+
+    def suspended(self, at_ns: int) -> None:
+        """The robot's clock stood: it cannot know the delays that it knew before."""
+        self.learned_ns = at_ns
+        for clock in self.clocks.values():
+            clock.least_ns = None
+
+    def stopped(self, at_ns: int, sent_ns: int) -> None:
+        self.stops.append({"at": at_ns, "sent": sent_ns})
+
+    def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
+        """Note a clear that worked, as the daemon says. Its sender saw the latch at `read_ns`."""
+        if text.startswith("nothing"):
+            return
+        self.counts["clear"] += 1
+        self.arming(asked_ns)
+        if self.fault_ns is not None and self.fault_ns <= asked_ns:
+            self.fault_ns = None
+        if "still" in text:
+            return
+        for stop in self.stops:
+            seen = read_ns is not None and read_ns >= stop["at"]
+            late = read_ns is None and asked_ns >= stop["at"] + 2 * NS - MARGIN_NS
+            if not (seen or late):
+                raise BrokenError(
+                    "a clear releases no stop that came after it",
+                    asked_ns,
+                    f"clear by {name} released the stop of {stop['at'] / NS:.3f} s: {text}",
+                )
+        self.stops.clear()
+
+    def set_limits(self, at_ns: int, settings: dict[str, float]) -> None:
+        """Note settings that the daemon says it has taken."""
+        self.before, self.changed_ns = dict(self.limits), at_ns
+        for key, value in settings.items():
+            parts = key.split(".")
+            if parts[0] == "limits":
+                self.limits[parts[1]] = value
+                low = self.softest.get(parts[1], value)
+                self.softest[parts[1]] = (
+                    min(low, value) if "deceleration" in key else max(low, value)
+                )
+            else:
+                if parts[1] == "pause":
+                    self.pause_ns = int(value * NS)
+                else:
+                    self.timeout[parts[2]] = int(value * NS)
+                self.arming(at_ns)
+
+    # what the daemon showed
+
+    def step(self, at_ns: int, mode: str, reason: str) -> None:
+        """Judge the mode and the words for it."""
+        if mode == self.mode and reason == self.reason:
+            return
+        if mode not in MODES or len(reason) < 6:
+            raise BrokenError("every state has a reason", at_ns, f"{mode}: {reason!r}")
+        if (mode == "driving") != reason.startswith("driving"):
+            raise BrokenError("every state has a reason", at_ns, f"{mode}: {reason!r}")
+        if "the guard replaced" in reason:
+            raise BrokenError("the guard never has to trip", at_ns, reason)
+        if mode == "fault" != self.mode:
+            self.counts["fault"] += 1
+            recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
+            if self.mode and self.fault_ns is None and set(recent) <= HARMLESS:
+                raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
+            if self.fault_ns is None:
+                self.fault_ns = at_ns
+        if mode != self.mode:
+            self.counts[f"mode {mode}"] += 1
+        self.mode, self.reason = mode, reason
+
+    @property
+    def held(self) -> tuple[int, str] | None:
+        """Since when nothing may move, and why."""
+        found = []
+        if self.stops:
+            found.append((self.stops[0]["at"], "a stop"))
+        if self.fault_ns is not None:
+            found.append((self.fault_ns, "a fault"))
+        if self.inactive_ns is not None:
+            found.append((self.inactive_ns, "being switched off"))
+        return min(found, default=None)
+
+    def line(self, at_ns: int, line: bytes, fed_ns: int) -> None:
+        """Judge a line on the wire; `fed_ns` is when the board was last heard."""
+        wheels = self._decoded.get(line) or self._read(at_ns, line)
+        if wheels is None:
+            return
+        if wheels == ZERO:
+            self.last, self.last_ns, self.coasting = ZERO, at_ns, None
+            self.softest = dict(self.limits)
+            return
+        self.counts["moving lines"] += 1
+        if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
+            raise BrokenError(
+                "a silent board gets zeros", at_ns, f"last heard {fed_ns / NS:.3f} s: {line!r}"
+            )
+        before, last_ns = self.last, self.last_ns
+        grows = any(
+            abs(new) > abs(old) + 0.001 or new * old < 0.0
+            for new, old in zip(wheels, before, strict=True)
+        )
+        if not self.pending:
+            self._limits(at_ns, wheels, before, at_ns - last_ns, grows)
+        held = None if self.pending else self.held
+        if held is not None:
+            self._held(at_ns, held, grows, line)
+        self._wished(at_ns, wheels, before, grows, line)
+        self.last, self.last_ns = wheels, at_ns
+
+    def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
+        """Return the wheel speeds of a line, None for a question to the board or a torn line."""
+        match = LINE.match(line)
+        if match is None:
+            if line.endswith(b"\n") and line[:1] in b"abcd#":
+                raise BrokenError("every line is whole", at_ns, repr(line))
+            return None
+        motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]
+        wheels = tuple(motors[place] * sign + 0.0 for place, sign in self.motors)
+        if len(self._decoded) > 20_000:
+            self._decoded.clear()
+        self._decoded[line] = wheels
+        return wheels
+
+    def twist(self, wheels: tuple[float, ...]) -> tuple[float, float]:
+        """Return the speed and turn rate of these wheels, front right and front left first."""
+        right, left = wheels[0], wheels[1]
+        return self.radius * (right + left) / 2, self.radius * (right - left) / (2 * self.half)
+
+    def _most(self, name: str, at_ns: int) -> float:
+        """Return a limit; shortly after it was changed the larger of the two."""
+        value = self.limits[name]
+        if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
+            return float(max(value, self.before[name]))
+        return float(value)
+
+    def _limits(
+        self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], dt: int, grows: bool
+    ) -> None:
+        if wheels[0] != wheels[3] or wheels[1] != wheels[2]:
+            raise BrokenError("the wheels of a side turn alike", at_ns, str(wheels))
+        most = self._most("wheel_speed", at_ns) + 0.011
+        if max(map(abs, wheels)) > max(most, max(map(abs, before)) if not grows else 0.0):
+            raise BrokenError("no wheel is over its limit", at_ns, f"{wheels} over {most:.2f}")
+        (v, w), (v0, w0) = self.twist(wheels), self.twist(before)
+        ev = self.radius * 0.011
+        ew = self.radius * 0.011 / self.half
+        seconds = min(dt / NS, max(0.05, 1.5 * self.period_ns / NS)) + 0.002
+        saturated = max(map(abs, wheels)) > self._most("wheel_speed", at_ns) - 0.1
+        for name, new, old, room in (("linear", v, v0, ev), ("angular", w, w0, ew)):
+            speed = self._most(f"{name}_speed", at_ns)
+            if abs(new) > max(speed, abs(old)) + room:
+                raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
+            up = self._most(f"{name}_acceleration", at_ns)
+            down = self._most(f"{name}_deceleration", at_ns)
+            if self.mode in ("stopped", "fault", "leaving"):
+                down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
+            gained = abs(new) - abs(old) if new * old >= 0 else abs(new)
+            if gained > up * seconds + 2 * room:
+                raise BrokenError(
+                    "no acceleration is over its limit", at_ns,
+                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
+                )  # fmt: skip
+            lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
+            if lost > down * (dt / NS + 0.002) + 2 * room and not saturated:
+                raise BrokenError(
+                    "no deceleration is over its limit", at_ns,
+                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
+                )  # fmt: skip
+
+    def ramp_ns(self, stop: bool) -> int:
+        """Return how long the softest limits of this drive allow a ramp to rest to take."""
+        low = self.softest
+        rim = low["wheel_speed"] * self.radius
+        word = "stop_deceleration" if stop else "deceleration"
+        linear = min(low["linear_speed"], rim) / low[f"linear_{word}"]
+        angular = min(low["angular_speed"], rim / self.half) / low[f"angular_{word}"]
+        return int(max(linear, angular) * NS)
+
+    def _held(self, at_ns: int, held: tuple[int, str], grows: bool, line: bytes) -> None:
+        since_ns, why = held
+        name = f"nothing moves after {why}"
+        if grows and at_ns > since_ns + self.period_ns:
+            raise BrokenError(name, at_ns, f"{line!r} grows, held since {since_ns / NS:.3f} s")
+        ramp_ns = self.ramp_ns(stop=why != "being switched off")
+        if at_ns > since_ns + ramp_ns + RAMP_NS + self.period_ns:
+            raise BrokenError(name, at_ns, f"{line!r} still, held since {since_ns / NS:.3f} s")
+
+    def _wished(
+        self,
+        at_ns: int,
+        wheels: tuple[float, ...],
+        before: tuple[float, ...],
+        grows: bool,
+        line: bytes,
+    ) -> None:
+        if not grows and at_ns - self.wished_ns < 100_000_000:
+            return
+        wish, why = self._explains(at_ns, wheels, before, grows)
+        if wish is not None:
+            self.wished_ns, self.coasting = at_ns, None
+            return
+        if grows:
+            raise BrokenError(
+                "motion needs a fresh wish of an armed sender", at_ns, f"{line!r}: {why}"
+            )
+        fastest = max(map(abs, wheels))
+        if self.coasting is None:
+            self.coasting = at_ns, fastest
+        since_ns, then = self.coasting
+        if at_ns - since_ns > 300_000_000 and fastest > then - 0.02:
+            raise BrokenError("without a wish the robot slows down", at_ns, f"{line!r}: {why}")
+        if at_ns - since_ns > self.ramp_ns(stop=False) + RAMP_NS:
+            raise BrokenError("without a wish the robot comes to rest", at_ns, f"{line!r}: {why}")
+
+    def _explains(
+        self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], grows: bool
+    ) -> tuple[Wish | None, str]:
+        """Return a wish that allows this line, or None and what is wrong with the latest one."""
+        slack = self.period_ns + MARGIN_NS
+        wishes, longest = self.wishes, max(self.timeout.values()) + slack
+        while wishes and wishes[0][1].arrived_ns < at_ns - longest:
+            wishes.popleft()
+        why, lowest = "no command arrived within its timeout", self._lowest(at_ns)
+        for source, wish in reversed(wishes):
+            if wish.arrived_ns > at_ns or at_ns - wish.arrived_ns > self.timeout[source] + slack:
+                continue
+            if self.priority[source] < lowest:
+                why = f"{source} has a lower priority than a source that sends"
+                continue
+            if not wish.fresh:
+                why = f"{source} by {wish.identity} is stale"
+                continue
+            if self.neutral_first:
+                known = self.senders[source, wish.identity]
+                armed_ns = wish.armed_ns
+                if not wish.v and not wish.w:
+                    self._arm(known, at_ns)
+                    armed_ns = known.armed_ns
+                if armed_ns < self.armed_since_ns:
+                    why = f"{source} by {wish.identity} is not armed"
+                    continue
+            if not grows or self._leads(wish, wheels, before):
+                return wish, ""
+            why = f"{source} by {wish.identity} wishes {wish.v:g}, {wish.w:g}"
+        return None, why
+
+    def _lowest(self, at_ns: int) -> int:
+        """Return the highest priority of a source that certainly sends now."""
+        if self.churns:
+            return 0
+        found = 0
+        for source, wish in self.wishes:
+            age = at_ns - wish.arrived_ns
+            live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS
+            if live and wish.certain and wish.arrived_ns > self.armed_since_ns + MARGIN_NS:
+                found = max(found, self.priority[source])
+        return found
+
+    def _leads(self, wish: Wish, wheels: tuple[float, ...], before: tuple[float, ...]) -> bool:
+        """Return whether the way from `before` to `wheels` leads towards the wish."""
+        goal_v, goal_w = self.clamped(wish.v, wish.w)
+        for new, old, goal, room in zip(
+            self.twist(wheels),
+            self.twist(before),
+            (goal_v, goal_w),
+            (self.radius * 0.022, self.radius * 0.022 / self.half),
+            strict=True,
+        ):
+            grew = abs(new) > abs(old) + room or (new * old < 0 and abs(new) > room)
+            if grew and (goal * new <= 0 or abs(new) > abs(goal) + room):
+                return False
+        return True
+
+    def clamped(self, v: float, w: float) -> tuple[float, float]:
+        """Return a wish scaled down to the limits with its curvature kept."""
+        limits, scale = self.softest, 1.0
+        scale = min(scale, limits["linear_speed"] / abs(v) if v else 1.0)
+        scale = min(scale, limits["angular_speed"] / abs(w) if w else 1.0)
+        rim = max(abs(v - w * self.half), abs(v + w * self.half)) / self.radius
+        if rim:
+            scale = min(scale, limits["wheel_speed"] / rim)
+        return v * scale, w * scale
