@@ -175,20 +175,19 @@ class Run:
         latch, read_ns = None, None
         if event.get("named") and self.product.alive:
             latch, read_ns = self.product.state()["latch"], self.true_ns
-        sent_ns, end_ns = self.true_ns, int(self.plan["seconds"] * NS)
-        due_ns = sent_ns + int(event["late"] * NS)
+        end_ns = int(self.plan["seconds"] * NS)
+        due_ns = self.true_ns + int(event["late"] * NS)
         for extra_ns in (0, 700_000_000) if event["twice"] else (0,):
             if due_ns + extra_ns < end_ns or self._epilogue:
                 self._at(
                     due_ns + extra_ns,
-                    lambda due=due_ns + extra_ns: self._ask(event, due, sent_ns, latch, read_ns),  # type: ignore[misc]
+                    lambda due=due_ns + extra_ns: self._ask(event, due, latch, read_ns),  # type: ignore[misc]
                 )
 
     def _ask(
         self,
         event: dict[str, Any],
         due_ns: int,
-        sent_ns: int,
         latch: int | None,
         read_ns: int | None,
     ) -> None:
@@ -214,12 +213,12 @@ class Run:
         elif via == "bridge":
             attachment = b""
         if verb == "stop":
-            witness.stopped(true_ns, sent_ns)
+            witness.stops.append(true_ns)
             if event.get("put"):
                 product.deliver(at_ns, "stop", b"", via="native", attachment=attachment)
                 return
         self._ticket += 1
-        ticket, was = self._ticket, product.state()["mode"]
+        ticket = self._ticket
 
         def answered(reply: bytes) -> None:
             success, text = _read_reply(reply, via)
@@ -230,12 +229,9 @@ class Run:
                 case "clear":
                     witness.cleared(true_ns, read_ns, text, event["by"])
                 case "activate":
-                    if was == "inactive":
-                        witness.arming(true_ns)
-                    witness.inactive_ns = None
+                    witness.activated(true_ns, read_ns, event["by"])
                 case "deactivate":
-                    if witness.inactive_ns is None:
-                        witness.inactive_ns = self.true_ns
+                    witness.offs.append(true_ns)
                 case "set":
                     if not text.startswith("nothing new"):
                         witness.set_limits(self.true_ns, event["settings"])
@@ -332,14 +328,15 @@ class Run:
         behind = product.disk.behind
         if behind:
             witness.stops.clear()
-            witness.fault_ns = witness.inactive_ns = None
+            witness.offs.clear()
+            witness.fault_ns = None
             witness.limits = dict(witness.file)
         self._calls.clear()
 
         def start() -> None:
             self.resumed_ns = product.now_ns
             if product.disk.full:
-                witness.stopped(self.true_ns, self.true_ns)
+                witness.stops.append(self.true_ns)
             product.start()
             witness.new_life(self.true_ns)
             self.pose.doubt()
@@ -413,8 +410,8 @@ class Run:
             self.true_ns + int((2.5 + self.plan["config"]["sim"].get("boot_time", 0)) * NS)
         )
         for _ in range(3):
-            state = product.state()
-            verb = "clear" if state["latch"] else "activate" if state["mode"] == "inactive" else ""
+            verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
+            verb = verbs.get(product.state()["mode"])
             if verb:
                 self._call({"verb": verb, "named": True, "by": "op", "via": "native",
                             "late": 0.0, "lost": False, "twice": False})  # fmt: skip

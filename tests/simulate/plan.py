@@ -342,7 +342,9 @@ def _events(
             call(at, "clear", named=True)
     for at in add("activation", 20):
         call(at, "deactivate")
-        call(round(at + dice.uniform(0.0, 4.0), 3), "activate")
+        for _ in range(dice.randrange(1, 3)):
+            after = round(at + dice.choice((0.0, 2.5)) + dice.uniform(0.0, 2.0), 3)
+            call(after, "activate", named=dice.random() < 0.7)
     for at in add("poses", 40):
         if dice.random() < 0.5:
             call(at, "reset_odometry")

@@ -108,9 +108,13 @@ class Witness:
         self.shared_clocks: set[str] = set()
         """Clocks that several senders of the plan stamp by."""
         self.churns = False
-        self.stops: list[dict[str, Any]] = []
+        self.stops: list[int] = []
+        """Arrivals of the stops that no clear has released."""
+        self.offs: list[int] = []
+        """Arrivals of each `deactivate` that no `activate` has released."""
+        self.dormant_ns: int | None = None
+        """Start of a daemon that waits for its first `activate`."""
         self.fault_ns: int | None = None
-        self.inactive_ns: int | None = None
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
         self.pending = False
@@ -142,7 +146,7 @@ class Witness:
         self.coasting: tuple[int, float] | None = None
         self.delivered = 0
         if not self.config["control"].get("auto_activate", True):
-            self.inactive_ns = at_ns
+            self.dormant_ns = at_ns
         self.mode = ""
 
     def command(
@@ -243,9 +247,6 @@ class Witness:
         for clock in self.clocks.values():
             clock.least_ns = None
 
-    def stopped(self, at_ns: int, sent_ns: int) -> None:
-        self.stops.append({"at": at_ns, "sent": sent_ns})
-
     def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
         """Note a clear that worked, as the daemon says. Its sender saw the latch at `read_ns`."""
         if text.startswith("nothing"):
@@ -256,16 +257,25 @@ class Witness:
             self.fault_ns = None
         if "still" in text:
             return
-        for stop in self.stops:
-            seen = read_ns is not None and read_ns >= stop["at"]
-            late = read_ns is None and asked_ns >= stop["at"] + 2 * NS - MARGIN_NS
+        self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
+
+    def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
+        """Note an `activate` that worked, as the daemon says."""
+        if self.dormant_ns is not None or self.offs:
+            self.arming(asked_ns)
+        self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
+        self.dormant_ns = None
+
+    def _release(
+        self, latched: list[int], promise: str, asked_ns: int, read_ns: int | None, name: str
+    ) -> None:
+        for at_ns in latched:
+            seen = read_ns is not None and read_ns >= at_ns
+            late = read_ns is None and asked_ns >= at_ns + 2 * NS - MARGIN_NS
             if not (seen or late):
-                raise BrokenError(
-                    "a clear releases no stop that came after it",
-                    asked_ns,
-                    f"clear by {name} released the stop of {stop['at'] / NS:.3f} s: {text}",
-                )
-        self.stops.clear()
+                text = f"the call of {name} released what was latched at {at_ns / NS:.3f} s"
+                raise BrokenError(promise, asked_ns, text)
+        latched.clear()
 
     def set_limits(self, at_ns: int, settings: dict[str, float]) -> None:
         """Note settings that the daemon says it has taken."""
@@ -313,11 +323,13 @@ class Witness:
         """Since when nothing may move, and why."""
         found = []
         if self.stops:
-            found.append((self.stops[0]["at"], "a stop"))
+            found.append((self.stops[0], "a stop"))
         if self.fault_ns is not None:
             found.append((self.fault_ns, "a fault"))
-        if self.inactive_ns is not None:
-            found.append((self.inactive_ns, "being switched off"))
+        if self.offs:
+            found.append((self.offs[0], "being switched off"))
+        if self.dormant_ns is not None:
+            found.append((self.dormant_ns, "being switched off"))
         return min(found, default=None)
 
     def line(self, at_ns: int, line: bytes, fed_ns: int) -> None:

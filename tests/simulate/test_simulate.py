@@ -5,19 +5,20 @@ from __future__ import annotations
 import json
 import random
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 
 import pytest
 
-from tests.simulate import pairs, promises, shrink
+from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, played
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.product import problems
-from tests.simulate.promises import NS, BrokenError, Witness
-from tests.simulate.roads import messages
+from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.roads import NS, messages
 
 PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
 EMPTY: Plan = {
@@ -87,8 +88,8 @@ def witnessed() -> Witness:
     ("what", "promise"),
     [
         (lambda w: None, "motion needs a fresh wish of an armed sender"),
-        (lambda w: w.stopped(NS // 2, NS // 2), "nothing moves after a stop"),
-        (lambda w: setattr(w, "inactive_ns", NS // 2), "nothing moves after being switched off"),
+        (lambda w: w.stops.append(NS // 2), "nothing moves after a stop"),
+        (lambda w: w.offs.append(NS // 2), "nothing moves after being switched off"),
         (lambda w: w.step(NS, "fault", "it is broken somehow"), "no fault without a cause"),
         (lambda w: w.step(NS, "ready", ""), "every state has a reason"),
         (
@@ -120,8 +121,8 @@ def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], prom
 
 def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> None:
     witness = witnessed()
-    witness.stopped(5 * NS, 5 * NS)
-    with pytest.raises(BrokenError, match="releases no stop that came after it"):
+    witness.stops.append(5 * NS)
+    with pytest.raises(BrokenError, match="releases no later stop"):
         witness.cleared(9 * NS, 4 * NS, "cleared; each sender must send a zero", "ann")
     witness.cleared(9 * NS, 6 * NS, "cleared; each sender must send a zero", "ann")
     assert witness.held is None
@@ -135,7 +136,7 @@ def test_shrinking_leaves_what_the_finding_needs(monkeypatch: pytest.MonkeyPatch
         verbs = [event.get("verb") for event in one["events"]]
         found = "clear" in verbs and any(s["phases"] for s in one["senders"])
         name = "a made-up promise" if found else ""
-        return Result(1, name, name, int(500 * NS), 1.0, 0.1, promises.Counter())
+        return Result(1, name, name, int(500 * NS), 1.0, 0.1, Counter())
 
     monkeypatch.setattr(shrink, "played", broken)
     dice = random.Random(1)
