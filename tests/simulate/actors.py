@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from tests.simulate.plan import Plan
-from tests.simulate.pose import PoseWitness
+from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
 from tests.simulate.roads import NS, Message, messages, sample
@@ -72,6 +72,8 @@ class Run:
         self._ticket = 0
         self._active: list[tuple[str, tuple[Any, ...]]] = []
         self._fed_ns = 0
+        self._linked = False
+        """This daemon has heard the board: before that, no event disarms a sender."""
         self._stalled_ns = -NS
         self._epilogue = False
         self._moved_ns = -1
@@ -267,7 +269,7 @@ class Run:
                 self._troubled("reset")
                 deaf_ns = int(event["deaf"] * NS)
                 if deaf_ns > 12 * NS // 10:
-                    self._at(self.true_ns + deaf_ns, lambda: witness.arming(self.true_ns))
+                    self._at(self.true_ns + deaf_ns, lambda: self._disarmed(self.true_ns))
             case "unplug":
                 product.unplug()
                 self.pose.doubt()
@@ -296,6 +298,8 @@ class Run:
 
     def _troubled(self, name: str) -> None:
         self.witness.troubles[name] = self.true_ns
+        if name in LIARS:
+            self.pose.doubt()
 
     def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
         self._active.remove(fault)
@@ -305,7 +309,7 @@ class Run:
     def _plug(self, new: bool) -> None:
         if not self.product.plugged:
             self.product.plug(new)
-            self.witness.arming(self.true_ns)
+            self._disarmed(self.true_ns)
 
     def _suspend(self, lasts_ns: int) -> None:
         """The host sleeps: its monotonic clock stands, and its USB ports lose their power."""
@@ -338,6 +342,7 @@ class Run:
             if product.disk.full:
                 witness.stops.append(self.true_ns)
             product.start()
+            self._linked = False
             witness.new_life(self.true_ns)
             self.pose.doubt()
 
@@ -349,8 +354,12 @@ class Run:
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
         if gap_ns > 11 * NS // 10 and self._stalled_ns < self._fed_ns:
+            self._disarmed(true_ns)
+        self._fed_ns, self._linked = true_ns, True
+
+    def _disarmed(self, true_ns: int) -> None:
+        if self._linked:
             self.witness.arming(true_ns)
-        self._fed_ns = true_ns
 
     def _see(self, seen: Seen) -> None:
         if self.failure is not None:

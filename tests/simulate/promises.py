@@ -155,13 +155,13 @@ class Witness:
         """Take note of a command that reached the daemon."""
         self.delivered += 1
         source = sender["source"]
-        if source not in self.priority or message.junk not in ("", "cancels", "stranger"):
+        if message.junk in ("stranger", "wildcard"):
+            return  # it names another source
+        if message.junk not in ("", "cancels"):
             known = self.senders.get((source, sample.identity))
             if known is not None:
                 self._arm(known, arrived_ns)
                 known.zeros.clear()
-            return
-        if message.junk == "stranger":
             return
         if message.junk == "cancels":
             v, w = 0.0, 0.0
