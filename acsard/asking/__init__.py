@@ -1,1 +1,1 @@
-"""How a verb asks who stands beside the robot: at a terminal, or through a program."""
+"""Prompts for the person beside the robot: at a terminal, or through a program."""

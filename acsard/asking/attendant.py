@@ -1,6 +1,6 @@
-"""Who stands beside the robot while it is calibrated: a person at this terminal, or nobody.
+"""The prompts of a calibration: a person at this terminal, or nobody.
 
-A person whom a program asks is in `json_lines.py`.
+`json_lines.py` has the prompts that go to a program.
 """
 
 from __future__ import annotations
@@ -25,27 +25,36 @@ LEAVES = "q"
 
 
 class Attendant(Protocol):
-    """What is asked of whoever stands there; all of it goes to standard error."""
+    """Interface of the prompts. All output goes to standard error."""
 
     def say(self, text: str) -> None:
-        """Tell."""
+        """Print a text."""
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Return when the leg may begin; raises `KeyboardInterrupt`. `by_key`: a key is how it is
-        meant to end."""
+        """Return when the leg may begin.
+
+        Raises `KeyboardInterrupt` if the person leaves. `by_key` says that a key press is the
+        intended end of the leg.
+        """
 
     def number(self, ask: Ask) -> float:
-        """What was read off; raises `KeyboardInterrupt` or `GuideError`."""
+        """Return the number that the person read off.
+
+        Raises `KeyboardInterrupt` if the person leaves, and `GuideError` if nobody can measure.
+        """
 
     def keys(self, wait_s: float) -> str:
-        """The keys that were pressed; waits that long for one."""
+        """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
 
     def progress(self, share: float) -> None:
-        """So much of the leg is done."""
+        """Show which share of the leg is done, 0 to 1."""
 
 
 class Nobody:
-    """Agrees to every leg and measures nothing: for the simulator."""
+    """Prompt without a person: it agrees to every leg and measures nothing.
+
+    It is for the simulator.
+    """
 
     def say(self, text: str) -> None:
         _print(text)
@@ -67,7 +76,7 @@ class Nobody:
 
 
 class Person:
-    """At the terminal that standard input is: single keys while the robot drives, lines else."""
+    """Terminal prompt on standard input: single keys while the robot drives, lines otherwise."""
 
     def __init__(self) -> None:
         self._input = sys.stdin.fileno()
@@ -79,7 +88,7 @@ class Person:
         import termios
 
         _print(text)
-        # Keys from before these words were read start nothing.
+        # Keys that were pressed before the text appeared must not start anything.
         termios.tcflush(self._input, termios.TCIFLUSH)
         _print("Enter starts it, any key then stops it; q leaves.", end="\n")
         while True:
@@ -116,14 +125,15 @@ class Person:
 
     def _read(self) -> str:
         read = os.read(self._input, 256)
-        if not read:  # the terminal has been closed
+        # The terminal has been closed.
+        if not read:
             raise KeyboardInterrupt
         return read.decode(errors="replace")
 
 
 @contextmanager
 def attending() -> Iterator[Person]:
-    """A person whose keys come one by one; the terminal is left as it was."""
+    """Yield a terminal prompt that reads single keys, and restore the terminal at the end."""
     from acsard.host.one_by_one import one_by_one
 
     with one_by_one():
@@ -132,8 +142,11 @@ def attending() -> Iterator[Person]:
 
 @contextmanager
 def interrupted_by(numbers: Sequence[signal.Signals]) -> Iterator[None]:
-    """These signals end it as Ctrl-C does, so that zeros go out; Ctrl-Z would leave it driving. A
-    second one does not disturb the zeros."""
+    """End the block on these signals as on Ctrl-C, so that zeros are sent.
+
+    The caller passes SIGTSTP (Ctrl-Z) too, because a suspended program would leave the robot
+    driving. A second signal does not disturb the zeros.
+    """
 
     def end(number: int, frame: FrameType | None) -> None:
         for each in numbers:
@@ -150,7 +163,7 @@ def interrupted_by(numbers: Sequence[signal.Signals]) -> Iterator[None]:
 
 @contextmanager
 def _lines(terminal: int) -> Iterator[None]:
-    """Whole lines, shown as they are typed."""
+    """Read whole lines from the terminal, and echo them while they are typed."""
     import termios
 
     before = termios.tcgetattr(terminal)
@@ -164,7 +177,7 @@ def _lines(terminal: int) -> Iterator[None]:
 
 
 def number_of(line: str, usual: float | None) -> float:
-    """What was typed; nothing is what is usual, and nan what is no number."""
+    """Return the typed number, the default for an empty answer, or NaN if it is not a number."""
     if not line and usual is not None:
         return usual
     try:

@@ -1,9 +1,9 @@
-"""`--json-lines`: the person beside the robot is asked by a program, the robot's page say.
+"""`--json-lines`: a program, such as the robot's page, shows the prompts to a person.
 
-Out go JSON objects, one a line, on standard output: what is told and asked. In come answers, keys,
-and signs that somebody is still there, on standard input. The end of the input ends it as Ctrl-C
-does, and so does its silence while something may move: the program speaks as long as it hears the
-person. deploy/web/README.md has the fields.
+Texts and questions are written to standard output as JSON objects, one per line. Answers, key
+presses and signs of life are read from standard input. The end of the input interrupts the verb as
+Ctrl-C does. So does a silence of the program while something may move: the program sends as long as
+it is in contact with the person. deploy/web/README.md describes the fields.
 """
 
 from __future__ import annotations
@@ -36,30 +36,34 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 HEARD_S = 0.9
-"""Who is to stop what moves is heard so often at least: zeros go out a second after the last sign.
+"""Longest silence of the program while something may move, s. Zeros then follow within a second of
+its last line.
 
-He says something every 0.1 s, if only `{}`. What a network loses TCP sends again after 0.2 s, and
-once more after 0.4 s: what is lost twice still comes in time, and a STOP that is lost three times
-would be as late. A computer too busy for this has ended the leg before, by 0.5 s without a word of
-the daemon (calibration/guided/riding.py). Driving by hand every command is a sign, and the source's
-timeout holds."""
+The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
+after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
+three times would be as late. On a computer that is too busy for this, the leg has ended before,
+because the daemon was silent for 0.5 s (calibration/guided/riding.py). When a person drives by
+hand, each command is a sign of life, and the source's timeout applies.
+"""
 
 LISTEN_S = 0.05
 
 LEAVING_S = 1.0
-"""Whoever does not read why it ends is waited for so long."""
+"""Time to wait for the reader thread at the end, s, if the program does not read."""
 
 LINE_BYTES = 65536
-"""Of a line that comes; who sends a longer one has lost his mind, and is not listened to."""
+"""Largest length of an input line. A longer one interrupts the verb, because the program is
+faulty.
+"""
 
 CHECK_STEPS = 16
-"""Findings of a check that comes to its end, about: its progress is told by them."""
+"""Approximate number of findings in a complete check, for its progress."""
 
 KEY = " "
 
 
 class Line(Struct, frozen=True):
-    """What comes in; other fields are ignored."""
+    """An input line. Unknown fields are ignored."""
 
     answer: int = 0
     value: str | float | None = None
@@ -67,7 +71,7 @@ class Line(Struct, frozen=True):
 
 
 class JsonLines:
-    """Standard input and output as a conversation; leaving ends it."""
+    """Conversation over standard input and output. It ends when the context is left."""
 
     def __init__(self) -> None:
         self._input, self._left = sys.stdin.fileno(), False
@@ -76,7 +80,7 @@ class JsonLines:
         self._open, self._answer = 0, Line()
         self._pressed = False
         self._moves = False
-        """Something may move, which a person has begun and must be able to stop."""
+        """True while something may move that a person has started and must be able to stop."""
         self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
 
     def __enter__(self) -> Self:
@@ -88,27 +92,27 @@ class JsonLines:
             self._left = True
         self._reader.join(LEAVING_S)
 
-    # out
+    # Output
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """What it is about, first of all."""
+        """Announce the subject; this is the first line."""
         self._tell(Subject(subject, simulated))
 
     def told(self, text: str) -> None:
-        """Tell what stays."""
+        """Send a text that stays visible."""
         self._tell(Told(text))
 
     def progress(self, share: float) -> None:
-        """So much is done."""
+        """Send the progress, 0 to 1."""
         self._tell(Progress(round(share, 3)))
 
     def shows(self, text: str) -> None:
-        """What was found, as at a terminal; nothing moves any more."""
+        """Send the result as a terminal shows it. From now on nothing moves."""
         self._moves = False
         self._tell(Result(text.strip("\n")))
 
     def choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
-        """One of the answers; whatever else is said is told to be none, and asked again."""
+        """Ask for one of the answers, and repeat the question after any other one."""
 
         def chosen(value: str | float | None) -> str:
             if value not in answers:
@@ -118,8 +122,11 @@ class JsonLines:
         return self._ask(chosen, words=words, answers=answers, **more)
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
-        """Write these keys into the configuration file, where that can be and the person wants it;
-        `trouble` is why it must not. Whether it was done."""
+        """Offer to write these keys into the configuration file.
+
+        Returns whether it was done. The question is asked only if the file can be changed.
+        `trouble` is a reason not to write, or "".
+        """
         try:
             if trouble:
                 raise MendableError(trouble)
@@ -139,18 +146,23 @@ class JsonLines:
         print(msgspec.json.encode(message).decode(), flush=True)
 
     def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
-        """What `read` makes of the answer; it raises `ValueError` with what that has to be."""
+        """Ask a question and return `read(answer)`.
+
+        `read` raises `ValueError` with a description of valid answers; then the question is
+        repeated.
+        """
         self._moves, wrong = False, ""
         while True:
             question = msgspec.convert(
                 {"question": next(self._numbers), "wrong": wrong, **about}, Question
             )
             self._open = question.question
-            # Without the lock: who does not read what he is told is listened to all the same.
+            # Do not take the lock here: a program that does not read its output must still be able
+            # to send.
             self._tell(question)
             with self._news:
                 while self._open:
-                    # Not for ever: a signal just before it begins to wait would not wake it.
+                    # Wait with a limit: a signal just before the wait begins would not wake it.
                     self._news.wait(LISTEN_S)
             try:
                 got = read(self._answer.value)
@@ -160,17 +172,20 @@ class JsonLines:
             self._moves = True
             return got
 
-    # in
+    # Input
 
     def pressed(self, wait_s: float) -> bool:
-        """A key was, since the last answer or look; waits that long for one."""
+        """Return whether a key was pressed since the last answer or call.
+
+        Waits up to `wait_s` s for one.
+        """
         with self._news:
             self._news.wait_for(lambda: self._pressed, wait_s)
             pressed, self._pressed = self._pressed, False
             return pressed
 
     def _listen(self) -> None:
-        """Whatever ends it but the end of the conversation ends what is done."""
+        """Read the input until the conversation ends; any other end interrupts the verb."""
         try:
             self._end(self._heard_out())
         except BaseException as error:
@@ -178,7 +193,7 @@ class JsonLines:
             raise
 
     def _heard_out(self) -> str:
-        """Take what comes in; why no more does, or "" when the conversation is over."""
+        """Read the input. Return why it ended, or "" if the conversation is over."""
         held, heard_s = b"", time.monotonic()
         while not self._left:
             if self._readable(LISTEN_S):
@@ -194,19 +209,20 @@ class JsonLines:
         return ""
 
     def _readable(self, wait_s: float) -> bool:
-        """Something has come, or does within so long."""
+        """Return whether input is available, or arrives within `wait_s` s."""
         return bool(select.select([self._input], [], [], wait_s)[0])
 
     def _take(self, line: bytes) -> None:
         try:
             said = self._lines.decode(line)
         except (msgspec.MsgspecError, ValueError, RecursionError):
-            return  # the question stays open
+            # The question stays open.
+            return
         with self._news:
             if said.key:
                 self._pressed = True
             elif said.answer and said.answer == self._open:
-                # A key from before stops nothing, and one from now on does.
+                # Forget a key that was pressed before the answer. A later key stops the leg.
                 self._open, self._answer, self._pressed = 0, said, False
             self._news.notify_all()
 
@@ -216,17 +232,18 @@ class JsonLines:
         with self._news:
             if self._left:
                 return
-            # First what stops the wheels: nobody may be there any more to be told.
+            # Interrupt the main thread first, because that stops the wheels. The message may find
+            # no reader.
             signal.pthread_kill(main, signal.SIGINT)
         with suppress(OSError):
             print(f"acsard: {why}", file=sys.stderr, flush=True)
 
 
 class JsonAttendant(JsonLines):
-    """Beside a robot that is calibrated: `attendant.Attendant`."""
+    """JSON prompt of a calibration; implements `attendant.Attendant`."""
 
     def say(self, text: str) -> None:
-        """Tell."""
+        """Send a text."""
         self.told(text)
 
     def start(self, text: str, by_key: bool = False) -> None:
@@ -234,7 +251,7 @@ class JsonAttendant(JsonLines):
         self.choose(text, ("start",), leg=True, by_key=by_key)
 
     def number(self, ask: Ask) -> float:
-        """What was read off."""
+        """Return the number that the person read off."""
 
         def read(value: str | float | None) -> float:
             number = number_of("" if value is None else str(value), ask.usual)
@@ -247,33 +264,33 @@ class JsonAttendant(JsonLines):
         )
 
     def keys(self, wait_s: float) -> str:
-        """The key that was pressed."""
+        """Return a key if one was pressed, else ""."""
         return KEY if self.pressed(wait_s) else ""
 
 
 class JsonPerson(JsonLines):
-    """At a board that is checked: `person.Screen`."""
+    """JSON prompt of a check; has the methods of `person.Screen`."""
 
     def __init__(self) -> None:
         super().__init__()
         self._found = 0
 
     def say(self, text: str) -> None:
-        """Tell what happens now."""
+        """Send the present activity."""
         self._tell(Doing(text))
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """One of the answers."""
+        """Return one of the answers."""
         return self.choose(question, answers)
 
     def found(self, finding: Finding) -> None:
-        """As it is made."""
+        """Send a finding as it is made, and the progress."""
         self._found += 1
         self._tell(Found(finding))
         self.progress(min(0.99, self._found / CHECK_STEPS))
 
     def result(self, found: Report, where: str) -> None:
-        """All of it together."""
+        """Send the summary of all findings."""
         from acsard.checkup.report import summary
 
         self.progress(1.0)

@@ -1,6 +1,6 @@
-"""Who answers for a check and what it asks: somebody at the terminal, or nobody; who ends it.
+"""The prompts of a check: a person at the terminal, or nobody; and the signals that end the check.
 
-Somebody whom a program asks is in `json_lines.py`.
+`json_lines.py` has the prompts that go to a program.
 """
 
 from __future__ import annotations
@@ -29,8 +29,12 @@ LEAVES = "q"
 
 
 class Screen:
-    """What is told: findings on standard output, or all as one JSON object; and what happens now, a
-    line on the terminal that is written over by what comes next, and nothing into a pipe."""
+    """Output of a check.
+
+    Findings go to standard output one by one, or all together as one JSON object. The present
+    activity is a line on the terminal that the next output overwrites. It is left out if standard
+    error is a pipe, and for JSON output.
+    """
 
     def __init__(self, as_json: bool = False) -> None:
         self._as_json = as_json
@@ -44,12 +48,12 @@ class Screen:
         self.clear()
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """What is checked, first of all."""
+        """Print the subject of the check."""
         if not self._as_json:
             print(subject, flush=True)
 
     def found(self, finding: Finding) -> None:
-        """Tell a finding as it is made."""
+        """Print a finding as it is made."""
         from acsard.checkup.report import row
 
         if not self._as_json:
@@ -57,7 +61,7 @@ class Screen:
             print(row(finding, coloured(sys.stdout)), flush=True)
 
     def result(self, found: Report, where: str) -> None:
-        """Tell all of it together."""
+        """Print the summary of all findings."""
         import msgspec
 
         from acsard.checkup.report import summary
@@ -66,29 +70,29 @@ class Screen:
         print(msgspec.json.encode(found).decode() if self._as_json else summary(found, where))
 
     def say(self, text: str) -> None:
-        """Tell what happens now."""
+        """Show the present activity."""
         if self._on:
-            # Whole or cut, never wrapped: a wrapped line cannot be written over.
+            # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
             room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
             print(f"\r\033[K{f'   ... {text}'[:room]}", end="", file=sys.stderr, flush=True)
             self._shown = True
 
     def clear(self) -> None:
-        """Room for what stays on the screen."""
+        """Erase the activity line before other output."""
         if self._shown:
             print("\r\033[K", end="", file=sys.stderr, flush=True)
             self._shown = False
 
     def offer(self, config: str | None, keys: Mapping[str, object]) -> bool:
-        """At a terminal one writes by --write."""
+        """Return False: at a terminal the option --write changes the file."""
         return False
 
 
 class Person(Screen):
-    """Asks on standard error, so that the findings can go elsewhere; reads the terminal."""
+    """Terminal prompt. It asks on standard error, so that the findings can be redirected."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """One of the answers; q, or the end of the input, ends the check."""
+        """Return one of the answers; q, or the end of the input, ends the check."""
         self.clear()
         choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
         while True:
@@ -103,15 +107,18 @@ class Person(Screen):
 
 
 class Nobody(Screen):
-    """Confirms what has been said on the command line, and sees nothing."""
+    """Prompt without a person. It confirms what the command line allows, and sees no wheel turn."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
-        """The confirmation; no wheel has been seen to turn."""
+        """Return the only answer as a confirmation, or None if the question needs an observer."""
         return answers[0] if len(answers) == 1 else None
 
 
 def answering(args: argparse.Namespace, port: str) -> Person | Nobody | JsonPerson:
-    """Who answers; raises unless that is a person here, or nothing real can move."""
+    """Return the prompt for these options.
+
+    Raises `ExitError` unless a person can answer, or nothing real can move.
+    """
     if port == SIMULATOR and args.port != SIMULATOR:
         raise ExitError(
             Exit.USAGE,
@@ -153,15 +160,16 @@ def answering(args: argparse.Namespace, port: str) -> Person | Nobody | JsonPers
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Signals end the check by an exception, so that the zeros go out; a second one is too late."""
-    # Ctrl-Z too: a check that is suspended would leave a wheel turning.
+    """End the check on signals by an exception, so that zeros are sent; ignore further signals."""
+    # Ctrl-Z is included because a suspended check would leave a wheel turning.
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
     before = [signal.getsignal(number) for number in numbers]
 
     def end(number: int, frame: FrameType | None) -> None:
         for each in numbers:
             signal.signal(each, signal.SIG_IGN)
-        # Who started it may be gone, or read nothing: the zeros wait for nobody.
+        # The program that started the check may be gone, or it may not read. The zeros must not
+        # wait.
         with suppress(OSError, ValueError):
             if select.select([], [sys.stderr], [], 0.0)[1]:
                 print("\nstopping: zeros go out, then the port is closed", file=sys.stderr)

@@ -1,1 +1,1 @@
-"""Shell: `acsard bench`: a daemon measured from outside, on one clock."""
+"""`acsard bench`: measures a daemon from outside, with one clock."""

@@ -1,4 +1,4 @@
-"""The processes of a benchmark: how one is ended, why one ended by itself, what one costs."""
+"""The processes of a benchmark: how one is ended, why one ended by itself, and its cost."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.parent import end_with_parent
 
 END_S = 5.0
-"""An end takes 0.2 s."""
+"""Time limit for the end of a process, s. It usually takes 0.2 s."""
 
 
 def end_with_us() -> None:
-    """In the child: a parent that is killed leaves no daemon behind."""
+    """End this child process if the benchmark is killed, so that no daemon remains."""
     end_with_parent(signal.SIGTERM)
 
 
 def leave(process: subprocess.Popen[bytes]) -> None:
-    """End a child: it is asked first."""
+    """End a child: first by SIGTERM, then by SIGKILL."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
         try:
@@ -30,15 +30,15 @@ def leave(process: subprocess.Popen[bytes]) -> None:
 
 
 def ended(who: str, code: int, said: str = "") -> ExitError:
-    """An end that nobody asked for, in words."""
+    """Return an error that describes the unexpected end of a process."""
     how = f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
     return ExitError(Exit.FAILURE, f"{who} {how}" + (f": {said}" if said else ""))
 
 
 def daemon_ended(code: int, log: Path) -> ExitError:
-    """Why the daemon ended by itself: its own reason and code become ours if it gave them."""
+    """Return why the daemon ended by itself, with its own message and exit code if it gave them."""
     lines = log.read_text(errors="replace").splitlines()
-    # What it logs is in JSON, why it ended in words.
+    # The daemon's log lines are JSON; its reason for ending is plain text.
     said = [line for line in lines if line.strip() and not line.startswith("{")]
     if code in Exit.__members__.values() and code and said:
         return ExitError(Exit(code), said[-1].removeprefix("acsard: "))
@@ -46,7 +46,7 @@ def daemon_ended(code: int, log: Path) -> ExitError:
 
 
 def processor_ns(pid: int) -> int:
-    """Processor time of all threads of a process so far."""
+    """Return the processor time of all threads of a process so far, ns."""
     return sum(
         int(task.joinpath("schedstat").read_text().split()[0])
         for task in Path(f"/proc/{pid}/task").iterdir()
@@ -54,6 +54,6 @@ def processor_ns(pid: int) -> int:
 
 
 def resident_mb(pid: int) -> float:
-    """Memory in use."""
+    """Return the resident memory of a process, MB."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.partition("VmRSS:")[2].split()[0]) / 1024

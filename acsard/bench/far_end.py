@@ -1,8 +1,9 @@
-"""The far end of the wire for a benchmark, as a program: a simulated MCU on a pty.
+"""The far end of the wire in a benchmark: a program that simulates the board on a pty.
 
-A process of its own, woken by the kernel itself, ahead of all others where that is permitted: its
-times are those of the wire, whatever the measured program or the measuring one does. Its first
-line of output is the device; when its input ends it writes all it saw and ends.
+It is a process of its own that the kernel wakes directly, with real-time priority where that is
+permitted. Its times are therefore those of the wire, independent of the measured and the measuring
+program. Its first line of output is the device. When its input ends, it writes all recorded data
+and ends.
 """
 
 from __future__ import annotations
@@ -26,21 +27,21 @@ from acsard.serial.pty_end import PtyEnd
 from acsard.sim.fake_mcu import FakeMcu
 
 PRIORITY = 80
-"""Of real-time scheduling: a microcontroller waits for no host."""
+"""Real-time priority: a microcontroller does not wait for its host."""
 
 
 class Part(msgspec.Struct, frozen=True):
-    """What the far end plays."""
+    """Role of the far end."""
 
     config: dict[str, object]
     unprompted: float = 0.0
-    """s between reports by its own clock; 0 for an answer to each line."""
+    """Time between reports by the board's own clock, s; 0 to answer each line."""
     baud_rate: int = 0
-    """Of this end, when it shall be another than the configuration may say."""
+    """Baud rate of this end, if it is one that the configuration does not allow; else 0."""
 
 
 class NumberedMcu(FakeMcu):
-    """Answers in time and form as the simulator does, but each line says a speed of its own."""
+    """Simulated board with the usual timing, each of whose lines reports a different speed."""
 
     def __init__(self, config: Config, now_ns: int) -> None:
         super().__init__(config, now_ns)
@@ -52,11 +53,12 @@ class NumberedMcu(FakeMcu):
         return [forward * speed for _, forward in self._wiring]
 
     def _pass(self, now_ns: int) -> None:
-        self._now_ns = max(self._now_ns, now_ns)  # nothing here moves
+        # The simulated vehicle does not move.
+        self._now_ns = max(self._now_ns, now_ns)
 
 
 class FarEnd:
-    """The pty and the MCU behind it, in one blocking loop."""
+    """The pty and the simulated board behind it, in one blocking loop."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.seen = Seen()
@@ -66,7 +68,7 @@ class FarEnd:
         self._timer = TimerFd()
 
     def play(self, until_fd: int) -> None:
-        """Until `until_fd` has something to say."""
+        """Run until `until_fd` becomes readable."""
         poll = select.poll()
         for fd in (self._pty.fileno(), self._timer.fileno(), until_fd):
             poll.register(fd, select.POLLIN)
@@ -100,11 +102,12 @@ class FarEnd:
 
 
 def main(part: Part) -> None:
-    """Play until standard input ends, then tell all."""
+    """Run until standard input ends, then write the recorded data."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     except OSError:
-        pass  # its times are then as good as the machine is idle
+        # Without real-time priority the times are only as good as the machine is idle.
+        pass
     config = from_builtins(part.config)
     if part.baud_rate:
         config = replace(config, mcu=replace(config.mcu, baud_rate=part.baud_rate))
@@ -122,7 +125,8 @@ def main(part: Part) -> None:
         sys.stdout.buffer.write(msgspec.msgpack.encode(end.seen))
         sys.stdout.flush()
     except BrokenPipeError:
-        os._exit(1)  # who asked has been killed
+        # The benchmark has been killed.
+        os._exit(1)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Which message belongs to which line: how `acsard bench` pairs what went in with what came out.
+"""Pairs the input of a measured daemon with its output, for `acsard bench`.
 
-Every command and every feedback line of a benchmark says a speed of its own, so that each is
-recognised by what it says and not by when it came. Times are monotonic, ns.
+Every command and every feedback line of a benchmark has a speed of its own, so each is recognized
+by its content and not by its time. Times are monotonic, in ns.
 """
 
 from __future__ import annotations
@@ -12,16 +12,18 @@ from collections.abc import Iterable, Sequence
 from msgspec import Struct
 
 STEPS = 1000
-"""So many speeds differ; lines further apart than this are told apart by their time."""
+"""Number of different speeds. Lines that are further apart are distinguished by their time."""
 
 LOWEST, STEP = 5.0, 0.02
-"""rad/s; neighbours are so close that no limit on acceleration comes between them."""
+"""Lowest speed and step, rad/s. Neighbouring speeds are so close that a limit on acceleration
+does not change them.
+"""
 
 PATIENCE_NS = 1_000_000_000
-"""A command that is not on the wire by then never comes."""
+"""Time after which a command that has not reached the wire is lost, ns."""
 
 Chunk = tuple[int, bytes]
-"""Bytes as they came or went, and when."""
+"""Monotonic time in ns and the bytes that were sent or received then."""
 
 
 class Summary(Struct, frozen=True):
@@ -37,13 +39,16 @@ class Fed(Struct, frozen=True):
     """A feedback line that became an odometry sample."""
 
     delay_ns: int
-    """From its last byte to the sample."""
+    """Time from the line's last byte to the sample, ns."""
     waiting: int
-    """Newer lines handed over by the time of the sample."""
+    """Number of newer lines handed over by the time of the sample."""
 
 
 def staircase(number: int) -> float:
-    """The wheel speed that stands for `number`, rad/s: up in even steps, down in odd ones."""
+    """Return the wheel speed that stands for `number`, rad/s.
+
+    The speeds rise over the even steps of the scale and fall over the odd ones.
+    """
     half = STEPS // 2
     place = number % STEPS
     rung = 2 * place if place < half else 2 * (STEPS - place) - 1
@@ -51,7 +56,10 @@ def staircase(number: int) -> float:
 
 
 def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
-    """The lines without their ends, each with the time of its first byte; empty ones left out."""
+    """Return the lines without line ends, each with the time of its first byte.
+
+    Empty lines are left out.
+    """
     lines, held, began_ns = [], b"", 0
     for at_ns, data in chunks:
         if not held:
@@ -65,9 +73,9 @@ def lines_of(chunks: Iterable[Chunk]) -> list[Chunk]:
 
 
 def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int]:
-    """ns from each command to the first line that says it; one that never came is left out.
+    """Return the ns from each command to its first line; lost commands are left out.
 
-    `sent` has each command's time and the line it must become.
+    `sent` holds the time of each command and the line that it must become.
     """
     times: dict[bytes, list[int]] = {}
     for at_ns, line in lines:
@@ -84,10 +92,10 @@ def commands_to_lines(sent: Sequence[Chunk], lines: Sequence[Chunk]) -> list[int
 def lines_to_samples(
     said: Sequence[tuple[int, float]], samples: Iterable[tuple[int, float]]
 ) -> list[Fed]:
-    """What became of each feedback line that was heard of: by its linear speed, m/s.
+    """Return the delay of each feedback line that became a sample, matched by linear speed in m/s.
 
-    `said` has each line's time and speed, `samples` each odometry sample's. A sample that repeats
-    a line is left out.
+    `said` holds the time and the speed of each line, and `samples` those of each odometry sample. A
+    sample that repeats a line is left out.
     """
     all_ns = [at_ns for at_ns, _ in said]
     places: dict[int, list[int]] = {}
@@ -109,7 +117,7 @@ def _key(speed: float) -> int:
 
 
 def summary(durations_ns: Sequence[int]) -> Summary | None:
-    """Exact percentiles, each a duration that was measured; None of nothing."""
+    """Return exact percentiles, each of them a measured duration; None for an empty sequence."""
     if not durations_ns:
         return None
     import numpy as np

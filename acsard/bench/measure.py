@@ -1,4 +1,4 @@
-"""One benchmark from beginning to end: a rig is run, its record becomes the figures."""
+"""Runs one benchmark and computes the figures from its record."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from acsard.messages.schema import RobotState
 
 
 def measure(config: Config, port: str, seconds: float) -> Result:
-    """A quarter of the time only followed, then commanded as well."""
+    """Measure for `seconds`: a quarter without commands, the rest with commands.
+
+    With an empty `port` the simulated board is measured.
+    """
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(config, Path(where))
         with Rig(config, file, port=port) as rig:

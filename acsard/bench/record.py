@@ -1,4 +1,4 @@
-"""What a benchmark recorded, and what follows from it: no clock, no process, only times."""
+"""The record of a benchmark, and the figures that follow from it; pure."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ from acsard.values import Instant
 
 
 class Seen(Struct, frozen=True):
-    """All that went over the wire, monotonic times in ns."""
+    """All data on the wire, with monotonic times in ns."""
 
     heard: list[Chunk] = []
-    """Bytes from the host, and when they were there to be read."""
+    """Bytes from the daemon, with the times at which they were readable."""
     said: list[Chunk] = []
-    """Lines to the host, and when the last byte was handed over."""
+    """Lines to the daemon, with the times at which the last byte was handed over."""
 
 
 class Sent(Struct, frozen=True):
-    """A command, when it was put, and the line it must become."""
+    """A command, with the time at which it was published and the line that it must become."""
 
     at_ns: int
     line: bytes
 
 
 class Sample(Struct, frozen=True):
-    """An odometry sample, when it came, and what it says."""
+    """An odometry sample, with its arrival and its content."""
 
     at: Instant
     stamp_ns: int
-    """Wall clock."""
+    """Stamp by the wall clock, ns."""
     speed: float
-    """m/s."""
+    """Linear speed, m/s."""
 
 
 class Record(Struct, frozen=True):
     """The raw times of one run."""
 
     began_ns: int
-    """Before the program was started."""
+    """Time just before the daemon was started."""
     window_ns: tuple[int, int]
-    """From the end of the start to the beginning of the end: what counts."""
+    """Time window that counts: from the end of the start to the beginning of the end."""
     seen: Seen | None
-    """None on a real port, whose wire cannot be seen."""
+    """Data on the wire; None on a real port, whose wire cannot be observed."""
     sent: list[Sent]
     samples: list[Sample]
 
     @property
     def said(self) -> list[Chunk]:
-        """The feedback lines that count."""
+        """The feedback lines within the window."""
         first_ns, last_ns = self.window_ns
         lines = lines_of(self.seen.said) if self.seen else []
         return [line for line in lines if first_ns <= line[0] < last_ns]
 
 
 def command_waits(record: Record) -> list[int]:
-    """ns from each command to its line on the wire; one that never came is left out."""
+    """Return the ns from each command to its line on the wire; lost commands are left out."""
     if record.seen is None:
         return []
     sent = [(sent.at_ns, sent.line) for sent in record.sent]
@@ -66,7 +66,7 @@ def command_waits(record: Record) -> list[int]:
 
 
 def feedback_fates(config: Config, record: Record) -> list[Fed]:
-    """What became of the feedback lines that were heard of."""
+    """Return the delay of each feedback line that became an odometry sample."""
     codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
     kinematics = Kinematics(config.drive)
     said = [(at_ns, kinematics.twist(codec.decode(line)).linear) for at_ns, line in record.said]

@@ -1,11 +1,11 @@
-"""A daemon under measurement: started as a user starts it, with both its ends in our hands.
+"""A daemon under measurement: started as a user starts it, with both of its ends under control.
 
     bench (bus client)  <- loopback TCP ->  daemon  <- pty ->  far_end.py (simulated MCU)
 
-Three processes and one monotonic clock, so that a time taken in one can be subtracted from a time
-taken in another. What lives here: starting, driving, ending, and the raw times. What must not:
-what they mean (`record.py`). Any program that takes `--config` and `--port` and speaks the
-same keys can stand in the daemon's place.
+The three processes share one monotonic clock, so a time from one can be subtracted from a time of
+another. This module starts, commands and ends the daemon and collects raw times; `record.py`
+evaluates them. Any program that accepts `--config` and `--port` and uses the same keys can take the
+daemon's place.
 """
 
 from __future__ import annotations
@@ -48,22 +48,24 @@ T = TypeVar("T")
 ACSARD = (sys.executable, "-m", "acsard", "run")
 
 START_S = 15.0
-"""A start takes 0.3 s, and 2 s more where opening the port resets the board."""
+"""Time limit of the start, s. It takes 0.3 s, and 2 s more if opening the port resets the board."""
 
 SETTLED = 10
-"""Odometry samples after which the link is up and the start is over."""
+"""Number of odometry samples after which the link is up and the start is over."""
 
 LOOK_S = 0.5
-"""Between two looks at whether all processes are there."""
+"""Interval at which the rig checks that all processes are running, s."""
 
 FAR_END = "the simulated microcontroller's process"
 
 SPACING_S = (0.02, 0.06)
-"""Between two commands, evenly spread: they fall anywhere within a period."""
+"""Range of the time between two commands, s. It is evenly distributed, so commands fall anywhere
+within a period.
+"""
 
 
 class Rig:
-    """Enter it to have the program up and linked; `end` gives what was recorded."""
+    """Context in which the daemon is up and linked; `end` returns the record."""
 
     def __init__(
         self,
@@ -115,7 +117,7 @@ class Rig:
     ) -> None:
         self._stack.close()
 
-    # starting
+    # Starting
 
     def _start_far_end(self, stack: ExitStack, where: Path) -> str:
         part = where / "part.json"
@@ -140,7 +142,8 @@ class Rig:
         )  # fmt: skip
         words = [*self._words, "--config", str(self._file), "--port", port]
         env = {key: value for key, value in os.environ.items() if key not in hidden}
-        # The measured daemon keeps its latches nowhere else: it must leave nothing behind.
+        # The measured daemon must not leave files behind, so its latches go to the temporary
+        # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
         with self._log.open("wb") as log:
             self._began_ns = clock.mono_ns()
@@ -173,27 +176,27 @@ class Rig:
             time.sleep(0.01)
 
     def _why(self) -> str:
-        """What the daemon waits for, if it can be asked."""
+        """Return the condition that the daemon waits for, if it replies."""
         try:
             return f": {self.state().reason}"
         except NoAnswerError:
             return ""
 
     def _alive(self) -> None:
-        """Raises the program's own end as ours, and that of the far end."""
+        """Raise an error if the measured program or the far end has ended."""
         if self._far_end is not None and self._far_end.poll() is not None:
             raise ended(FAR_END, self._far_end.returncode)
         code = self.process.poll()
         if code is not None:
             raise daemon_ended(code, self._log)
 
-    # measuring
+    # Measuring
 
     def _odometry(self, sample: zenoh.Sample) -> None:
         self._arrived.append((clock.now(), sample.payload.to_bytes()))
 
     def follow(self, seconds: float) -> float:
-        """Only listen for so long; the share of a core the program took."""
+        """Only listen for `seconds`; return the share of a core that the program used."""
         began_ns, used_ns = clock.mono_ns(), processor_ns(self.process.pid)
         end_ns = began_ns + int(seconds * NS_PER_S)
         while (left_ns := end_ns - clock.mono_ns()) > 0:
@@ -202,9 +205,10 @@ class Rig:
         return self._share(began_ns, used_ns)
 
     def command(self, seconds: float, wheel_speed: Callable[[int], float], seed: int = 1) -> float:
-        """Command at random phases for so long; the share of a core the program took.
+        """Send commands at random phases for `seconds`.
 
-        `wheel_speed` gives the speed of all wheels of the n-th command, rad/s.
+        Returns the share of a core that the program used. `wheel_speed` returns the speed of all
+        wheels for the n-th command, rad/s.
         """
         phases, number = random.Random(seed), 0
         self._neutral(phases)
@@ -214,12 +218,13 @@ class Rig:
             self._alive()
             self._sent.append(self._put(wheel_speed(number)))
             number += 1
-        time.sleep(0.1)  # the last one's line
+        # Wait for the line of the last command.
+        time.sleep(0.1)
         self._put(0.0)
         return self._share(began_ns, used_ns)
 
     def _neutral(self, phases: random.Random) -> None:
-        """Send zeros until they count: whose delays nobody knows shows them first."""
+        """Send zeros until they count: a daemon must first learn the delay of a new sender."""
         before = self._counted()
 
         def look() -> bool | None:
@@ -231,7 +236,7 @@ class Rig:
         time.sleep(0.2)
 
     def _counted(self) -> int | None:
-        """Commands so far; None of a program that does not say."""
+        """Return the number of commands so far, or None if the program does not report it."""
         try:
             return self.state().counters.get("commands", 0)
         except NoAnswerError:
@@ -252,11 +257,11 @@ class Rig:
         return Sent(at_ns, line)
 
     def deaf(self) -> None:
-        """Listen to the odometry no longer."""
+        """Unsubscribe from the odometry."""
         self._kept.undeclare()
 
     def state(self) -> RobotState:
-        """What the daemon says of itself."""
+        """Return the daemon's `state`."""
         key = full_key(self._config.robot.id, "state")
         for reply in self._session.get(key, timeout=3.0) if self._session else ():
             if reply.ok is not None:
@@ -268,9 +273,10 @@ class Rig:
         leave(self.process)
 
     def end(self) -> Record:
-        """End the program and tell what was recorded; the rig is used up."""
+        """End the program and return the record; the rig cannot be used again."""
         window_ns = (self._settled_ns, clock.mono_ns())
-        time.sleep(0.1)  # what was under way
+        # Wait for messages that are still under way.
+        time.sleep(0.1)
         self._alive()
         self.leave()
         seen = None if self._far_end is None else _last_words(self._far_end)
@@ -287,7 +293,7 @@ class Rig:
 
 
 def _last_words(far_end: subprocess.Popen[bytes]) -> Seen:
-    """End the far end; all it saw."""
+    """End the far end, and return the data that it recorded."""
     assert far_end.stdin is not None
     assert far_end.stdout is not None
     far_end.stdin.close()

@@ -1,4 +1,4 @@
-"""What a benchmark's daemon runs with: a configuration beside the user's, as a file of its own."""
+"""The configuration of the measured daemon: the user's, with some changes, in a file of its own."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from acsard.config.writing import document
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
-    """The configuration to measure with: a name, a bus and a commander of its own.
+    """Return the configuration to measure with: it has its own robot id, bus and source.
 
-    On the simulator nothing may hide a command or doubt a made-up feedback: it goes into the next
-    line whole, and feedback that has nothing to do with it is no fault. Lines are plain there: a
-    checked one has a number of its own and is not recognised by the speed it says.
+    With the simulator, a command must reach the next line unchanged, and feedback that does not
+    match it must not be a fault. Lines are plain there, because the sequence number of a checked
+    line would hide the speed by which it is recognized.
     """
     own = replace(
         config,
@@ -62,14 +62,14 @@ def bench_config(config: Config, *, simulated: bool) -> Config:
 
 
 def free_endpoint() -> str:
-    """A loopback address nobody listens on."""
+    """Return a loopback address on which no process listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def write(config: Config, where: Path) -> Path:
-    """The configuration as a file."""
+    """Write the configuration to a file in the directory `where`."""
     file = where / "acsard.toml"
     file.write_text("\n".join(document(effective(config))) + "\n", encoding="utf-8")
     return file

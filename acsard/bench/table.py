@@ -1,4 +1,4 @@
-"""What `acsard bench` prints: the machine, the figures and between which points each was taken."""
+"""Prints the figures of `acsard bench`, with the machine and the measuring points."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ POINTS = {
     "feedback_to_odometry": "feedback line's last byte handed over -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
-"""What is measured from outside, and between which points; "here" is another process."""
+"""The figures measured from outside, and their points; "here" is the benchmark's own process."""
 
 OWN = {
     "period_lateness": "period due (of several missed, the first) -> its step",
@@ -27,11 +27,11 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""What the daemon measures of itself, within its own process, as `figures.Name` defines it."""
+"""The figures that the daemon measures within its own process, as `figures.Name` defines them."""
 
 
 class Machine(Struct, frozen=True):
-    """What the figures are figures of."""
+    """The machine on which the figures were measured."""
 
     cpu: str
     cores: int
@@ -39,11 +39,11 @@ class Machine(Struct, frozen=True):
     python: str
     acsard: str
     realtime_permitted: bool
-    """This user may schedule in real time."""
+    """True if this user may use real-time scheduling."""
 
 
 class Result(Struct, frozen=True, omit_defaults=False):
-    """All figures of one run; durations in us unless the name says otherwise."""
+    """All figures of one run; durations are in us unless the name says otherwise."""
 
     machine: Machine
     port: str
@@ -52,34 +52,36 @@ class Result(Struct, frozen=True, omit_defaults=False):
     baud_rate: int
     seconds: float
     realtime: bool
-    """The daemon's control task was scheduled in real time."""
+    """True if the daemon's control task had real-time scheduling."""
     outside: dict[str, Summary | None]
-    """By the names of `POINTS`; null for what could not be measured."""
+    """Figures by the names of `POINTS`; null for those that could not be measured."""
     own: dict[str, Summary]
-    """By the names of `OWN`; percentiles right to 12 %."""
+    """Figures by the names of `OWN`; their percentiles are accurate to 12 %."""
     commands_sent: int
     commands_seen: int | None
-    """Commands whose line was seen on the wire; null on a real port."""
+    """Number of commands whose line was seen on the wire; null on a real port."""
     lines_said: int | None
-    """Feedback lines handed over; null on a real port."""
+    """Number of feedback lines handed over; null on a real port."""
     lines_told: int
-    """Feedback lines that became odometry here."""
+    """Number of feedback lines that became odometry here."""
     lines_waiting_max: int | None
-    """Newer feedback lines handed over by the time of a sample, at the most."""
+    """Largest number of newer lines handed over by the time of a sample; null on a real port."""
     lines_sent: int
-    """Lines the daemon handed to the port, counted up to the same moment as `missed_periods`."""
+    """Lines that the daemon handed to the port, counted up to the same moment as
+    `missed_periods`.
+    """
     missed_periods: int
     cpu_percent_following: float
-    """Of one core, with one subscriber of odometry and no commands."""
+    """Share of one core with one subscriber to the odometry and without commands."""
     cpu_percent_commanded: float
-    """The same with 25 commands a second."""
+    """Share of one core with one subscriber to the odometry and 25 commands a second."""
     resident_mb: float
     start_up_ms: float | None
-    """Start of the process -> first line on the port; null on a real port."""
+    """Time from the start of the process to its first line on the port; null on a real port."""
 
 
 def this_machine() -> Machine:
-    """Where we are."""
+    """Return the description of this machine."""
     return Machine(
         cpu=_cpu_model(),
         cores=len(os.sched_getaffinity(0)),
@@ -91,7 +93,7 @@ def this_machine() -> Machine:
 
 
 def _cpu_model() -> str:
-    """As the kernel names it; boards name themselves in the device tree."""
+    """Return the processor's name from the kernel, or a board's name from the device tree."""
     try:
         board = Path("/proc/device-tree/model").read_text().strip("\0\n ")
         if board:
@@ -108,7 +110,8 @@ def _cpu_model() -> str:
 def _realtime_permitted() -> bool:
     permitted = []
 
-    def ask() -> None:  # in a thread that ends with what it was granted
+    # A thread asks, because a granted priority ends with it.
+    def ask() -> None:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
             permitted.append(True)
@@ -122,7 +125,7 @@ def _realtime_permitted() -> bool:
 
 
 def table(result: Result) -> str:
-    """The figures for people."""
+    """Return the figures as text for people."""
     head, width = "  count      p50      p99      max  us", max(map(len, POINTS.values()))
     lines = [*_about(result), "", f"{'measured from outside':{width}}{head}"]
     for name, points in POINTS.items():

@@ -6,29 +6,34 @@
         robot.drive(0.5, 0.0, seconds=2.0)
         print(robot.pose())
 
-`connect` is for scripts, `connect_async` for asyncio programs; both give the same verbs and typed
-messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive opens
-with zeros, so the daemon's staleness and neutral-first rules are met without thinking of them. A
-drive that the robot does not follow is an error, and one that returns has come to a stand.
+`connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
+typed messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive
+begins with zeros. The daemon's rules about stale commands and about zeros before motion are
+therefore satisfied without further code. A drive that the robot does not follow raises an error. A
+drive that returns has ended with the robot at rest.
 
-Where you do not say which robot you mean, the file does that ACSARD_CONFIG names, as for the
-command line (`bus.listen`, `robot.id`, `bus.tls`); without that variable it is `acsar` on this
-machine. A file in the current directory is not looked for: a program means the same robot wherever
+Arguments that you leave out come from the file that ACSARD_CONFIG names, as for the command line
+(`bus.listen`, `robot.id`, `bus.tls`). Without that variable they mean the robot `acsar` on this
+machine. A file in the current directory is ignored, so that a program means the same robot wherever
 it runs.
 
-Errors are `AcsardError`s and mostly what Python calls such a thing too; their text says what to do:
+Errors are `AcsardError`s, and most are also the matching built-in exception. Their text says what
+to do:
 
-    UnreachableError   ConnectionError  nobody listens at the endpoint
-    NoAnswerError      TimeoutError     no robot of this id there, no such key, or you may not ask
-    ReplyError         RuntimeError     the daemon answers that it cannot; a service that refuses
-                                        says so in its reply instead
-    NotDrivenError   RuntimeError     the robot does not follow your drive: stopped, in fault,
-                                        behind somebody else, not allowed; the text says which
-    NotPermittedError  PermissionError  your certificate may not do this, or you not read its files
-    CertificateError   ValueError       certificates that are not there, or cannot be used
-    UsageError         ValueError       an endpoint, an id, a key or a number that cannot be, or the
-                                        file that ACSARD_CONFIG names
-    DecodeError                         what was sent is not one of our messages
+    UnreachableError   ConnectionError  no daemon listens at the endpoint
+    NoAnswerError      TimeoutError     there is neither such a robot nor such a key, or you may not
+                                        query it
+    ReplyError         RuntimeError     the daemon reports a failure; a service that refuses says so
+                                        in its reply instead
+    NotDrivenError     RuntimeError     the robot does not follow your drive: it is stopped or in
+                                        fault, another client drives, or you may not; the text says
+                                        which
+    NotPermittedError  PermissionError  your certificate does not allow this, or you may not read
+                                        its files
+    CertificateError   ValueError       the certificates do not exist or cannot be used
+    UsageError         ValueError       an endpoint, id, key or number is not valid, or the
+                                        file that ACSARD_CONFIG names is not valid
+    DecodeError                         a payload is not a message of acsard
 """
 
 from acsard.bus.identity import Identity

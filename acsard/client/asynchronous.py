@@ -1,4 +1,4 @@
-"""The client of asyncio programs: the same verbs, waiting on threads of their own."""
+"""The client for asyncio programs. Calls that block run in threads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from acsard.values import Plain, Pose
 
 
 class AsyncClient:
-    """The same verbs for asyncio programs; make it with `connect_async`."""
+    """Client with the methods of `Client` for asyncio programs; create it with `connect_async`."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -29,7 +29,7 @@ class AsyncClient:
         self._client.send(linear, angular)
 
     async def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive as `Client.drive`; cancelling sends a zero at once."""
+        """Drive as `Client.drive` does. A cancelled drive sends a zero at once."""
         try:
             with closing(drive(self._client, linear, angular, seconds)) as steps:
                 for pause in steps:
@@ -39,27 +39,27 @@ class AsyncClient:
             raise found from None
 
     async def call(self, service: str, **fields: float) -> schema.ServiceReply:
-        """Call a service, as `Client.call`."""
+        """Call a service, as `Client.call` does."""
         return await in_thread(lambda: self._client.call(service, **fields), 2 * REPLY_TIMEOUT_S)
 
     async def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
-        """Change settings, as `Client.set`."""
+        """Change settings, as `Client.set` does."""
         return await in_thread(lambda: self._client.set(settings), 2 * REPLY_TIMEOUT_S)
 
     async def get(self, name: str) -> Any:
-        """The last value of a key, as `Client.get`."""
+        """Return the last value of a key, as `Client.get` does."""
         return await in_thread(lambda: self._client.get(name), 2 * REPLY_TIMEOUT_S)
 
     async def whoami(self) -> Identity:
-        """Who we are to the daemon, as `Client.whoami`."""
+        """Return this client's identity as the daemon sees it, as `Client.whoami` does."""
         return await in_thread(self._client.whoami, 2 * REPLY_TIMEOUT_S)
 
     async def pose(self) -> Pose:
-        """Where base_link is in odom now."""
+        """Return the present pose of base_link in odom."""
         return await in_thread(self._client.pose, 2 * REPLY_TIMEOUT_S)
 
     async def messages(self, name: str) -> AsyncIterator[Any]:
-        """The typed messages of a published key as they come, until the loop over them ends."""
+        """Yield the typed messages of a published key as they arrive."""
         reader = decoder(name)
         async with aclosing(self._client.subscribe(name).arriving()) as samples:
             async for sample in samples:

@@ -1,4 +1,4 @@
-"""Opening and closing a connection to a robot."""
+"""Opens and closes the connection to a robot."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ def connect(
 ) -> Iterator[Client]:
     """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
 
-    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". What
-    is None is taken from the file that the environment variable ACSARD_CONFIG names, and without
-    one is "tcp/127.0.0.1:7448", "acsar" and no certificate.
+    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". An
+    argument that is None comes from the file that the environment variable ACSARD_CONFIG names.
+    Without such a file it is "tcp/127.0.0.1:7448", "acsar" or no certificate.
     """
     where = address_by_environment(endpoint, robot_id, tls)
     session = client_session(where.endpoint, where.tls)
@@ -44,7 +44,10 @@ async def connect_async(
     source: str = "app",
     tls: str | None = None,
 ) -> AsyncIterator[AsyncClient]:
-    """`connect` for asyncio programs; opening and closing do not hold the event loop."""
+    """Connect as `connect` does, for asyncio programs.
+
+    Opening and closing do not block the event loop.
+    """
     where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
     session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=_close)
     try:
@@ -57,4 +60,5 @@ def _close(session: zenoh.Session) -> None:
     try:
         session.close()
     except zenoh.ZError:
-        pass  # the other side is stuck; we are leaving anyway
+        # The other side is stuck, and this client leaves in any case.
+        pass

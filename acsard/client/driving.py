@@ -1,7 +1,7 @@
-"""One drive of `acsard.client`: what is sent when, and what `state` says becomes of it.
+"""One drive of `acsard.client`: the commands that are sent, and the check that the robot follows.
 
-The daemon tells nobody that his command does not count: it says so in `state`. Whoever drives
-therefore follows `state`, and ends with the daemon's own reason when it does not drive him.
+The daemon does not answer commands; it reports in `state` why a command does not count. A drive
+therefore follows `state`, and ends with the daemon's own reason if the robot does not follow it.
 """
 
 from __future__ import annotations
@@ -21,74 +21,81 @@ from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import RobotState
 
 SEND_PERIOD_S = 0.05
-"""Commands are repeated at 20 Hz: five times within the default timeout."""
+"""Pause between two commands, s: 20 Hz, so five commands within the default timeout."""
 
 OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Zeros at first: for 0.25 s a daemon that never heard us wants to see that they are not late, and
-sees it sooner through the jitter of a busy machine the more there are."""
+"""Duration and period of the zeros at the beginning, s. A daemon to which the client is new
+checks for 0.25 s that the commands are not late. More zeros let it decide sooner despite the
+jitter of a busy machine.
+"""
 
 OPENED_S = 2.0
-"""By when zeros that count have counted, and whoever else drove has had time to leave."""
+"""Time after which zeros must count, s. It also gives another driver time to leave."""
 
 NEVER = ("inactive", "stopped", "fault", "leaving")
 """Modes in which no command counts."""
 
 SETTLED_S = 0.2
-"""A state that is older than what we did last has come by then."""
+"""Time after an action, s, by which a state from before the action has arrived."""
 
 GRACE_S = 0.5
-"""A drive that does not count for so long, or for half of its time, is over: a held-up sender is
-heard again sooner."""
+"""Longest time, s, that a drive may not count before it ends; half of the drive's duration if
+that is shorter. A sender that was only delayed counts again sooner.
+"""
 
 ASK_S, DEAD_S = 0.3, 2.0
-"""Without a state for so long it is asked for, since it may be published seldom; without an answer
-nobody is there."""
+"""Time without a state, s, after which the client queries it, since `state` may be published
+seldom; and time without any answer after which the daemon counts as dead.
+"""
 
 QUIET_S = 2 * ASK_S
-"""A state older than this is none to end by."""
+"""Age, s, above which a state is too old to end a drive by."""
 
 STANDS = 0.01, 0.02
-"""m/s and rad/s below which it stands."""
+"""Speeds, m/s and rad/s, below which the robot counts as standing."""
 
 SLOWER, SLOWS_S = 0.97, 1.0
-"""It still slows down while within so long its speed falls below this share."""
+"""The robot is still slowing down if its speed falls below this share within this time, s."""
 
 
 class UnheardError(NotDrivenError):
-    """Not one command of ours arrives."""
+    """No command of this client arrives at the daemon."""
 
 
 class Driven(Protocol):
-    """What a drive needs of a client."""
+    """Interface of a client as a drive uses it."""
 
     source: str
     sender: str
-    """Our name on each command."""
+    """Public name of this client, which each of its commands carries."""
 
     def send(self, linear: float, angular: float = 0.0) -> None:
-        """One command."""
+        """Send one command."""
 
     def subscribe(self, name: str) -> Subscription:
-        """The samples of a key."""
+        """Subscribe to a key."""
 
     def ask(self, name: str, take: Any) -> None:
-        """Have `take` called with the last sample of a key, if it comes."""
+        """Query a key, and call `take` with the reply, if one comes."""
 
 
 def drive(
     robot: Driven, linear: float, angular: float, seconds: float
 ) -> Generator[float, None, None]:
-    """Drive for `seconds` and until it stands, yielding how long to wait before the next step.
+    """Drive for `seconds` and then until the robot stands; yield each pause between steps, s.
 
-    Raises `NotDrivenError` with the daemon's reason when it does not drive us, `NoAnswerError`
-    when it is silent, `UsageError` for what is no number, or no time.
+    Raises:
+        NotDrivenError: The robot does not follow; the text is the daemon's reason.
+        NoAnswerError: The daemon is silent.
+        UsageError: An argument is not a finite number, or `seconds` is not above 0.
     """
     _require(linear=linear, angular=angular, seconds=seconds)
     if seconds <= 0:
         raise UsageError(f"seconds = {seconds:g}: a drive takes a time above 0; back is linear < 0")
     watch = _Watch(robot)
     try:
-        # Each time: the robot may have been stopped and cleared, or started, since the last drive.
+        # Send the zeros before each drive: since the last one, the robot may have been stopped and
+        # cleared, or restarted.
         yield from _opening(robot, watch)
         end, grace = time.monotonic() + seconds, min(GRACE_S, seconds / 2)
         while (left := end - time.monotonic()) > 0:
@@ -97,7 +104,7 @@ def drive(
             watch.require(grace)
         yield from _stopping(robot, watch)
     finally:
-        # Whatever interrupts the drive, the robot is told to stop.
+        # Send a zero at the end, even if an exception interrupts the drive.
         robot.send(0.0, 0.0)
         watch.end()
 
@@ -113,7 +120,7 @@ def _require(**numbers: object) -> None:
 
 
 def _opening(robot: Driven, watch: _Watch) -> Iterator[float]:
-    """Zeros until the daemon follows them."""
+    """Send zeros until the daemon follows them."""
     begun = time.monotonic()
     while (passed := time.monotonic() - begun) < OPENING_S or watch.objection != "":
         robot.send(0.0, 0.0)
@@ -124,7 +131,7 @@ def _opening(robot: Driven, watch: _Watch) -> Iterator[float]:
 
 
 def _stopping(robot: Driven, watch: _Watch) -> Iterator[float]:
-    """Zeros until it stands, or gets no slower: then something else moves it."""
+    """Send zeros until the robot stands, or becomes no slower because something else moves it."""
     begun = since = time.monotonic()
     slowest = math.inf
     while since + SLOWS_S > (now := time.monotonic()) or now - watch.heard > QUIET_S:
@@ -137,7 +144,8 @@ def _stopping(robot: Driven, watch: _Watch) -> Iterator[float]:
             continue
         linear, angular = watch.state.linear, watch.state.angular
         if linear is None or angular is None:
-            continue  # without feedback nobody knows whether it stands
+            # Without feedback, it is unknown whether the robot stands.
+            continue
         speed = max(abs(linear) / STANDS[0], abs(angular) / STANDS[1])
         if speed < 1.0:
             return
@@ -146,35 +154,36 @@ def _stopping(robot: Driven, watch: _Watch) -> Iterator[float]:
 
 
 class _Watch:
-    """What `state` says of our commands."""
+    """The daemon's `state`, and its verdict on the commands of this client."""
 
     def __init__(self, robot: Driven) -> None:
         self._robot = robot
         self._decoder = Decoder(RobotState)
         self._states = robot.subscribe("state")
         self._answers: deque[zenoh.Sample] = deque()
-        """What was asked for comes on a thread of Zenoh's, which only leaves it here."""
+        """Replies to queries. A thread of Zenoh appends them here and does nothing else."""
         self._answered = Answers()
         self.state: RobotState | None = None
         self.heard = self._asked = time.monotonic()
         self.objection: str | None = None
-        """Why the last state does not drive us; None without one."""
+        """Why the robot does not follow, by the last state; "" if it does, None without a state."""
         self._fine = self.heard
         self._unreadable = False
 
     @property
     def hopeless(self) -> bool:
-        """It does not become better by waiting."""
+        """True if waiting cannot help."""
         state = self.state
         return state is not None and (
             state.mode in NEVER or all(one.name != self._robot.source for one in state.sources)
         )
 
     def look(self) -> None:
-        """Take what has come; raises `NoAnswerError` after a long silence."""
+        """Take the states that have arrived; raise `NoAnswerError` after a long silence."""
         now = time.monotonic()
         try:
-            while self._answers:  # first: what comes by itself is later
+            # Replies come first, because a published state is newer.
+            while self._answers:
                 self._take(self._answers.popleft(), asked=True)
             while (sample := self._states.try_recv()) is not None:
                 self._take(sample, asked=False)
@@ -191,7 +200,7 @@ class _Watch:
             )
 
     def require(self, grace: float) -> None:
-        """Raises `NotDrivenError` when it has not driven us for longer than `grace` s."""
+        """Raise `NotDrivenError` if the robot has not followed for longer than `grace` s."""
         self.look()
         if not self.objection:
             return
@@ -200,7 +209,7 @@ class _Watch:
             raise (NotDrivenError if heard else UnheardError)(self.objection)
 
     def end(self) -> None:
-        """No more states."""
+        """Unsubscribe from `state`."""
         self._states.undeclare()
 
     def _take(self, sample: zenoh.Sample, asked: bool) -> None:
@@ -210,7 +219,8 @@ class _Watch:
             self._unreadable = True
             return
         if asked and not self._answered.news(state, self.state):
-            if self.state is None:  # the first may be a storage's: another, at once, tells
+            # The first reply may come from a router's storage. Query again at once to find out.
+            if self.state is None:
                 self.state, self._asked = state, self.heard
             return
         self.state, self.heard = state, time.monotonic()
@@ -220,18 +230,21 @@ class _Watch:
 
 
 class Answers:
-    """Which answers show that the daemon lives.
+    """Tells which replies prove that the daemon is alive.
 
-    A storage of a router answers too, for a robot that is dead with the last state there was. What
-    comes unasked is no storage's, and may be older: clocks are set back.
+    A router's storage also replies, for a dead robot with its last state. A state that arrives
+    unqueried never comes from a storage, but it may be older, because a clock can be set back.
     """
 
     def __init__(self) -> None:
         self._last: RobotState | None = None
 
     def news(self, answer: RobotState, held: RobotState | None) -> bool:
-        """It is newer than the state held so far; or, where the robot's clock was set back since
-        that came, than the answer before it. What is held already is no news."""
+        """Return whether the reply is newer than the held state, or than the reply before it.
+
+        The second case covers a robot whose clock was set back since the held state arrived. A
+        reply equal to the held state is not news.
+        """
         before, self._last = (held, self._last), answer
         if held is not None and answer.stamp == held.stamp:
             return False
@@ -239,7 +252,7 @@ class Answers:
 
 
 def objection(state: RobotState, source: str, sender: str) -> str:
-    """Why the robot does not follow what `sender` sends as `source`, in words; "" when it does."""
+    """Return why the robot does not follow the commands of `sender` as `source`; "" if it does."""
     if state.mode in NEVER:
         return state.reason
     ours = next((one for one in state.sources if one.name == source), None)
@@ -252,7 +265,8 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         return f"the daemon hears no command of source {source}"
     if state.source != source:
         return ours.waits_for or state.reason
-    if state.mode != "driving":  # its zeros do not count
+    # The robot is `ready`: the zeros of this client arrive, but they do not count.
+    if state.mode != "driving":
         return state.reason
     if state.sender in ("", sender):
         return ""
@@ -260,5 +274,5 @@ def objection(state: RobotState, source: str, sender: str) -> str:
 
 
 def _heard(state: RobotState, source: str) -> bool:
-    """Something comes from this source, be it only late."""
+    """Return whether any command of this source arrives, even if it is late."""
     return any(one.name == source and one.waits_for != "a command" for one in state.sources)

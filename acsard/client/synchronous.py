@@ -1,4 +1,4 @@
-"""The client of scripts: each verb waits until it is done."""
+"""The client for scripts: each method waits until its work is done."""
 
 from __future__ import annotations
 
@@ -45,35 +45,38 @@ from acsard.messages.topics import (
 from acsard.values import Plain, Pose
 
 AGAIN_S = 0.03
-"""Between a daemon that says it is asked too much and the next try."""
+"""Pause before the next try, s, if the daemon reports too many queries."""
 
 SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
-"""What Zenoh says in the place of one who heard the question and did not answer in time."""
+"""Text that Zenoh returns if a queryable received the query and did not reply in time."""
 
 
 class _Puts:
-    """Of one connection: the daemon takes 1000 commands a second of it on a key, so a zero on the
-    heels of another command, be it of somebody else who shares it, would be lost."""
+    """Spacing of the commands on one connection.
+
+    The daemon accepts 1000 commands a second per connection and key. A zero directly after another
+    command, even of another client object on the connection, would be dropped.
+    """
 
     def __init__(self) -> None:
-        # A signal's handler may send as well, while the same thread is in here.
+        # The lock is reentrant: a signal handler may also send while the same thread holds it.
         self._lock, self._next_s = threading.RLock(), 0.0
 
     def wait(self) -> None:
-        """Until one may go."""
+        """Wait until the next command may be sent."""
         with self._lock:
             at_s = max(self._next_s, time.monotonic())
             self._next_s = at_s + SPACING_S
         time.sleep(max(0.0, at_s - time.monotonic()))
-        # A busy machine wakes it late: the next one is as far from that.
+        # A busy machine may wake this thread late, and the next command must keep its distance.
         self._next_s = max(self._next_s, time.monotonic() + SPACING_S)
 
 
 class Client:
-    """A connection to one robot; make it with `connect`."""
+    """A connection to one robot; create it with `connect`."""
 
     def __init__(
         self,
@@ -86,27 +89,29 @@ class Client:
         self.session, self._tls, self._endpoint = session, tls, endpoint
         self._id, self.source = robot_id, source
         self.name = own_name()
-        """Who calls services, in the daemon's log; set it to what you like."""
+        """Name under which the daemon's log shows service calls; you may change it."""
         self._opened = False
         self._puts = _Puts()
         self.certificate = shown_at(endpoint, tls)
-        """The common name of the certificate that this client shows, "" without one."""
-        # `like` makes another sender of commands on this connection, but not another caller.
+        """Common name of the certificate that this client presents, "" without one."""
+        # `like` can make another sender of commands on this connection, but not another caller.
         self._secret = new_secret()
         self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
         self._sequence = 0
-        # The wall clock may be set while we drive, and the daemon would take that for a delay.
+        # The wall clock may be set during a drive, and the daemon would take the step for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
 
     def _sign_as(self, name: str) -> None:
         self._sender_id = sender_id(name)
         self.sender = public_name(self._sender_id, self.certificate)
-        """The name that `state.sender` has while the robot follows this client."""
+        """Value of `state.sender` while the robot follows this client."""
 
     @property
     def caller(self) -> str:
-        """The sender id on each call: `name` with a secret. The daemon's log shows its public
-        name."""
+        """The sender id of each call: `name` with a secret.
+
+        The daemon's log shows its public name.
+        """
         return sender_id(self.name, self._secret)
 
     def like(self, robot_id: str, name: str = "") -> Client:
@@ -121,21 +126,22 @@ class Client:
         return other
 
     def key(self, name: str) -> str:
-        """The full key of a name of the topic table, for example "odom"."""
+        """Return the full key of a name in the topic table, such as "odom"."""
         return full_key(self._id, name)
 
     def command_key(self, source: str) -> str:
-        """The key below the robot's id that this client commands on as `source`.
+        """Return the key, below the robot's id, on which this client commands as `source`.
 
-        Over TLS that is a key of its certificate.
+        Over TLS each certificate has a key of its own.
         """
         return command_key("cmd", source, self.certificate)
 
     def send(self, linear: float, angular: float = 0.0, *, stamp_ns: int | None = None) -> None:
-        """Send one command: `linear` m/s, `angular` rad/s (left is +). Repeat it to keep moving.
+        """Send one command: `linear` m/s, `angular` rad/s (left is +).
 
-        The first call sends a zero in its place, since the daemon wants one before it drives.
-        `stamp_ns` is when it was meant, by the clock of whoever meant it, where we only pass it on.
+        Repeat it to keep moving. The first call sends a zero instead, because the daemon requires
+        one before it drives. `stamp_ns` is for a program that forwards commands: the time of the
+        command by the clock of its origin, ns.
         """
         if self._opened:
             self._put(linear, angular, stamp_ns)
@@ -144,11 +150,11 @@ class Client:
             self._put(0.0, 0.0, stamp_ns)
 
     def drive(self, linear: float, angular: float = 0.0, *, seconds: float) -> None:
-        """Drive for so long (above 0 s), then to a stand; returns when the robot stands.
+        """Drive for `seconds` (above 0), then slow down, and return when the robot stands.
 
-        Above its `[limits]` the robot drives at them, and that is no error: `get("config")` has
-        them, `get("cmd_vel_out")` what is applied. Raises `NotDrivenError` with the daemon's reason
-        as soon as it does not follow us.
+        Speeds above its `[limits]` are not an error: the robot drives at the limits.
+        `get("config")` returns them, and `get("cmd_vel_out")` the applied speed. Raises
+        `NotDrivenError` with the daemon's reason as soon as the robot does not follow.
         """
         try:
             with closing(drive(self, linear, angular, seconds)) as steps:
@@ -161,68 +167,72 @@ class Client:
         """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`.
 
         `clear` releases the stop or fault that `state` shows now, and `activate` switches on a
-        robot that `state` shows as switched off now. Pass `latch=state.latch` of the state that a
-        person has looked at, and the daemon refuses if a stop or a `deactivate` came since.
+        robot that `state` shows as switched off now. Pass the `latch` of the state that a person
+        has looked at as `latch=state.latch`, and the daemon refuses if a stop or a `deactivate`
+        has come since.
         """
         if service in ("clear", "activate") and "latch" not in fields:
             fields["latch"] = self.get("state").latch
         return self.request(service, fields)
 
     def set(self, settings: Mapping[str, Plain]) -> schema.ServiceReply:
-        """Change settings until the next start: `{"rates.state": 5.0}`; all or none.
+        """Change settings until the next start, for example `{"rates.state": 5.0}`; all or none.
 
         A lowered speed, acceleration or jerk of `limits` survives the next start.
         """
         return self.request("set", {"settings": settings})
 
     def request(self, service: str, fields: Mapping[str, object]) -> schema.ServiceReply:
-        """The same for any service, with its payload as it is."""
+        """Call any service with this payload, and return its reply."""
         payload = msgspec.json.encode(fields) if fields else None
         return Decoder(schema.ServiceReply).decode(*self._ask(service_key(service), payload))
 
     def get(self, name: str) -> Any:
-        """The last value of a published key as its typed message, or of `info`, `config`, …"""
+        """Return the last value of a key as its typed message: `odom`, `state`, `info`, …"""
         return decoder(name).decode(*self.reply(name))
 
     def reply(self, name: str) -> tuple[str, bytes]:
-        """The same as it came: encoding and payload."""
+        """Return the last value of a key undecoded: its encoding and its payload."""
         return self._ask(name)
 
     def whoami(self) -> Identity:
-        """Who we are to the daemon; the role is "" when it answers none of them."""
+        """Return this client's identity as the daemon sees it. An unknown role is ""."""
         return identity(self.ask, self._tls, self.sender, self._id, self._endpoint)
 
     def pose(self) -> Pose:
-        """Where base_link is in odom now."""
+        """Return the present pose of base_link in odom."""
         state = self.get("state")
         return Pose(state.x, state.y, state.yaw)
 
     def messages(self, name: str, timeout: float | None = None) -> Iterator[Any]:
-        """The typed messages of a published key as they come.
+        """Yield the typed messages of a published key as they arrive.
 
-        Ends after `timeout` s of silence, and when the connection is closed.
+        The iterator ends after `timeout` s of silence, and when the connection is closed.
         """
         reader = decoder(name)
         for sample in self.subscribe(name).until_silence(timeout):
             yield reader.decode(*encoded(sample))
 
     def samples(self, name: str, timeout: float | None = None) -> Iterator[zenoh.Sample]:
-        """The raw samples of any key below the robot's id, whatever key they were put on."""
+        """Yield the raw samples of any key or wildcard below the robot's id."""
         yield from Subscription(self._queue(name)).until_silence(timeout)
 
     def listen(self, name: str, callback: Callable[[zenoh.Sample], None]) -> Any:
-        """Call back for each sample of a key, on a thread of Zenoh's; `undeclare` it to end."""
+        """Call back for each sample of a key, on a thread of Zenoh.
+
+        `undeclare` the result to end it.
+        """
         try:
             return self.session.declare_subscriber(self.key(name), callback)
         except zenoh.ZError:
             raise _no_key(name) from None
 
     def subscribe(self, name: str) -> Subscription:
-        """The raw samples of a key, for a loop of your own, which must not wait here."""
+        """Return the raw samples of a key, for a loop that must not block."""
         return Subscription(self._queue(name), self.key(name))
 
     def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
-        """Call back with the last value of a key, if it comes, on a thread of Zenoh's."""
+        """Query a key, and call back with its last value on a thread of Zenoh, if a reply comes."""
         self.session.get(
             self.key(name),
             lambda reply: take(reply.ok) if reply.ok is not None else None,
@@ -258,7 +268,7 @@ class Client:
         )
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
-        """The first answer: a stranger may give any number of others."""
+        """Return the first reply. A stranger may send any number of further ones."""
         end_s = time.monotonic() + REPLY_TIMEOUT_S
         while True:
             reply = self._first(name, payload)
@@ -272,7 +282,8 @@ class Client:
                     f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
                     "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
                 )
-            # A question is asked again; not what somebody else may have decided otherwise since.
+            # Repeat only queries. The effect of a service call may have been overruled by another
+            # client since.
             if said != BUSY or name in VERBS or time.monotonic() > end_s:
                 raise ReplyError(f"{name}: {said}")
             time.sleep(AGAIN_S)
@@ -290,7 +301,7 @@ class Client:
         return next(iter(replies), None)
 
     def _unanswered(self, name: str) -> MendableError:
-        """Why nobody answers: one reason where one can be seen."""
+        """Return an error that explains the missing reply, with its cause if that is known."""
         key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
@@ -309,7 +320,7 @@ class Client:
         return NoAnswerError(f"{no_answer}: {why_quiet(key, self._id, self._endpoint, seen)}")
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
-        """The same by its documented name, with what our certificate has to do with it."""
+        """Convert the error to its documented type, and add the role of the certificate in it."""
         if isinstance(error, UnheardError) and not self._tls:
             return NotDrivenError(str(error))
         if not self._tls:
@@ -329,7 +340,10 @@ def _no_key(name: str) -> UsageError:
 
 
 def decoder(name: str) -> Decoder[Any]:
-    """The decoder of a key's type; plain dictionaries where it has none (config, schema/…)."""
+    """Return the decoder of a key's type.
+
+    Keys without a type (config, schema/…) become dictionaries.
+    """
     topic = by_key(name)
     cls = None if topic is None else schema.MESSAGES.get(topic.type)
     return Decoder(cls or dict)

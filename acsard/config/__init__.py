@@ -1,1 +1,1 @@
-"""Pure: `acsard.toml` bytes -> one frozen `Config`, or errors that name the key and the mend."""
+"""Pure: decodes `acsard.toml` to a frozen `Config`, or to errors that name each key and its fix."""

@@ -1,7 +1,7 @@
-"""The rules between the keys of a configuration: what contradicts, and what will surprise.
+"""The rules between the keys of a configuration: contradictions, and warnings about surprises.
 
-Each contradiction is a line with key, value and mend; each warning a sentence. Those about motion
-are in `motion_rules.py`, about the simulator's faults in `named_faults.py`.
+Each contradiction is a line with key, value and fix; each warning is a sentence. The rules about
+motion are in `motion_rules.py`, those about simulated faults in `named_faults.py`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from acsard.config.wire_time import (
 from acsard.values import ROOT, WHEELS
 
 LEAST_BRIDGE = 2
-"""Control periods that encoder counts must last without a wrap: one lost line must cost nothing."""
+"""Control periods for which encoder counts must not wrap, so that one lost line does no harm."""
 
 
 def warnings(config: Config) -> list[str]:
-    """What is allowed but will surprise; a sentence each."""
+    """Return the warnings about settings that are allowed but may surprise, one sentence each."""
     found = []
     count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
@@ -86,7 +86,7 @@ def _count_warnings(config: Config) -> list[str]:
 
 
 def contradictions(config: Config) -> list[str]:
-    """What cannot be: a line each."""
+    """Return the contradictions, one line each."""
     return told(RULES, config)
 
 
@@ -107,7 +107,7 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """The way out by what makes the lines long, where it is one."""
+    """Return the fix that shortens the lines, if it makes them fit, else ""."""
     ways = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
     for check, way in ways:
         count = line_bytes(mcu.trailing_comma, check)
@@ -117,7 +117,10 @@ def _shorter_lines(mcu: McuConfig, rate: float) -> str:
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Counts that wrap too soon: a difference could be read as one in the other direction."""
+    """Find counts that wrap too soon.
+
+    The difference of two counts could then be read as a motion in the other direction.
+    """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
     lasts = LEAST_BRIDGE / config.rate_hz
     if fastest * counts * lasts <= FIELD / 2:
@@ -189,7 +192,7 @@ def _source_problems(config: Config) -> list[str]:
 
 
 def _way_problems(config: Config) -> list[str]:
-    """Nobody, or nobody by TLS, could reach the daemon."""
+    """Find a configuration in which no client, or no client over TLS, could reach the daemon."""
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
@@ -251,7 +254,7 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    """Those in use, by key: a client listens nowhere."""
+    """Return the endpoints that are used, by key. A Zenoh client does not listen."""
     listen = {"listen": bus.listen} if bus.mode == "peer" else {}
     return listen | {"connect": bus.connect}
 
@@ -259,7 +262,8 @@ def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
 def _host(endpoint: str) -> str | None:
     scheme, _, address = endpoint.partition("/")
     if set(endpoint) & set("#?;= \t"):
-        return None  # Zenoh's own options could switch off what is promised here
+        # Zenoh's own endpoint options could switch off the protection that these rules ensure.
+        return None
     host, _, port = address.rpartition(":")
     good = (
         scheme in ("tcp", "tls")
@@ -297,4 +301,4 @@ RULES: tuple[Rule, ...] = (
     _ros_problems,
     *named_faults.RULES,
 )
-"""Each by itself: one that looks at a key without a valid value says nothing."""
+"""The rules, one function each. A rule that reads a key without a valid value is skipped."""

@@ -1,4 +1,4 @@
-"""Changes the text of an `acsard.toml`: comments, order and line ends stay as they are.
+"""Changes values in the text of an `acsard.toml` and keeps its comments, order and line ends.
 
 Needs the library tomlkit (extras `lan` and `mcu`).
 """
@@ -13,10 +13,10 @@ from acsard.config.validation import write
 
 
 def edited(text: str, keys: Mapping[str, object]) -> str:
-    """The text with dotted keys set to these values.
+    """Return the text with dotted keys set to new values.
 
-    Raises `ConfigError` when either is no configuration, and `ValueError` when the text is written
-    in a way that cannot be changed safely.
+    Raises `ConfigError` if the old or the new text is not a valid configuration, and `ValueError`
+    if the text is written in a way that cannot be changed safely.
     """
     from tomlkit.exceptions import TOMLKitError
 
@@ -37,7 +37,7 @@ def edited(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _changed(text: str, keys: Mapping[str, object]) -> str:
-    """The text with these keys; all lines end as its lines end."""
+    """Return the text with new values, and with the line ends of the original text."""
     import tomlkit
 
     crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
@@ -56,8 +56,11 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Tables written as top-level dotted keys (`mcu.port = ...`) get new keys in the same form;
-    tomlkit would open a table in the middle of them. The text, and the keys still to be set."""
+    """Insert new keys of tables that are written as top-level dotted keys (`mcu.port = ...`).
+
+    The new keys get the same form, because tomlkit would open a table in the middle of the dotted
+    keys. Returns the text and the keys that are still to be set.
+    """
     import tomlkit
 
     document = tomlkit.parse(text)

@@ -1,8 +1,9 @@
-"""The settings that can be changed while the daemon runs, and a configuration with some changed.
+"""The settings that may change while the daemon runs, and the check of such a change.
 
-What lives here: **the** table of them, when each may change, and the check of a change: the same
-rules as for the file, whole or not at all. What must not: what a change means for a part of the
-robot (its own `use`). All others shape the wire, the bus or the base, and take a start.
+The module holds the table of these settings and when each may change. A change must satisfy the
+same rules as the file, and is applied completely or not at all. Each part of the robot decides in
+its own `use` how a change affects it. All other settings shape the wire, the bus or the base, and
+take effect only at the next start.
 """
 
 from __future__ import annotations
@@ -26,12 +27,16 @@ WHEN: dict[When, str] = {
     "raised": "lowered only while the robot stands",
     "rest": "only while the robot stands",
 }
-"""A lower deceleration could not stop in time a robot that still drives faster than its new limits
-allow; the wheels' limit cuts a speed off at once; new timeouts forget who commands."""
+"""When a setting may change, in words.
+
+With a lower deceleration, a robot that still drives faster than its new limits allow could not stop
+in time. The limit of the wheels cuts a speed off at once. New timeouts forget the present
+commander.
+"""
 
 
 class Live(Struct, frozen=True):
-    """When a setting may change, and what it is."""
+    """A setting that may change: when, and its description."""
 
     when: When
     what: str
@@ -68,13 +73,15 @@ LIVE: dict[str, Live] = {
     "rates.diagnostics": Live("always", "how often diagnostics are published"),
     "log.level": Live("always", "the least that the log tells"),
 }
-"""By key as in `acsard.toml`, tables and key joined by dots; a source counts by its name."""
+"""The settings by dotted key as in `acsard.toml`. A source is named in place of its index, and
+"*" stands for every source.
+"""
 
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
 
 
 def live(key: str) -> Live | None:
-    """The row of a key; None for one that takes a start."""
+    """Return the row of a key, or None if the key takes effect only at a start."""
     parts = key.split(".")
     if parts[:2] == ["commands", "sources"] and len(parts) == 4:
         parts[2] = "*"
@@ -82,7 +89,7 @@ def live(key: str) -> Live | None:
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Every leaf with its dotted name; a list of named tables counts as tables by those names."""
+    """Yield every leaf with its dotted name; a table in a list is named by its own name."""
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from flat(inner, f"{name}.{key}" if name else str(key))
@@ -95,10 +102,10 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
-    """The configuration with these settings, and what is new in words; "" for nothing.
+    """Return the configuration with these settings, and a description of the changes ("" if none).
 
-    Raises `ConfigError` with every problem; nothing is changed then. A setting that has its value
-    already is no change, whichever it is.
+    Raises `ConfigError` with every problem; then nothing changes. A setting that already has the
+    wished value is not a change, even if it cannot be set. `at_rest` says that the robot stands.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))
@@ -108,7 +115,7 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
         more = [f"and {len(fixed) - 1} more that cannot be set"] if len(fixed) > 1 else []
         raise ConfigError([_refusal(fixed[0], news[fixed[0]], before), *more])
     problems: list[str] = []
-    # As the rules between tables have it: a list of tables, not of structs.
+    # The rules between tables need a list of tables here, not a tuple of structs.
     tables["commands"]["sources"] = list(tables["commands"]["sources"])
     for key, value in news.items():
         _put(tables, key.split("."), value)
@@ -153,7 +160,7 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Why this change waits until the robot stands; "" when it need not."""
+    """Return why this change must wait until the robot stands; "" if it may happen now."""
     row = live(key)
     if row is None or row.when == "always":
         return ""

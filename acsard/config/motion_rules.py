@@ -1,6 +1,6 @@
-"""The rules about motion: it must end soon when it should, and must not look like a fault.
+"""The rules about motion: the robot must stop soon enough, and ordinary motion must not be a fault.
 
-Each contradiction is a line with key, value and mend. The other rules are in `contradictions.py`.
+Each contradiction is a line with key, value and fix. The other rules are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -13,30 +13,33 @@ from acsard.config.partial import Rule, told
 from acsard.config.settings import Config
 
 LEAST_JERK = 0.01
-"""m/s3 or rad/s3; at less a robot takes over ten seconds to reach walking pace."""
+"""Smallest jerk limit, m/s3 or rad/s3. With less, walking pace takes over ten seconds."""
 
 LONGEST_STOP_S = 2.0
-"""From full speed to rest by a stop: who calls for one waits no longer."""
+"""Longest time from full speed to rest by a stop, s: the longest that a person who stops the
+robot should wait.
+"""
 
 LONGEST_RAMP_S = 5.0
-"""From full speed to rest when commands end: nobody is steering any more."""
+"""Longest time from full speed to rest when commands end, s, because nobody steers any more."""
 
 HEADROOM = 1.1
-"""Times what it is told; so fast may a healthy wheel turn for a moment."""
+"""Factor by which a healthy wheel may exceed its commanded speed for a moment."""
 
 MOST_WHEEL_SPEED = 99.99
-"""rad/s; the most that a line can say."""
+"""Highest wheel speed that a line can express, rad/s."""
 
 LONGEST_REPLY_S = 0.25
-"""Between two lines; with two lost, the next still comes within the second after which the
-microcontroller counts as started again."""
+"""Longest time between two feedback lines, s. With two lines lost, the next one still arrives
+within one second, after which the board would count as restarted.
+"""
 
 LINES_OF_EVIDENCE = 2
-"""A fault must rest on this many lines at least, or a single lost one would be a fault."""
+"""Number of feedback lines on which a fault must rest, so that one lost line is not a fault."""
 
 
 class _Reach(Struct, frozen=True):
-    """The fastest the limits let the robot go, m/s, turn, rad/s, and any wheel turn, rad/s."""
+    """The highest speeds that the limits allow: m/s, rad/s, and rad/s of any wheel."""
 
     linear: float
     angular: float
@@ -47,8 +50,8 @@ def _reach(config: Config) -> _Reach:
     drive, limits = config.drive, config.limits
     sides = (drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
     half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
-    # Where one side's wheels are larger, the fastest turn also moves forward: each side at its own
-    # rim speed, so the mean of the two bounds either axis.
+    # If the wheels of one side are larger, the fastest turn also moves the robot forward, because
+    # each side runs at its own rim speed. The mean of the two rim speeds bounds either axis.
     rim = limits.wheel_speed * drive.wheel_radius * sum(sides) / 2
     fastest_rim = limits.linear_speed + limits.angular_speed * half_track
     wished = fastest_rim / (drive.wheel_radius * min(sides))
@@ -90,7 +93,7 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Lines dropped, and faults latched, while the robot does what its limits allow."""
+    """Find a feedback limit that would drop lines or latch faults in allowed motion."""
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
     if most >= needed:
@@ -103,7 +106,7 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 
 
 def _reply_problems(config: Config) -> list[str]:
-    """Lines so far apart that one that is lost is a fault, or a new start."""
+    """Find a reply period so long that one lost line would be a fault or look like a restart."""
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
     most = longest_reply(fault_s)
     if period <= most:
@@ -118,13 +121,13 @@ def _reply_problems(config: Config) -> list[str]:
 
 
 def longest_reply(fault_s: float) -> float:
-    """The most that mcu.reply_period may be, s, where a fault takes `fault_s` (0 for no faults)."""
+    """Return the longest allowed `mcu.reply_period`, s, for this `feedback.fault_time` (0: off)."""
     share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
     return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
 
 
 def _rounded_up(value: float) -> float:
-    """To three decimals, so that what is advised is enough."""
+    """Round up to three decimals, so that an advised value is sufficient."""
     return math.ceil(round(value * 1000, 6)) / 1000
 
 
@@ -139,5 +142,5 @@ RULES: tuple[Rule, ...] = (
 
 
 def problems(config: Config) -> list[str]:
-    """What cannot be: a line each."""
+    """Return the contradictions, one line each."""
     return told(RULES, config)

@@ -1,7 +1,7 @@
-"""The simulator's faults as a person names them: `mute`, `stuck_encoder=b`, `stalls=5:0.15`.
+"""The names of the simulator's faults: `mute`, `stuck_encoder=b`, `stalls=5:0.15`.
 
-What lives here: **the** table of their names, how one is read, what is wrong with `[sim] faults`.
-What must not: what a fault does (`sim/faults.py` has a method of each name).
+The module holds the table of the names, reads a name with its arguments, and finds mistakes in
+`[sim] faults`. The faults themselves are methods of the same names in `sim/faults.py`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FAULTS = (
     "late_watchdog", "fed_by_anything", "lost_replies", "lost_commands", "bit_errors", "unprompted",
     "ftdi",
 )  # fmt: skip
-"""Those that need no argument."""
+"""Faults without arguments."""
 
 ARGUMENTS = {
     "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
@@ -31,34 +31,36 @@ ARGUMENTS = {
     "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
     "pushed": "n", "stalls": "nn",
 }  # fmt: skip
-"""Those that need arguments: `m` a motor, 0 to 3 for a to d; `n` a number."""
+"""Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
 
 RESET = "reset"
-"""Needs a timer, so only `acsard sim --fault` has it: again and again after so many seconds."""
+"""Fault that restarts the simulated board again and again after this many seconds. It needs a
+timer, so only `acsard sim --fault` has it.
+"""
 
 MOTORS = "abcd"
 
 MOST = 1e6
-"""Of any number: beyond it sums overflow, and no robot is there."""
+"""Largest absolute value of a number. Beyond it sums overflow, and no robot has such values."""
 
 SHORTEST_S = 0.001
-"""A stall; a shorter one nobody sees."""
+"""Shortest stall, s. A shorter one has no visible effect."""
 
 
 class NamedFault(Struct, frozen=True):
-    """One fault and its numbers; motors are 0 to 3."""
+    """A fault with its arguments; motors are 0 to 3."""
 
     name: str
     values: tuple[int | float, ...] = ()
 
 
 def forms() -> list[str]:
-    """How the faults with arguments are written."""
+    """Return the faults with arguments, as they are written."""
     return [_form(name, kinds) for name, kinds in ARGUMENTS.items()]
 
 
 def named(text: str) -> NamedFault:
-    """The fault a person means; raises `ValueError` in words, without the text itself."""
+    """Parse a fault; raise `ValueError` with a description that does not repeat the text."""
     name, _, given = text.partition("=")
     known = {RESET: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
     if name not in known:
@@ -83,7 +85,7 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """That the simulator has faults, so that nobody looks for them in the robot."""
+    """Warn that the simulator has faults, so that nobody searches for them in the robot."""
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []

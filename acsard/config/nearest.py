@@ -1,4 +1,4 @@
-"""What was probably meant by a word that nothing is called."""
+"""Suggests the known word that an unknown word probably stands for."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Characters of a word that are looked at; a stranger's may be any."""
+"""Largest number of characters compared; a stranger's word may be longer."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:
-    """The known word that is like it, or none."""
+    """Return the most similar known word, or an empty list."""
     return difflib.get_close_matches(word[:LONGEST], list(known), n=1, cutoff=0.6)
 
 
 def hint(word: str, known: Iterable[str], otherwise: str) -> str:
-    """The same as a question, or what helps where nothing is like it."""
+    """Return the most similar known word as a question, or `otherwise` if no word is similar."""
     near = nearest(word, known)
     return f"did you mean {near[0]}?" if near else otherwise

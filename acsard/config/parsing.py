@@ -1,8 +1,7 @@
-"""`acsard.toml` bytes -> one frozen `Config`, or an error that names every key and its mend.
+"""Decodes `acsard.toml` to one frozen `Config`, or to an error that names every key and its fix.
 
-What lives here: decoding. The keys are in `settings.py`, the rules between them in
-`contradictions.py`. What must not: reading files (the command line does), or anything that uses
-the values.
+The keys are in `settings.py` and the rules between them in `contradictions.py`. The command line
+reads the file; this module only decodes it.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from acsard.config.validation import build_partly
 from acsard.values import AcsardError
 
 MAX_BYTES = 65536
-"""The reference file is a tenth of this."""
+"""Largest size of a configuration. The reference file has a tenth of this."""
 
 
 class ConfigError(AcsardError):
-    """The configuration cannot be used; `problems` has one line per mistake."""
+    """A configuration that cannot be used; `problems` has one line per mistake."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -30,9 +29,10 @@ class ConfigError(AcsardError):
 
 
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
-    """Decode a configuration file; raises `ConfigError` with every problem found.
+    """Decode a configuration file.
 
-    `overrides` are values from the command line, by table and key; they win over the file.
+    Raises `ConfigError` with every problem found. `overrides` are values from the command line, by
+    table and key; they win over the file.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError([f"{len(text)} bytes: not a configuration; at most {MAX_BYTES}"])
@@ -42,7 +42,8 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError([f"not TOML: {error}; texts need quotes, true/false none"]) from None
-    except (ValueError, RecursionError):  # numbers and nesting beyond what Python takes
+    # Python limits the length of numbers and the depth of nesting.
+    except (ValueError, RecursionError):
         raise ConfigError(["not TOML: a number too long or lists too deep; mend it"]) from None
     for section, values in (overrides or {}).items():
         inner = table.setdefault(section, {})
@@ -62,12 +63,12 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
 
 
 def from_builtins(data: object) -> Config:
-    """The `Config` that `effective` described."""
+    """Convert the result of `effective` back to a `Config`."""
     return convert(data, Config)
 
 
 def effective(config: Config) -> dict[str, object]:
-    """The configuration in force as plain tables, defaults filled in."""
+    """Return the configuration in force as plain tables, with defaults filled in."""
     plain = to_builtins(config)
     assert isinstance(plain, dict)
     return plain

@@ -1,6 +1,7 @@
-"""A configuration of which some keys could not be read: rules see the others, and only those.
+"""A view of a configuration in which some keys have no valid value.
 
-A rule that looks at a key which has no valid value says nothing about the rest.
+A rule that reads such a key is skipped, because its result would be meaningless. All other rules
+still run.
 """
 
 from __future__ import annotations
@@ -12,20 +13,20 @@ from acsard.config.settings import Config
 from acsard.values import AcsardError
 
 Rule = Callable[[Config], Iterable[str]]
-"""What is wrong with a configuration: a line each."""
+"""Function that returns the mistakes in a configuration, one line each."""
 
 
 class SpoiltError(AcsardError):
-    """There is no valid value to look at."""
+    """Raised when a rule reads a key without a valid value."""
 
 
 def without(config: Config, spoilt: Set[str]) -> Config:
-    """The same to read, but the keys that are `spoilt` (dotted) raise `SpoiltError`."""
+    """Return a view of the configuration that raises `SpoiltError` for these dotted keys."""
     return cast(Config, _View(config, "", spoilt)) if spoilt else config
 
 
 def told(rules: Iterable[Rule], config: Config) -> list[str]:
-    """What every rule says whose keys can be read."""
+    """Return the results of all rules that read only valid keys."""
     found: list[str] = []
     for rule in rules:
         try:
@@ -36,7 +37,7 @@ def told(rules: Iterable[Rule], config: Config) -> list[str]:
 
 
 class _View:
-    """One table."""
+    """View of one table."""
 
     def __init__(self, table: object, path: str, spoilt: Set[str]) -> None:
         self._table, self._path, self._spoilt = table, path, spoilt
@@ -44,7 +45,8 @@ class _View:
     def __getattr__(self, name: str) -> Any:
         static = getattr(type(self._table), name, None)
         if isinstance(static, property) and static.fget:
-            return static.fget(self)  # so that what it reads is looked at as well
+            # Run the property on the view, so that the keys that it reads are checked as well.
+            return static.fget(self)
         where = f"{self._path}{name}"
         if where in self._spoilt:
             raise SpoiltError(where)

@@ -1,8 +1,7 @@
-"""The keys of `acsard.toml`: names, defaults, ranges and units, one frozen struct per table.
+"""The keys of `acsard.toml`: names, defaults, ranges and units, with one frozen struct per table.
 
-What lives here: the shape of the configuration. `acsard.toml` at the root is its commented
-reference and must equal these defaults (a test). What must not: rules between keys
-(`contradictions.py`).
+The `acsard.toml` at the root is the commented reference; a test proves that it equals these
+defaults. The rules between keys are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ Text = Annotated[
 CommonName = Annotated[
     str,
     Meta(
-        # It is a part of keys and of what `state` shows.
+        # The name becomes a part of keys, and `state` shows it.
         pattern=r"^(?!@)[\w .:@+-]{1,64}\Z",
         extra={
             "unit": "a common name of letters, digits, spaces and _.:@+-",
@@ -109,7 +108,7 @@ class WheelMap(Struct, frozen=True):
 
 
 SIMULATOR = "sim"
-"""The port of the built-in simulator."""
+"""Port name that selects the built-in simulator."""
 
 
 class McuConfig(Struct, frozen=True):
@@ -123,17 +122,17 @@ class McuConfig(Struct, frozen=True):
 
     @property
     def simulated(self) -> bool:
-        """There is no device: the built-in simulator is behind the port."""
+        """True if the built-in simulator takes the place of a serial device."""
         return self.port == SIMULATOR
 
     @property
     def wants_samples(self) -> bool:
-        """The MCU is asked for its encoder counts with every line."""
+        """True if the daemon asks the board for its encoder counts with every line."""
         return self.link_check != "off" and self.encoder_counts > 0
 
     @property
     def line_bytes(self) -> int:
-        """Length of the longest line of either direction that may be on the wire."""
+        """Length in bytes of the longest line, in either direction, that may be on the wire."""
         return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
 
 
@@ -165,7 +164,7 @@ class JointsConfig(Struct, frozen=True):
     rear_right: Frame = "rear_right_wheel_joint"
 
     def as_tuple(self) -> tuple[str, str, str, str]:
-        """The four names in `values.WHEELS` order."""
+        """Return the four names in `values.WHEELS` order."""
         return self.front_right, self.front_left, self.rear_left, self.rear_right
 
 
@@ -251,7 +250,7 @@ class RatesConfig(Struct, frozen=True):
 
 
 TLS = "tls/"
-"""Endpoints that begin so show and ask for a certificate."""
+"""Prefix of endpoints that present a certificate and require one."""
 
 
 class BusConfig(Struct, frozen=True):
@@ -266,12 +265,12 @@ class BusConfig(Struct, frozen=True):
 
     @property
     def plain(self) -> tuple[str, ...]:
-        """Where the daemon itself listens; a client listens nowhere."""
+        """Endpoints at which the daemon itself listens; empty for a Zenoh client."""
         return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
 
     @property
     def outside(self) -> tuple[str, ...]:
-        """Where the door listens for the network."""
+        """Endpoints at which the TLS gateway listens for the network; empty for a Zenoh client."""
         return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
 
     @property
@@ -302,7 +301,7 @@ class LogConfig(Struct, frozen=True):
 
 
 RECORD = "ACSARD_RECORD"
-"""The environment variable by which the service's units say where it records."""
+"""Environment variable in which the systemd units name the directory of recordings."""
 
 
 class RecordConfig(Struct, frozen=True):
@@ -360,7 +359,7 @@ class Config(Struct, frozen=True):
 
     @property
     def rate_hz(self) -> float:
-        """Control periods per second; "auto" is what fits comfortably, at most 100."""
+        """Control periods per second. "auto" is the highest comfortable rate, at most 100."""
         if self.control.rate != "auto":
             return float(self.control.rate)
         mcu = self.mcu

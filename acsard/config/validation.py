@@ -1,6 +1,7 @@
-"""A TOML table -> one frozen struct, or every problem at once, each naming key, value and mend.
+"""Decodes a TOML table to a frozen struct, or finds every problem, each with key, value and fix.
 
-Generic: knows msgspec types, nothing of robots. The rules between keys are in `contradictions.py`.
+The module knows msgspec types and nothing about robots. The rules between keys are in
+`contradictions.py`.
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
 def build_partly(
     cls: type[T], table: object, path: str, problems: list[str], spoilt: set[str]
 ) -> T | None:
-    """As `build`, but what has no valid value gets its default, and its dotted key is `spoilt`.
+    """Decode `table` as `build` does, with defaults in place of invalid values.
 
-    None where a key without a default has none.
+    The dotted key of each invalid value is added to `spoilt`. Returns None if a required key lacks
+    a valid value.
     """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
@@ -48,7 +50,8 @@ def build_partly(
         if key not in known:
             near = nearest(key, known)
             problems.append(_unknown(key, table[key], path, near, list(known)))
-            spoilt |= {prefix + name for name in near}  # what was meant is not known
+            # The similar key may be the one that the user meant, so its value is not known.
+            spoilt |= {prefix + name for name in near}
     values: dict[str, Any] = {}
     for name, field in known.items():
         where = prefix + name
@@ -67,7 +70,7 @@ def build_partly(
 
 
 def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoilt: set[str]) -> Any:
-    """The value, None where it is not valid."""
+    """Return the value, or None if it is not valid."""
     if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
         return build_partly(field.type, raw, where, problems, spoilt)
     kind = inspect.type_info(field.type)
@@ -91,7 +94,10 @@ def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoil
 
 
 def _finite(raw: object) -> bool:
-    """TOML can spell inf and nan, and msgspec's bounds let inf through."""
+    """Return whether all numbers are finite.
+
+    TOML has inf and nan, and msgspec's bounds admit inf.
+    """
     if isinstance(raw, list):
         return all(_finite(item) for item in raw)
     return not isinstance(raw, float) or math.isfinite(raw)
@@ -105,7 +111,7 @@ def _unknown(key: str, value: object, path: str, near: list[str], known: list[st
 
 
 def expected(kind: inspect.Type) -> str:
-    """What a value of this type must be, in words with range and unit."""
+    """Describe the valid values of a type, with range and unit."""
     unit = ""
     if isinstance(kind, inspect.Metadata):
         unit = str((kind.extra or {}).get("unit", ""))
@@ -144,18 +150,18 @@ def _example(field: FieldInfo) -> str:
 
 
 def show(value: object) -> str:
-    """A value as TOML would write it, cut to one short line."""
+    """Format a value as TOML, cut to one short line."""
     text = write(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def write(value: object) -> str:
-    """A value as TOML writes it."""
+    """Format a value as TOML."""
     match value:
         case bool():
             return "true" if value else "false"
         case str():
-            # JSON's escapes are TOML's, but for DEL, which TOML wants escaped too.
+            # JSON's escapes are valid in TOML, except that TOML also requires an escape for DEL.
             return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
         case list() | tuple():
             return "[" + ", ".join(write(item) for item in value) + "]"

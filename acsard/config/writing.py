@@ -1,4 +1,4 @@
-"""A configuration as the text of an `acsard.toml`."""
+"""Writes a configuration as the text of an `acsard.toml`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from acsard.config.validation import write
 
 
 def document(table: dict[str, object], path: str = "") -> list[str]:
-    """The lines of a TOML document: plain keys first, then tables, then lists of tables."""
+    """Return the lines of a TOML document: plain keys first, then tables, then lists of tables."""
     lines: list[str] = []
     tables: list[str] = []
     for key, value in table.items():
@@ -24,7 +24,7 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Some dotted keys as lines of TOML, by table."""
+    """Return dotted keys as lines of TOML, grouped by table."""
     lines: list[str] = []
     table = ""
     for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):

@@ -1,1 +1,1 @@
-"""Shell: the door, a process of its own that ends the network's connections (`acsard door`)."""
+"""The TLS gateway (`acsard door`): a process that terminates connections from the network."""

@@ -1,7 +1,8 @@
-"""The door: clients from other machines by TLS on one side, the daemon on loopback on the other.
+"""The TLS gateway between clients on other machines and the daemon on loopback.
 
-A Zenoh router of its own, which lets through what the access rules allow. The worst that somebody
-can do is that the door is opened anew (`watched.py`), and all come in again.
+The gateway is a Zenoh router of its own that forwards only what the access rules allow. The worst
+that a client can cause is a restart of the gateway (`watched.py`), after which all clients
+reconnect.
 """
 
 from __future__ import annotations
@@ -28,22 +29,26 @@ from acsard.values import NS_PER_S
 CONNECT_S = 1.0
 
 ASK_NS = NS_PER_S
-"""How often the daemon is asked, and how long it may take."""
+"""Interval between two queries to the daemon, ns. A query that has not ended by then counts."""
 
 LET_GO_S = 60.0
-"""When Zenoh itself ends a question, which is no answer: long after enough of them were counted,
-also by a door that is kept waiting for a core between its looks."""
+"""Time after which Zenoh itself ends a query, s; that is not an answer. It is long after the
+unanswered queries have been counted, even if the gateway waits for a core between its looks.
+"""
 
 
 class Door:
-    """Opens when the daemon is there, and tells it who has come."""
+    """The TLS gateway. It opens when the daemon runs, and reports its connections to the daemon."""
 
     most = MAX_SESSIONS - 1
-    """One is the daemon's."""
+    """Largest number of connections from the network; one more is the daemon's."""
     events = DOOR_EVENTS
 
     def __init__(self, config: Config) -> None:
-        """Raises `CertificateError` or `NotPermittedError` for certificates it cannot use."""
+        """Check the certificates.
+
+        Raises `CertificateError` or `NotPermittedError` if they cannot be used.
+        """
         self._config, self.where = config, ", ".join(config.bus.outside)
         require_usable(config.bus.tls)
         self._opened_ns = 0
@@ -52,7 +57,7 @@ class Door:
         self._question = Question(full_key(config.robot.id, "info"))
 
     def ready(self) -> bool:
-        """Nobody is let in before there is a daemon."""
+        """Return whether the daemon accepts connections. Clients are not admitted before."""
         host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
         try:
             with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
@@ -61,7 +66,7 @@ class Door:
             return False
 
     def open(self) -> zenoh.Session:
-        """Between the network and the daemon."""
+        """Open the session between the network and the daemon."""
         config = self._config
         sources = tuple(source.name for source in config.commands.sources)
         limited, access = command_keys(config.ros), door_access(config)
@@ -70,7 +75,7 @@ class Door:
         return session
 
     def look(self, session: zenoh.Session) -> Look:
-        """Who is connected from outside, and whether the daemon is."""
+        """Return the connections from the network, and whether the daemon is connected."""
         links = session.info.links()
         near = [link for link in links if str(link.dst).startswith("tcp/")]
         holders = tuple(link.auth_identifier or "" for link in links if link not in near)
@@ -78,7 +83,7 @@ class Door:
         return Look(clock.mono_ns(), holders, bool(near), unanswered)
 
     def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
-        """The daemon counts it in `state`."""
+        """Report to the daemon, which shows it in `state`."""
         if self._publisher is None:
             self._ends_ns = ends_ns(self._config.bus.tls) or 0
             key, kind = full_key(self._config.robot.id, "door"), "DoorState"
@@ -89,19 +94,22 @@ class Door:
 
 
 class Question:
-    """Asked through the connection to the daemon again and again: that it stands is not enough.
+    """Repeated query to the daemon, because an open connection does not prove that data arrives.
 
-    After two doors had died within half a minute on a machine with forty times its work, the third
-    one's connection stood for minutes without the daemon's Zenoh reading from it.
+    On a machine with forty times the work that it can do, two gateways ended within half a minute.
+    The connection of the third stayed open for minutes, while the daemon's Zenoh did not read from
+    it.
     """
 
     def __init__(self, key: str) -> None:
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """That Zenoh lets go of a question is an answer, too: the daemon has had it."""
+        """Set when the query has ended. An end without a reply also counts as an answer, because
+        the daemon has received the query.
+        """
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """So many in a row have had no end yet."""
+        """Return the number of consecutive queries that have not ended yet."""
         if now_ns - self._asked_ns < ASK_NS:
             return self._unanswered
         if self._asked_ns:

@@ -1,7 +1,8 @@
-"""A fleet's router: Zenoh in router mode by a configuration of Zenoh's own, watched (`watched.py`).
+"""A router for a fleet: Zenoh in router mode with a Zenoh configuration file, supervised.
 
-The rules in the file say who may do what, as they do for zenohd. Beyond those anybody with a
-certificate can hold up a router; this one notices, and opens anew within 2 s.
+As with zenohd, the rules in the file are the permissions of the clients. Within these rules, any
+client with a certificate can still block a router. This one detects it and restarts within 2 s
+(`watched.py`).
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ ROUTER_EVENTS: Events = {
     "open": "router_open",
     "crowded": "router_crowded",
     "stuck": "router_stuck",
-}  # it waits for nobody, and is never alone
+    # "alone" is missing because the router does not wait for a daemon.
+}
 
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
-"""The part of an endpoint that may be taken, or not there yet."""
+"""Part of an endpoint that may be in use or not exist yet."""
 
 _KNOWN = re.compile(
     r'msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+) \}\)'
@@ -33,7 +35,7 @@ _GRAMMAR = re.compile(r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)
 
 
 def why(error: zenoh.ZError) -> str:
-    """What Zenoh has to say of a configuration that it cannot use, whole, and where."""
+    """Return Zenoh's complete message about an invalid configuration, with the position."""
     text = str(error)
     if match := _KNOWN.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])
@@ -44,15 +46,15 @@ def why(error: zenoh.ZError) -> str:
 
 
 class Router:
-    """What zenohd would open, without its plugins."""
+    """The router that zenohd would open, without its plugins."""
 
     events = ROUTER_EVENTS
 
     def __init__(self, file: Path) -> None:
-        """Raises `RouterFileError` for a file that Zenoh does not take."""
+        """Read the file; raise `RouterFileError` if Zenoh does not accept it."""
         self._file = file
         try:
-            # Zenoh says only that it could not open it.
+            # Zenoh reports only that it could not open the file.
             file.read_bytes()
         except OSError as error:
             raise RouterFileError(f"cannot read {file}: {error.strerror}; correct it") from None
@@ -66,7 +68,8 @@ class Router:
             raise RouterFileError(
                 f"{file} is no configuration of Zenoh's: {why(error)}; correct it"
             ) from error
-        if isinstance(endpoints, dict):  # by mode, as Zenoh has it of itself: everywhere, in clear
+        # Zenoh's default is a table by mode: every address, without encryption.
+        if isinstance(endpoints, dict):
             endpoints = []
         if mode != "router" or not endpoints:
             raise RouterFileError(
@@ -77,11 +80,11 @@ class Router:
         self.where = ", ".join(endpoints)
 
     def ready(self) -> bool:
-        """A router waits for nobody."""
+        """Return True: a router does not wait for a daemon."""
         return True
 
     def open(self) -> zenoh.Session:
-        """Listen; raises `InUseError` where that may be possible later, else `RouterFileError`."""
+        """Listen; raise `InUseError` if that may be possible later, else `RouterFileError`."""
         try:
             return zenoh.open(self._config)
         except zenoh.ZError as error:
@@ -96,9 +99,10 @@ class Router:
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Whether it does on free addresses of this machine: then only its own are the trouble.
+        """Return whether the configuration opens on free addresses of this machine.
 
-        Zenoh's words do not tell those, which may be there later, from the rest of the file.
+        If it does, only its own addresses are at fault, and they may become free later. Zenoh's
+        messages do not tell this case from a mistake in the file.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
@@ -112,9 +116,9 @@ class Router:
         return True
 
     def look(self, session: zenoh.Session) -> Look:
-        """Who is connected: all come from outside, and nobody is waited for."""
+        """Return the connections. All come from outside, and no daemon is awaited."""
         links = session.info.links()
         return Look(clock.mono_ns(), tuple(link.auth_identifier or "" for link in links), True)
 
     def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
-        """It concerns nobody but the log."""
+        """Do nothing: the log has all reports of a router."""

@@ -1,4 +1,4 @@
-"""Pure: what the door sees of itself -> what to tell of it, and when it has to be opened anew."""
+"""Pure: decides when a gateway or a router logs an incident, and when it must restart."""
 
 from __future__ import annotations
 
@@ -12,24 +12,26 @@ from acsard.host.silence import Silence
 from acsard.values import NS_PER_S, Event, EventName
 
 STUCK_NS = NS_PER_S
-"""A look at Zenoh takes a millisecond; longer than this, and somebody has taken its time."""
+"""Time without a new look after which Zenoh counts as stuck, ns. A look takes a millisecond."""
 
 FIRST_NS, ALONE_NS = 5 * NS_PER_S, NS_PER_S
-"""How long to wait for the daemon: for the first time, while others come in too, and later on."""
+"""Time to wait for the daemon, ns: at the start, while other clients connect too, and later."""
 
 TOLD_EVERY_NS = 60 * NS_PER_S
 
 UNANSWERED = 4
-"""Questions in a row without an end, each a second old at least: what comes in at the door does not
-arrive, though the connection stands."""
+"""Number of consecutive queries without an end, each at least a second old, that show a dead
+connection. Data from the network then does not reach the daemon, although the connection is
+open.
+"""
 
 NAMES = 5
-"""Holders of connections that are named, those with most of them."""
+"""Number of clients named in a report, those with the most connections."""
 
 What = Literal["open", "crowded", "stuck", "alone"]
 
 Events = dict[What, EventName]
-"""What happens to it, as the log calls that."""
+"""Name of the log event for each incident."""
 
 DOOR_EVENTS: Events = {
     "open": "door_open",
@@ -40,31 +42,31 @@ DOOR_EVENTS: Events = {
 
 
 class Look(Struct, frozen=True):
-    """What Zenoh said when it was last looked at."""
+    """State of the Zenoh session at the last look."""
 
     at_ns: int
     holders: tuple[str, ...] = ()
-    """The name in the certificate of each connection from outside, "" where Zenoh has none."""
+    """Common name in the certificate of each connection from outside; "" if Zenoh reports none."""
     linked: bool = False
-    """The daemon is connected."""
+    """True if the daemon is connected."""
     unanswered: int = 0
-    """Questions in a row that the daemon has left without an end."""
+    """Number of consecutive queries to the daemon that have not ended."""
 
 
 class Watch:
-    """Judges look after look."""
+    """Judgement of one look after the other."""
 
     def __init__(self, most: int, opened_ns: int, events: Events = DOOR_EVENTS) -> None:
-        """`most` connections from outside are all there are."""
+        """Start at the monotonic time `opened_ns`, with at most `most` connections from outside."""
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
         self._last_ns, self._silence = 0, Silence(STUCK_NS)
         self._told_ns: int | None = None
         self.crowded = 0
-        """Looks at which all connections were taken."""
+        """Number of looks at which all connections were in use."""
 
     def tell(self, look: Look) -> Event | None:
-        """What there is to say of a new look."""
+        """Return an event about a new look, or None."""
         if len(look.holders) < self._most:
             return None
         self.crowded += 1
@@ -75,7 +77,7 @@ class Watch:
         return Event(self._events["crowded"], f"{text}: nobody else is let in", "warning")
 
     def reopen(self, look: Look, passed_ns: int) -> Event | None:
-        """Why the door has to be opened anew, `passed_ns` after the last call; None: it has not."""
+        """Return why the session must be opened again, `passed_ns` after the last call, or None."""
         new, self._last_ns = look.at_ns != self._last_ns, look.at_ns
         stuck = self._silence.too_long(new, passed_ns)
         if look.linked:
@@ -93,6 +95,6 @@ class Watch:
 
 
 def crowd(holders: Sequence[str]) -> str:
-    """Who has how many connections, in words."""
+    """Describe how many connections each client has."""
     most = Counter(holders).most_common(NAMES)
     return ", ".join(f"{count} by {name or 'an unnamed one'}" for name, count in most)

@@ -1,8 +1,8 @@
-"""A Zenoh session that strangers come to, in a process that may be lost: watched, ended when stuck.
+"""Supervises a Zenoh session that is open to strangers, in a process that may be lost.
 
-Whatever somebody makes Zenoh do (compare key expressions for ever, keep all connections, take
-memory) happens here. No call to Zenoh can be trusted to come back then, so one thread looks at the
-session, and the main thread judges whether it still does.
+A stranger can make Zenoh compare key expressions for ever, keep all connections, or take memory;
+all of that happens in this process. No call to Zenoh is then sure to return. Therefore one thread
+looks at the session, and the main thread judges whether it still does so.
 """
 
 from __future__ import annotations
@@ -28,43 +28,45 @@ from acsard.host.systemd import Systemd
 LOOK_S = 0.25
 
 MEMORY_BYTES = 192 << 20
-"""What it may keep: it takes 35 MB, and 72 with all connections in use. An attack takes 600 MB a
-second, which no look could be quick enough for: the kernel refuses, and that ends the process."""
+"""Memory limit. The process takes 35 MB, and 72 MB with all connections in use. An attack takes
+600 MB a second, faster than any look could react: the kernel refuses the memory, and that ends
+the process.
+"""
 
 NICE = 5
-"""Behind the daemon and what people run beside it."""
+"""Niceness: the process yields to the daemon and to programs that people run."""
 
 
 class Side(Protocol):
-    """What is opened, and who is expected there."""
+    """Interface of the supervised session: a gateway or a router."""
 
     where: str
-    """Its addresses, in words."""
+    """Addresses at which it listens, in words."""
     most: int
-    """Connections from outside, all there are."""
+    """Largest number of connections from outside."""
     events: Events
-    """What the log calls what happens to it."""
+    """Names of its log events."""
 
     def ready(self) -> bool:
-        """Whether it is time to let anybody in."""
+        """Return whether clients may be admitted now."""
 
     def open(self) -> zenoh.Session:
-        """Listen; blocks."""
+        """Open the session and listen; blocks."""
 
     def look(self, session: zenoh.Session) -> Look:
-        """Who is connected; may never come back."""
+        """Return the connections; the call may never return."""
 
     def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
-        """Pass on what was seen, to whom it concerns; may never come back."""
+        """Report the look to the daemon, if there is one; the call may never return."""
 
 
 class Watched:
     """One life of the process."""
 
     def __init__(self, side: Side, log: Log, manager: Systemd, holder: int | None) -> None:
-        """It ends when the file descriptor `holder` does, if there is one.
+        """Run until `holder` ends, if it is a file descriptor.
 
-        A holder that is a socket is told all the time that we are alive.
+        If it is a socket, the process writes a sign of life to it at each look.
         """
         self._side, self._log, self._manager, self._holder = side, log, manager, holder
         self._beats = False
@@ -72,13 +74,16 @@ class Watched:
             os.set_blocking(holder, False)
             self._beats = True
         self._session: zenoh.Session | None = None
-        """Kept to the end of the process: to close it could take for ever."""
+        """Kept open until the process ends, because closing it could take for ever."""
         self._look = Look(0)
         self._error: BaseException | None = None
         self._leaving = False
 
     def run(self) -> Exit:
-        """OK after a signal or the holder's end, FAILURE when it has to be opened anew."""
+        """Run until the process must end.
+
+        Returns OK after a signal or the holder's end, and FAILURE if the process must restart.
+        """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._leave)
         if self._holder is not None:
@@ -106,11 +111,12 @@ class Watched:
         self._leaving = True
 
     def _wait(self) -> bool:
-        """A moment; whether it is time to go."""
+        """Wait for `LOOK_S`, and return whether the process must end."""
         self._manager.alive()
         held = [] if self._holder is None else [self._holder]
         if self._beats and self._holder is not None:
-            with contextlib.suppress(OSError):  # it is full, or gone
+            # The socket's buffer is full, or the holder is gone.
+            with contextlib.suppress(OSError):
                 os.write(self._holder, b".")
         ended, _, _ = select.select(held, [], [], LOOK_S)
         return self._leaving or bool(ended and not os.read(held[0], 64))
@@ -126,7 +132,7 @@ class Watched:
         return watch
 
     def _report(self, session: zenoh.Session, watch: Watch) -> None:
-        """Look, tell the log and whom it concerns, again and again."""
+        """Look at the session and report, again and again."""
         try:
             pause = threading.Event()
             while True:
@@ -141,10 +147,11 @@ class Watched:
 
 
 def _confine() -> None:
-    """Take no more than a door's share, as far as we may say so."""
+    """Limit memory and priority of this process, as far as permitted."""
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with contextlib.suppress(OSError):
         os.nice(NICE)
-    os.environ["RUST_BACKTRACE"] = "0"  # an end for want of memory is none of the log's business
+    # The process may end for lack of memory, and a backtrace would only fill the log.
+    os.environ["RUST_BACKTRACE"] = "0"

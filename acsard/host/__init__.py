@@ -1,1 +1,1 @@
-"""Shell: the machine beneath us: clock, timers, threads, scheduling, systemd, journal, logs."""
+"""Access to the machine: clock, threads, scheduling, processes, systemd, files and logs."""

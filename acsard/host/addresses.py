@@ -1,4 +1,4 @@
-"""The addresses this machine has on its networks."""
+"""The addresses that this machine has on its networks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ ASK_S = 5.0
 
 
 def own_addresses() -> list[str]:
-    """Those that others can reach it by: no loopback, no link-local. None where `ip` is missing."""
+    """Return the addresses at which others can reach this machine.
+
+    Loopback and link-local addresses are left out. The list is empty if the command `ip` is
+    missing.
+    """
     try:
         found = json.loads(called(("ip", "-json", "address"), ASK_S).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):

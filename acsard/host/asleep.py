@@ -1,6 +1,6 @@
-"""Was this computer suspended? The clock that counts for us stands still meanwhile.
+"""Detects that this computer was suspended, while the daemon's monotonic clock stood still.
 
-A command of before would be as fresh as it was, and the speeds of the wheels, which stood.
+Without this check, commands and wheel speeds from before the suspend would seem fresh.
 """
 
 from __future__ import annotations
@@ -10,21 +10,24 @@ from collections.abc import Callable
 from acsard.host.clock import asleep_ns
 
 MOMENT_NS = 100_000_000
-"""A sleep takes longer; a clock that is set anew by NTP moves both."""
+"""Shortest time that counts as a suspend, ns. A suspend takes longer, and a step of the wall
+clock by NTP does not change the measured time.
+"""
 
 
 class Asleep:
-    """Asked now and then, tells of each sleep once."""
+    """Detector that reports each suspend once."""
 
     def __init__(self, read: Callable[[], int] = asleep_ns) -> None:
-        """`read` tells how long it was suspended until now, ns."""
+        """Use `read`, which returns how long the computer was suspended since its start, ns."""
         self._read, self._known_ns = read, read()
 
     def was(self) -> bool:
-        """Whether it has been suspended since it was asked last."""
+        """Return whether the computer has been suspended since the last call."""
         if self._read() - self._known_ns < MOMENT_NS:
             return False
-        # Between the two clocks of one reading somebody else may have had the processor.
+        # `read` reads two clocks, and another process may have run between them. A second reading
+        # confirms the suspend.
         now_ns = self._read()
         slept, self._known_ns = now_ns - self._known_ns >= MOMENT_NS, now_ns
         return slept

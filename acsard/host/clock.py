@@ -1,10 +1,10 @@
-"""The only place that reads a clock.
+"""The only module that reads a clock.
 
-The monotonic one is the raw one: NTP slews the other, by up to 8 %, and with it every distance
-that is speed times time, and every delay that a command seems to have had.
+The monotonic clock is CLOCK_MONOTONIC_RAW. NTP slews CLOCK_MONOTONIC by up to 8 %, and with it
+every distance that is computed as speed times time, and every apparent delay of a command.
 
-An `Instant` is in whole us: what is below is only how long the reading took, and a recording that
-had to keep it would be twice as large.
+An `Instant` is in whole us. Digits below that show only how long the reading took, and storing them
+would make a recording twice as large.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from functools import partial
 from acsard.values import Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
-"""The monotonic clock alone. Read a dozen times a period: no Python function around it."""
+"""Read the monotonic clock, ns. A dozen reads a period are too many for a Python wrapper."""
 
 
 def asleep_ns() -> int:
-    """How long this computer was suspended since it was switched on; `mono_ns` stood meanwhile."""
+    """Return how long this computer was suspended since its start, ns, while `mono_ns` stood."""
     awake_ns = time.clock_gettime_ns(time.CLOCK_MONOTONIC)
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - awake_ns
 
@@ -31,7 +31,9 @@ def steady_ns() -> int:
 
 
 TOGETHER_NS = 50_000
-"""Two readings take 1 us, unless another process gets the core between them."""
+"""Longest time between two readings that belong together, ns. Two readings take 1 us, unless
+another process gets the core between them.
+"""
 
 TRIES = 5
 
@@ -39,7 +41,7 @@ NS_PER_US = 1000
 
 
 def now() -> Instant:
-    """Both clocks, read together."""
+    """Read both clocks as close together as possible."""
     for _ in range(TRIES):
         mono, wall = mono_ns(), time.time_ns()
         if mono_ns() - mono < TOGETHER_NS:

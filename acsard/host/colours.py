@@ -1,4 +1,4 @@
-"""Whether what is written may be coloured."""
+"""Decides whether output may contain colours."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from typing import TextIO
 
 
 def coloured(stream: TextIO) -> bool:
-    """It goes to a terminal that knows colours, and nobody has asked for none by NO_COLOR."""
+    """Return whether the stream is a terminal with colours, and NO_COLOR is not set."""
     wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
     return wanted and stream.isatty()

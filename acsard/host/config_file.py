@@ -1,4 +1,4 @@
-"""Which file is the configuration, and whether it may be changed."""
+"""Finds the configuration file, and checks whether it can be changed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
 
 def find(path: str | None) -> tuple[str, bytes]:
-    """Where the configuration is and what it holds; ("built-in defaults", b"") without a file."""
+    """Return the path and the content of the configuration, or ("built-in defaults", b"")."""
     named = path or os.environ.get("ACSARD_CONFIG")
     if named:
         try:
@@ -32,7 +32,10 @@ def find(path: str | None) -> tuple[str, bytes]:
 
 
 def writable(path: str | None) -> Path:
-    """The file that --write is to change; raises `ExitError` where it has none, or no tomlkit."""
+    """Return the file that --write changes.
+
+    Raises `ExitError` if it or the library tomlkit is missing.
+    """
     require_tomlkit()
     where, text = find(path)
     if not text and not Path(where).is_file():

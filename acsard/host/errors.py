@@ -1,9 +1,9 @@
-"""What goes wrong outside of us and a person can mend: each an `AcsardError`, and what Python
-calls such a thing, so that either may be caught.
+"""Errors with an external cause that a person can fix.
 
-The text says what was wrong and what to do. What the command line ends with for each is in
-`cli/exits.py`. What must not live here: bugs, and what is a state of the robot (a lost port, a
-stale command).
+Each is an `AcsardError` and also the built-in exception that Python uses for such a case, so either
+can be caught. The text says what is wrong and how to fix it. `cli/exits.py` maps them to exit
+codes. Bugs are not among them, and neither are states of the robot, such as a lost port or a stale
+command.
 """
 
 from __future__ import annotations
@@ -12,43 +12,43 @@ from acsard.values import AcsardError
 
 
 class MendableError(AcsardError):
-    """Base of them all."""
+    """Base class of these errors."""
 
 
 class UsageError(MendableError, ValueError):
-    """What was asked for is not written as it must be, or does not exist."""
+    """An argument is not written correctly, or names something that does not exist."""
 
 
 class UnreachableError(MendableError, ConnectionError):
-    """Nobody listens at this endpoint."""
+    """No process listens at this endpoint."""
 
 
 class NoAnswerError(MendableError, TimeoutError):
-    """Somebody listens there, but nobody answers this."""
+    """A process listens at the endpoint, but no daemon answers this query."""
 
 
 class ReplyError(MendableError, RuntimeError):
-    """The answer is that it cannot be done, or none that can be read."""
+    """The reply is a failure, or it cannot be decoded."""
 
 
 class NotDrivenError(MendableError, RuntimeError):
-    """The robot does not follow our commands; the text is the daemon's reason."""
+    """The robot does not follow this client's commands; the text is the daemon's reason."""
 
 
 class InUseError(MendableError, OSError):
-    """Somebody else has the serial port, the bus address or the robot's id."""
+    """Another process uses the serial port, the bus address or the robot's id."""
 
 
 class NoPortError(MendableError, FileNotFoundError):
-    """There is no such serial port."""
+    """The serial port does not exist."""
 
 
 class NotPermittedError(MendableError, PermissionError):
-    """We may not read or open it."""
+    """This process is not permitted to read or open the file or device."""
 
 
 class RouterFileError(MendableError, ValueError):
-    """The file of a router cannot be used."""
+    """The configuration file of a router cannot be used."""
 
 
 class CertificateError(MendableError, ValueError):
@@ -56,4 +56,4 @@ class CertificateError(MendableError, ValueError):
 
 
 class RecordingError(MendableError, ValueError):
-    """A file is no recording of acsard's, or cannot be lived again."""
+    """A file is not a recording of acsard, or it cannot be replayed."""

@@ -1,6 +1,7 @@
-"""Why acsard ends, as exit codes after sysexits.h, and the error of a verb that ends with one.
+"""The exit codes of acsard, after sysexits.h, and an error that ends a verb with one of them.
 
-What others may import raises the errors of `errors.py` instead; `cli/exits.py` has their codes.
+Modules that other programs may import raise the errors of `errors.py` instead; `cli/exits.py` has
+their exit codes.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ WORDS: dict[int, str] = {
     Exit.NO_PERMISSION: "no permission",
     Exit.BAD_CONFIG: "bad configuration",
 }
-"""What a code means, for people."""
+"""Meaning of each exit code, for people."""
 
 
 class ExitError(MendableError):
-    """Ends the program with `code`; the text says what was wrong and what to do."""
+    """Ends the program with exit code `code`; the text says what is wrong and how to fix it."""
 
     def __init__(self, code: Exit, text: str) -> None:
         super().__init__(text)

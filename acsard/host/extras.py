@@ -1,4 +1,4 @@
-"""How one gets what an extra of `pyproject.toml` brings: acsard is on no package index."""
+"""Tells how to install an extra of `pyproject.toml`, as acsard is not on a package index."""
 
 from __future__ import annotations
 
@@ -16,17 +16,21 @@ Extra = Literal["foxglove", "lan", "mcu", "report", "shell", "top", "web"]
 
 
 def install(extra: Extra) -> str:
-    """What to type, as the error that says what is missing tells it."""
+    """Return the command to type, as an error about a missing library shows it."""
     try:
         wanted = wanted_by(distribution("acsard"), extra)
-    except PackageNotFoundError:  # run from a directory that nobody has installed
+    # acsard runs from a directory and was never installed.
+    except PackageNotFoundError:
         wanted = [f".[{extra}]"]
     return shlex.join([*_installer(), *wanted])
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
-    """The arguments of pip: where it was installed from, with the extra; or the libraries alone
-    where that is gone."""
+    """Return the arguments of pip for an extra.
+
+    They name the directory that acsard was installed from, with the extra, or only the libraries if
+    that directory is gone.
+    """
     told = json.loads(installed.read_text("direct_url.json") or "{}")
     url = urlsplit(told.get("url", ""))
     place = Path(unquote(url.path))
@@ -42,7 +46,7 @@ def _only(extra: Extra) -> list[str]:
 
 
 def _installer() -> list[str]:
-    """The pip of this very venv, whichever is first in the PATH."""
+    """Return the installer of the running venv, not the one that comes first in PATH."""
     sudo = [] if os.access(sys.prefix, os.W_OK) else ["sudo"]
     if find_spec("pip"):
         return [*sudo, sys.executable, "-m", "pip", "install"]

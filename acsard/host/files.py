@@ -1,4 +1,4 @@
-"""A person's files changed in place, all or nothing."""
+"""Changes a user's files in place, completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
 
 NEW_MODE = 0o644
-"""A configuration has no secrets, and the service reads it as a user of its own."""
+"""Mode of a new configuration. It holds no secrets, and the service's own user reads it."""
 
 Keys = Mapping[str, object]
-"""Values by dotted keys, as "mcu.port"."""
+"""Values by dotted keys, such as "mcu.port"."""
 
 
 def require_tomlkit() -> None:
-    """Say at once what is missing, before anybody has spent a minute on a check."""
+    """Raise an error now if tomlkit is missing, before a person has spent minutes on a check."""
     try:
         import tomlkit  # noqa: F401
     except ImportError:
@@ -34,9 +34,10 @@ def require_tomlkit() -> None:
 
 
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
-    """Set keys in an `acsard.toml`, given or made from what it says, and return them.
+    """Set keys in an `acsard.toml`, and return them.
 
-    Raises `ExitError` and leaves it as it was when it cannot be done. `new`: it need not be there.
+    `keys` may be a function that computes them from the configuration. Raises `ExitError` and
+    leaves the file unchanged if that is impossible. With `new` the file need not exist.
     """
     try:
         place, text, given = _changed(file, keys, new)
@@ -49,7 +50,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
 def require_changeable(
     file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
 ) -> None:
-    """Raises what `change` would, before anything else is done that needs the change."""
+    """Raise the error that `change` would raise, before other work depends on the change."""
     try:
         place, _, _ = _changed(file, keys, new)
         if not os.access(place.parent, os.W_OK):
@@ -61,9 +62,9 @@ def require_changeable(
 def _changed(
     file: Path, keys: Keys | Callable[[Config], Keys], new: bool
 ) -> tuple[Path, str, Keys]:
-    """Where the file really is, its text with the keys, and the keys."""
+    """Return the resolved path, the text with the new keys, and the keys."""
     place = file.resolve(strict=not new)
-    # Not read_text: it would lose CRLF.
+    # `read_text` would lose CRLF line ends.
     text = "" if new and not place.exists() else place.read_bytes().decode()
     given = keys(parse(text.encode())) if callable(keys) else keys
     return place, edited(text, given), given
@@ -93,7 +94,8 @@ def replace(file: Path, text: str, *, synced: bool = True) -> None:
                 if before:
                     os.fchown(new.fileno(), before.st_uid, before.st_gid)
             except PermissionError:
-                pass  # another's file in a directory of ours: it becomes ours
+                # The file of another user in a directory of ours becomes ours.
+                pass
             if synced:
                 os.fsync(new.fileno())
         os.replace(name, file)

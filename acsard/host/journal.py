@@ -1,6 +1,6 @@
-"""The journal of systemd as a stream: each line a datagram with fields of its own.
+"""Writes log lines to the systemd journal, each as a datagram with fields of its own.
 
-`journalctl ACSARD_EVENT=link_down` then finds what a text search would guess at.
+With these fields, `journalctl ACSARD_EVENT=link_down` finds exactly the lines of an event.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any, TextIO
 SOCKET = "/run/systemd/journal/socket"
 
 _PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
-"""syslog's numbers."""
+"""Priorities of syslog."""
 
 
 def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
-    """The stream leads to the journal, by what systemd says of it."""
+    """Return whether the stream leads to the journal, according to systemd's JOURNAL_STREAM."""
     try:
         found = os.fstat(stream.fileno())
     except (OSError, ValueError):
@@ -27,7 +27,7 @@ def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
 
 
 def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
-    """A structlog line in the journal's own protocol."""
+    """Render a structlog line in the journal's own protocol."""
     fields = {
         "MESSAGE": _message(line),
         "PRIORITY": str(_PRIORITIES.get(str(line.get("level")), 6)),
@@ -46,7 +46,7 @@ def _message(line: Mapping[str, Any]) -> str:
 
 
 class JournalStream(io.StringIO):
-    """Sends what is written to it, a datagram each; raises `OSError` when it cannot be opened."""
+    """Stream that sends each write as a datagram. Raises `OSError` without a journal."""
 
     def __init__(self, path: str = SOCKET) -> None:
         super().__init__()
@@ -58,6 +58,6 @@ class JournalStream(io.StringIO):
             raise
 
     def write(self, text: str) -> int:
-        """One line of the log."""
+        """Send one line of the log."""
         self._socket.send(text.encode(errors="replace"))
         return len(text)

@@ -1,7 +1,7 @@
-"""structlog: an event -> one line on standard error, never a wait.
+"""Logs events as lines on standard error through structlog, without ever blocking.
 
-Lines are written by a thread of their own from a bounded queue: a full disk, a closed pipe or a
-terminal someone has scrolled must not hold up the control loop. What does not fit is dropped.
+A thread writes the lines from a bounded queue, because a full disk, a closed pipe or a stopped
+terminal must not delay the control loop. Lines that do not fit in the queue are dropped.
 """
 
 from __future__ import annotations
@@ -24,14 +24,16 @@ from acsard.values import Event, EventName
 Form = Literal["console", "json", "logfmt", "journal"]
 
 QUEUED_LINES = 1000
-"""More than the daemon says in a minute of all troubles at once (`drive/tally.py`)."""
+"""Largest number of queued lines: more than the daemon logs in a minute with all faults at once
+(`drive/tally.py`).
+"""
 
 MAX_VALUE = 500
-"""Characters of one value: a stranger's words may be in it."""
+"""Largest number of characters of one value, which may be a stranger's text."""
 
 
 class Writer:
-    """A file that never blocks and never raises."""
+    """Stream that never blocks and never raises."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -43,14 +45,15 @@ class Writer:
         try:
             self._lines.put_nowait(text)
         except queue.Full:
-            pass  # the reader is stuck; the robot is not
+            # The reader is stuck, and the robot must not wait for it.
+            pass
         return len(text)
 
     def flush(self) -> None:
-        """Nothing to do: the thread flushes each line."""
+        """Do nothing: the thread flushes each line."""
 
     def close(self, timeout: float) -> None:
-        """Let what is queued out, for at most `timeout` s."""
+        """Write the queued lines, for at most `timeout` s."""
         try:
             self._lines.put_nowait(None)
         except queue.Full:
@@ -62,18 +65,20 @@ class Writer:
             try:
                 write_through(self._stream, text)
             except (OSError, ValueError):
-                pass  # disk full or stream closed: logging degrades, control goes on
+                # On a full disk or a closed stream the log loses lines, and control goes on.
+                pass
 
 
 def write_through(stream: TextIO, text: str) -> None:
-    """Write to the stream's descriptor, past its buffer.
+    """Write to the stream's file descriptor, past its buffer.
 
-    A thread that is stuck in a buffered write holds the buffer's lock, and then nobody could
-    flush it at the end.
+    A thread that is stuck in a buffered write holds the buffer's lock, and then no other thread
+    could flush the buffer at the end.
     """
     try:
         fd = stream.fileno()
-    except (OSError, ValueError):  # a stream in memory
+    # A stream in memory lacks a descriptor.
+    except (OSError, ValueError):
         stream.write(text)
         return
     data = text.encode(errors="replace")
@@ -82,7 +87,7 @@ def write_through(stream: TextIO, text: str) -> None:
 
 
 class Log:
-    """What the daemon writes about itself."""
+    """The daemon's log."""
 
     def __init__(self, settings: LogConfig, stream: TextIO = sys.stderr) -> None:
         form: Form = settings.format if settings.format != "auto" else _fitting(stream)
@@ -90,13 +95,14 @@ class Log:
             try:
                 stream = JournalStream()
             except OSError:
-                form = "json"  # no journal here, or a sandbox without it
+                # The journal is missing, or a sandbox hides it.
+                form = "json"
         self._writer = Writer(stream)
         self._form, self._stream = form, stream
         self.use(settings)
 
     def use(self, settings: LogConfig) -> None:
-        """Tell from this level on; where it goes and how stays as it began."""
+        """Log from this level on. The destination and the format stay as they were at the start."""
         self._logger: Any = structlog.wrap_logger(
             structlog.WriteLogger(self._writer),  # type: ignore[arg-type]
             processors=[
@@ -113,7 +119,7 @@ class Log:
         )
 
     def event(self, event: Event) -> None:
-        """Write an event of the core or of a shell."""
+        """Log an event of the core or of another module."""
         fields: dict[str, object] = {"text": event.text}
         if event.by:
             fields["by"] = event.by
@@ -122,11 +128,11 @@ class Log:
         self._logger.log(_LEVELS[event.level], event.name, **fields)
 
     def info(self, name: EventName, **fields: object) -> None:
-        """Write a line of the daemon's own."""
+        """Log a message of the daemon itself."""
         self._logger.info(name, **fields)
 
     def close(self) -> None:
-        """Write out what is queued; bounded."""
+        """Write the queued lines, within 0.2 s."""
         self._writer.close(0.2)
 
 
@@ -134,7 +140,7 @@ _LEVELS = {"info": logging.INFO, "warning": logging.WARNING, "error": logging.ER
 
 
 def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> dict[str, Any]:
-    """When, how bad and what come first in every format."""
+    """Put the time, the level, the event and its text first in every format."""
     first = ("timestamp", "level", "event", "text")
     return {key: line[key] for key in first if key in line} | dict(line)
 
@@ -142,7 +148,7 @@ def _in_order(logger: object, method: str, line: MutableMapping[str, Any]) -> di
 def _printable(
     logger: object, method: str, line: MutableMapping[str, Any]
 ) -> MutableMapping[str, Any]:
-    """Nothing that moves a terminal's cursor or begins a line of its own."""
+    """Replace characters that would move a terminal's cursor or begin a new line."""
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE):
             cut = value[:MAX_VALUE]
@@ -161,7 +167,8 @@ def _renderer(form: Form, stream: TextIO) -> Any:
         case "journal":
             return render
         case "console":
-            # How far it pads; the name was another once.
+            # The number is the width to which event names are padded. structlog has renamed the
+            # parameter, so it is passed by position.
             return structlog.dev.ConsoleRenderer(14, colors=coloured(stream))
         case "json":
             return structlog.processors.JSONRenderer()

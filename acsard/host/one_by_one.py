@@ -1,4 +1,4 @@
-"""A terminal whose keys come one by one, for who drives by them."""
+"""Sets the terminal to deliver single key presses, for driving by keys."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from contextlib import contextmanager, suppress
 
 @contextmanager
 def one_by_one() -> Iterator[None]:
-    """Standard input, which is left as it was. Ctrl-S is a key like any other: it must not hold up
-    what is written, and with it who writes and drives."""
+    """Deliver the keys of standard input one by one, and restore the terminal at the end.
+
+    Ctrl-S is an ordinary key meanwhile. Otherwise it would block the program's output, and with it
+    the program that drives the robot.
+    """
     before = termios.tcgetattr(sys.stdin)
     tty.setcbreak(sys.stdin)
     now = termios.tcgetattr(sys.stdin)
@@ -21,5 +24,6 @@ def one_by_one() -> Iterator[None]:
     try:
         yield
     finally:
-        with suppress(OSError, termios.error):  # the terminal has been closed
+        # The terminal may have been closed.
+        with suppress(OSError, termios.error):
             termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

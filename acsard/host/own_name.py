@@ -1,4 +1,4 @@
-"""The names that this process gives itself to a daemon."""
+"""The names under which this process presents itself to a daemon."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from acsard.messages.signature import MAX_NAME
 
 SECRET_BYTES = 16
-"""128 bits, which no program can guess."""
+"""Size of the random secret: 128 bits, which no program can guess."""
 
 
 def own_name() -> str:
-    """Like `alice@laptop patrol`: the user, the machine, and the program if it has a name."""
+    """Return a name like `alice@laptop patrol`: user, machine, and the program if it has a name."""
     try:
         user = pwd.getpwuid(os.getuid()).pw_name
     except KeyError:

@@ -1,4 +1,4 @@
-"""Can a service run this installation: its venv, and the interpreter that the venv borrows?"""
+"""Checks whether a service can run this installation: the venv and the Python that it uses."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 HOME = "/opt/acsard/venv"
-"""Where the unit of `deploy/` believes acsard to be."""
+"""Path of the venv in the unit files of `deploy/`."""
 
 OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
-"""Places a service cannot see."""
+"""Directories that a service cannot see."""
 
 
 def misplaced(
@@ -21,13 +21,13 @@ def misplaced(
     executable: str = sys.executable,
     hidden: Sequence[str] = OUT_OF_SIGHT,
 ) -> str:
-    """Why this installation is no place for a service, or ""."""
+    """Return why a service cannot run this installation, or "" if it can."""
     if prefix == base or _hidden(Path(prefix), hidden):
         return (
             f"{prefix} is no place for a service, which cannot see homes and /tmp; install acsard "
             f"in a venv at {HOME} (deploy/systemd/README.md)"
         )
-    # A venv has no Python of its own: its bin/python is a link to the one it was made with.
+    # A venv borrows its Python: its bin/python is a link to the one that it was made with.
     interpreter = Path(os.path.realpath(executable))
     for path in (Path(base), interpreter):
         if _hidden(path, hidden):
@@ -55,14 +55,15 @@ def _hidden(path: Path, hidden: Sequence[str]) -> bool:
 
 
 def _closed(path: Path) -> Path | None:
-    """The first on the way to `path` that others may not use."""
+    """Return the first part of `path` that other users may not enter, or None."""
     for place in (*reversed(path.parents), path):
         try:
             mode = place.stat().st_mode
         except PermissionError:
             return place
         except OSError:
-            return None  # not there; nobody is kept out
+            # The path does not exist, so nothing keeps the service out.
+            return None
         if not mode & stat.S_IXOTH:
             return place
     return None

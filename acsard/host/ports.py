@@ -1,6 +1,6 @@
-"""The serial ports of this machine: which boards they are, who holds them.
+"""The serial ports of this machine: the boards behind them and the processes that use them.
 
-Read from sysfs and procfs; nothing is opened, so a running robot is not disturbed.
+The module reads sysfs and procfs and opens no port, so a running robot is not disturbed.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ BOARDS: dict[str, str] = {
     "0403:6015": "FTDI FT-X",
     "10c4:ea60": "Silicon Labs CP210x",
 }
-"""USB ids a robot's microcontroller is found behind; a test holds deploy/udev/70-acsar.rules to
-them."""
+"""USB ids of the interfaces behind which a robot's microcontroller is found. A test proves that
+deploy/udev/70-acsar.rules has the same ids.
+"""
 
 BY_ID = Path("/dev/serial/by-id")
 
@@ -34,18 +35,18 @@ class SerialDevice(Struct, frozen=True):
 
     device: str
     names: list[str]
-    """Stable names for it: by-id links and /dev/acsar."""
+    """Stable names of the port: by-id links and /dev/acsar."""
     driver: str
     usb_id: str
-    """`vid:pid` in hex, "" when it is not on USB."""
+    """`vid:pid` in hex; "" if the port is not on USB."""
     description: str
     board: str
-    """Which usual microcontroller board it looks like, "" for none."""
+    """Usual microcontroller board with this USB id; "" if none matches."""
     holders: list[Holder]
 
 
 def serial_devices() -> list[SerialDevice]:
-    """The serial ports that are plugged in; those without hardware behind them are left out."""
+    """Return the serial ports that are plugged in; ports without hardware are left out."""
     links = _links()
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: str(p.device)):

@@ -1,6 +1,7 @@
-"""Which process has a device open, as far as procfs lets us see; nothing is opened.
+"""Finds the processes that have a device open, as far as procfs shows them, and opens nothing.
 
-Only what lies in a /dev is looked at: a file on a network disk that hangs would hold us up.
+Only files below a /dev directory are examined: a file on a network disk that hangs would block this
+process.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from msgspec import Struct
 PROC = Path("/proc")
 
 PTY_MAJORS = range(136, 144)
-"""Device numbers of ptys, 256 each; a serial port has another."""
+"""Major device numbers of ptys, with 256 minor numbers each. Serial ports have others."""
 
 
 class Holder(Struct, frozen=True):
@@ -31,25 +32,29 @@ class _Open(Struct, frozen=True):
     fd: str
 
     def device(self) -> int:
-        """Its number."""
+        """Return the device number."""
         return os.stat(self.process / "fd" / self.fd).st_rdev
 
     def about(self) -> list[str]:
-        """What the kernel tells of the descriptor."""
+        """Return the kernel's information about the descriptor, as lines."""
         return (self.process / "fdinfo" / self.fd).read_text().splitlines()
 
 
 def holders(path: str) -> Iterator[Holder]:
-    """Who has this device open."""
+    """Yield the processes that have this device open."""
     for process in dict.fromkeys(one.process for one in _having_open(path)):
         try:
             yield _holder(process)
         except OSError:
-            continue  # it has ended
+            # The process has ended.
+            continue
 
 
 def holder_of(path: str) -> Holder | None:
-    """Who keeps us out of this device: who has locked it, else one that has it open."""
+    """Return the process that keeps this one out of a device.
+
+    It is the process with a lock on the device, else one that has it open, or None.
+    """
     found = None
     for one in _having_open(path):
         try:
@@ -58,12 +63,13 @@ def holder_of(path: str) -> Holder | None:
                 if any(line.startswith("lock:") for line in one.about()):
                     return found
         except OSError:
-            continue  # it has ended
+            # The process has ended.
+            continue
     return found
 
 
 def master_of(path: str) -> Holder | None:
-    """The process at the other end of a pty; None for a real device."""
+    """Return the process at the other end of a pty; None for a real device."""
     wanted = _number(path)
     if os.major(wanted) not in PTY_MAJORS:
         return None
@@ -73,12 +79,13 @@ def master_of(path: str) -> Holder | None:
             if index in one.about():
                 return _holder(one.process)
         except OSError:
-            continue  # it has ended
+            # The process has ended.
+            continue
     return None
 
 
 def name_of(pid: int) -> str:
-    """The program that runs as this process; "" where none does, or may be seen."""
+    """Return the program's name of a process; "" if the process does not exist or is hidden."""
     try:
         return _name(PROC / str(pid))
     except OSError:
@@ -86,8 +93,10 @@ def name_of(pid: int) -> str:
 
 
 def waited_ns(pid: int) -> int:
-    """For how long the first thread of a process has waited for a processor since it started; 0
-    where the kernel does not tell."""
+    """Return how long the first thread of a process has waited for a processor since its start, ns.
+
+    Returns 0 if the kernel does not report it.
+    """
     try:
         return int((PROC / str(pid) / "schedstat").read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -95,13 +104,14 @@ def waited_ns(pid: int) -> int:
 
 
 def running(name: str) -> bool:
-    """A process of this name runs."""
+    """Return whether a process of this name runs."""
     for process in _processes():
         try:
             if _comm(process) == name[:15]:
                 return True
         except OSError:
-            continue  # it has ended
+            # The process has ended.
+            continue
     return False
 
 
@@ -110,17 +120,19 @@ def _processes() -> Iterator[Path]:
 
 
 def _open_devices(part: str) -> Iterator[_Open]:
-    """What every process has open below a /dev, with `part` in its path."""
+    """Yield the devices that any process has open below a /dev, with `part` in their path."""
     for process in _processes():
         try:
             numbers = os.listdir(process / "fd")
         except OSError:
-            continue  # it has ended, or is not ours to look at
+            # The process has ended, or belongs to another user.
+            continue
         for fd in numbers:
             try:
                 target = os.readlink(process / "fd" / fd)
             except OSError:
-                continue  # closed meanwhile
+                # The descriptor has been closed meanwhile.
+                continue
             if "/dev/" in target and part in target:
                 yield _Open(process, fd)
 
@@ -132,11 +144,12 @@ def _having_open(path: str) -> Iterator[_Open]:
             if one.device() == wanted:
                 yield one
         except OSError:
-            continue  # closed meanwhile
+            # The descriptor has been closed meanwhile.
+            continue
 
 
 def _number(path: str) -> int:
-    """The device's number; 0 for what is none."""
+    """Return the device number of a path; 0 if it is not a device."""
     try:
         return os.stat(path).st_rdev
     except OSError:
@@ -148,7 +161,7 @@ def _holder(process: Path) -> Holder:
 
 
 def _name(process: Path) -> str:
-    """The program's name; acsard's own also when Python runs it as a module or script."""
+    """Return the program's name; "acsard" also if Python runs it as a module or script."""
     words = (process / "cmdline").read_bytes().split(b"\0")
     if any(Path(os.fsdecode(word)).name == "acsard" for word in words[:4]):
         return "acsard"

@@ -1,7 +1,7 @@
-"""What the operating system can do for punctuality: asked for once, before any thread starts.
+"""Asks the operating system for punctual scheduling, once, before any thread starts.
 
-Only the control loop's own thread becomes real-time: what it starts (the bus's threads, children)
-does not inherit it, so that no flood on the bus competes with the loop.
+Only the control loop's own thread becomes real-time. The threads of the bus and child processes do
+not inherit it, so a flood on the bus does not compete with the loop.
 """
 
 from __future__ import annotations
@@ -12,21 +12,25 @@ import resource
 from pathlib import Path
 
 PRIORITY = 10
-"""Ahead of everything that is not real-time, behind the kernel's own interrupt threads (50)."""
+"""Real-time priority: above ordinary processes, below the kernel's interrupt threads (50)."""
 
 SPIN_S = 1
-"""How long the loop may run in one go before the kernel ends it: it is ahead of everything else
-on its core, and a step takes a thousandth of this."""
+"""Time that the loop may run without a pause before the kernel ends it, s. The loop has priority
+over everything else on its core, and a step takes a thousandth of this.
+"""
 
 DOZE = "/dev/cpu_dma_latency"
-"""The kernel's device for how long a processor may take to wake."""
+"""The kernel's device that limits how long a processor may take to wake."""
 
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
 
 def ask() -> str:
-    """Ask for all of it; what was refused and the mend, or ""."""
+    """Ask for real-time scheduling, locked memory and a processor that stays awake.
+
+    Returns a sentence about the refused requests, with the fix, or "".
+    """
     asked = {
         "real-time scheduling": _schedule(),
         "locked memory": _lock(),
@@ -43,8 +47,10 @@ def ask() -> str:
 
 
 def has(pid: int) -> bool | None:
-    """Whether the first thread of a process, a daemon's loop, is real-time; None where that cannot
-    be seen."""
+    """Return whether the first thread of a process, such as a daemon's loop, is real-time.
+
+    Returns None if that cannot be seen.
+    """
     try:
         policy = os.sched_getscheduler(pid)
     except OSError:
@@ -53,8 +59,11 @@ def has(pid: int) -> bool | None:
 
 
 def allowed() -> bool:
-    """Whether a daemon that we start would get it: by the capability, or by the limit; root
-    without the capability, as in a container, is held to the limit like anybody else."""
+    """Return whether a daemon started by this user would get real-time scheduling.
+
+    The capability or the limit grants it. Without the capability, as in a container, the limit also
+    applies to root.
+    """
     limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     return _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY or limit >= PRIORITY
 
@@ -66,7 +75,8 @@ def _capable(capability: int) -> bool:
 
 def _schedule() -> bool:
     if has(0):
-        return True  # as systemd started us
+        # systemd has started this process with it.
+        return True
     try:
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         resource.setrlimit(resource.RLIMIT_RTTIME, (SPIN_S * 1_000_000, SPIN_S * 1_000_000))
@@ -77,23 +87,29 @@ def _schedule() -> bool:
 
 
 def _stay_awake() -> bool:
-    """A processor that dozes between steps takes longer to wake, and finds its caches cold."""
+    """Keep the processor out of deep sleep.
+
+    A processor that sleeps between steps takes longer to wake, and finds its caches cold.
+    """
     try:
         wish = os.open(DOZE, os.O_WRONLY | os.O_CLOEXEC)
     except FileNotFoundError:
-        return True  # this kernel does not let anybody ask
+        # This kernel does not offer the device.
+        return True
     except OSError:
         return False
-    os.write(wish, bytes(4))  # 0 us, for as long as it is open: until we end
+    # The value is 0 us. It holds while the file is open, so until this process ends.
+    os.write(wish, bytes(4))
     return True
 
 
 def _lock() -> bool:
-    # Under a finite limit the call might succeed and a later allocation fail: all or nothing. Root
-    # without the capability, as in a container, is held to the limit like anybody else.
+    # Under a finite limit the call might succeed and a later allocation fail, so ask only if it is
+    # unlimited. Without the capability, as in a container, the limit also applies to root.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if not unlimited and not _capable(_CAP_IPC_LOCK):
         return False
-    # As pages are touched: to lock whole thread stacks and arenas would take ten times the memory.
+    # Lock pages when they are touched: locking whole thread stacks and arenas would take ten times
+    # the memory.
     flags = _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT
     return bool(ctypes.CDLL(None).mlockall(flags) == 0)

@@ -1,7 +1,7 @@
-"""acsard as a system service: its files, its commands, and which steps install or remove it.
+"""acsard as a system service: its files, its commands, and the steps that install or remove it.
 
-The files are those of `deploy/`, with the path of this installation in the unit. Nothing that
-somebody else wrote is overwritten or removed without force.
+The files are those of `deploy/`, with the path of this installation in the units. A file that
+somebody else has written is neither overwritten nor removed without force.
 """
 
 from __future__ import annotations
@@ -25,30 +25,31 @@ UNITS = Path("/etc/systemd/system")
 ETC = Path("/etc/acsard")
 LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
-"""Where `lan.conf` believes the certificates to be."""
+"""Directory in which `lan.conf` expects the certificates."""
 STATES = {
     UNIT: (Path("/var/lib/acsard"), "its recordings, and the stop that it keeps"),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
-"""Where units keep what they write, and what that is."""
+"""State directories of the units, each with a description of its content."""
 
 Found = Mapping[Path, bytes | None]
-"""What is there now in the place of each file."""
+"""Present content of each file's path; None if it does not exist."""
 
 ASK_S = 10.0
-"""systemd answers at once, or hangs."""
+"""Time limit for a call of systemd, s: it answers at once, or it hangs."""
 
 RELOAD = (
     Run(("systemctl", "daemon-reload")),
     Run(("udevadm", "control", "--reload"), may_fail=True),
 )
 AGAIN = ("tty", "usb-serial", "misc")
-"""Subsystems with devices that the rules are about: they are looked at again."""
+"""Subsystems of the devices that the udev rules cover; udev applies the rules to them again."""
 
 INSTALLED = (
     *RELOAD,
     Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
-    # First by itself, whatever becomes of it: the page's unit mounts the directory it is given.
+    # Start the daemon first, and ignore a failure: the page's unit mounts the directory that
+    # systemd creates for the daemon.
     Run(("systemctl", "start", UNIT), may_fail=True),
     Run(("systemctl", "enable", "--now", *ALL)),
 )
@@ -56,7 +57,7 @@ GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))
 
 
 def files() -> list[File]:
-    """Every file of the service, as this installation writes it."""
+    """Return every file of the service, as this installation writes it."""
     reference = _reference().read_text(encoding="utf-8")
     return [
         *(_unit(name) for name in ALL),
@@ -79,15 +80,16 @@ def _unit(name: str) -> File:
 
 
 def lan_drop_in(unit: str) -> File:
-    """What lets a unit onto the local network and gives it its certificates."""
+    """Return the drop-in that gives a unit access to the local network and to the certificates."""
     return File(UNITS / f"{unit}.d" / LAN, (source() / "systemd" / LAN).read_bytes())
 
 
 def admitting(directory: Path) -> Write | Keep | None:
-    """What opens the installed service's door with these certificates; None without a service.
+    """Return the step that gives the TLS gateway of the service these certificates, or None.
 
-    The unit itself sees loopback only, and none of root's files. A drop-in that is there keeps its
-    networks, which somebody may have narrowed.
+    None means that the service is not installed, or the user is not root. The unit itself may use
+    loopback only and reads none of root's files. A drop-in that exists keeps its networks, which an
+    administrator may have narrowed.
     """
     if os.geteuid() != 0 or not (UNITS / DOOR).exists():
         return None
@@ -96,7 +98,10 @@ def admitting(directory: Path) -> Write | Keep | None:
 
 
 def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
-    """The drop-in, as it is `found` or else as it comes, with the certificates of `directory`."""
+    """Return the step that puts the certificates of `directory` into the drop-in.
+
+    `found` is the drop-in's present content, or None; then the delivered content is the base.
+    """
     place = str(directory).encode()
     text = re.sub(
         rb"(?m)^(LoadCredential=[\w.-]+:).*/",
@@ -109,12 +114,12 @@ def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
 
 
 def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
-    """What is there now in the place of these files."""
+    """Return the present content of each file's path."""
     return {file.path: file.found() for file in wanted}
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """The steps to the service; raises `ExitError` when they would overwrite somebody's work."""
+    """Return the installation steps; raise `ExitError` if they would overwrite a changed file."""
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
@@ -132,12 +137,12 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
 
 
 def own_places() -> list[Path]:
-    """Directories that may hold more of the service than was installed."""
+    """Return the directories that may hold files of the service that were not installed."""
     return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
 
 
 def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
-    """What else is in these places: certificates, drop-ins of somebody's own."""
+    """Return the other files in these places, such as certificates and further drop-ins."""
     ours = {file.path for file in files}
     inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
     return [path for path in inside if path not in ours]
@@ -152,10 +157,10 @@ def uninstalling(
     purge: bool = False,
     stateful: Iterable[str] = (),
 ) -> list[Step]:
-    """The steps that undo it, and what stays with the reason.
+    """Return the steps that remove the service, with a reason for each file that stays.
 
-    What somebody has changed stays unless forced; a `kept` file, `others` and the `STATES` of the
-    `stateful` units unless purged.
+    A changed file stays unless `force` or `purge` is set; for a `kept` file only `purge` counts.
+    `others` and the `STATES` of the `stateful` units stay unless `purge` is set.
     """
     there = [file for file in wanted if found[file.path] is not None]
     why: dict[Path, str] = {}
@@ -167,7 +172,7 @@ def uninstalling(
         elif not force:
             why[file.path] = "somebody has changed it; --force removes it"
     if any(path.name == UNIT for path in why):
-        # A unit that is started again must find what sends zeros after it.
+        # A unit that may start again needs the program that sends zeros after it.
         why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
     steps: list[Step] = [
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
@@ -177,7 +182,7 @@ def uninstalling(
         steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
         where, what = STATES[unit]
-        # systemd knows where it truly is; it must still know the unit.
+        # systemd knows the real place of the state directory, as long as it knows the unit.
         clean = Run(("systemctl", "clean", "--what=state", unit))
         steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
     units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]
@@ -186,7 +191,7 @@ def uninstalling(
 
 
 def state(unit: str) -> str:
-    """What systemd says of a unit, "" where it does not answer."""
+    """Return systemd's report about a unit; "" if systemd does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
         done = called(("systemctl", "show", unit, about), ASK_S)
@@ -196,7 +201,7 @@ def state(unit: str) -> str:
 
 
 def source() -> Path:
-    """The files of `deploy/`: inside the package, or beside it in a clone."""
+    """Return the directory `deploy/`, which is inside the package or beside it in a clone."""
     package = Path(acsard.__file__).parent
     inside = package / "deploy"
     if inside.is_dir():
@@ -208,6 +213,6 @@ def source() -> Path:
 
 
 def _reference() -> Path:
-    """The reference configuration, which lies beside `deploy/` in a clone."""
+    """Return the reference configuration, which is beside `deploy/` in a clone."""
     inside = source() / "acsard.toml"
     return inside if inside.is_file() else source().parent / "acsard.toml"

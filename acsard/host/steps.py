@@ -1,4 +1,4 @@
-"""What is done to a machine, step by step, as values: a person reads one, then it is done."""
+"""Changes of a machine as values: the user reads the steps before they are carried out."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d", "acsard-we
 """Directories that are removed with the last file in them."""
 
 RUN_S = 60.0
-"""A command that takes longer has hung."""
+"""Time limit of a command, s. A command that takes longer has hung."""
 
 
 class File(Struct, frozen=True):
@@ -25,10 +25,10 @@ class File(Struct, frozen=True):
     content: bytes
     mode: int = 0o644
     kept: bool = False
-    """The user's to change: never replaced, removed only while it is as it was written."""
+    """True for a file that the user may change. It is not replaced, nor removed if changed."""
 
     def found(self) -> bytes | None:
-        """What is there now, None for nothing."""
+        """Return the present content of the path, or None if the file does not exist."""
         try:
             return self.path.read_bytes()
         except FileNotFoundError:
@@ -37,7 +37,7 @@ class File(Struct, frozen=True):
             raise _unreadable(self.path, error) from None
 
     def condition(self) -> str:
-        """How it is, in a word or two."""
+        """Return the file's condition in a word or two."""
         try:
             found = self.found()
         except MendableError:
@@ -48,7 +48,7 @@ class File(Struct, frozen=True):
 
 
 class Write(Struct, frozen=True):
-    """A file is made, or made anew."""
+    """Step that writes a file."""
 
     file: File
 
@@ -58,19 +58,20 @@ class Write(Struct, frozen=True):
         )
 
     def do(self) -> None:
-        """With directories that the service's own user can enter whatever the umask."""
+        """Write the file. New directories are open to the service's user, whatever the umask."""
         path = self.file.path
         made = [place for place in path.parents if not place.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         for place in made:
             place.chmod(0o755)
-        path.unlink(missing_ok=True)  # a link is replaced, not written through
+        # A link is replaced, not written through.
+        path.unlink(missing_ok=True)
         path.write_bytes(self.file.content)
         path.chmod(self.file.mode)
 
 
 class Remove(Struct, frozen=True):
-    """A file is removed, and the directories made for it as far as they are empty."""
+    """Step that removes a file, and the directories made for it if they are empty."""
 
     path: Path
 
@@ -78,24 +79,25 @@ class Remove(Struct, frozen=True):
         return f"remove  {self.path}"
 
     def do(self) -> None:
-        """Remove it."""
+        """Remove the file."""
         self.path.unlink()
         self.tidy(self.path)
 
     @staticmethod
     def tidy(path: Path) -> None:
-        """Remove the directories of ours that nothing is left in."""
+        """Remove acsard's own directories that have become empty."""
         for place in path.parents:
             if place.name not in OURS:
                 return
             try:
                 place.rmdir()
             except OSError:
-                return  # something else lives there
+                # The directory holds something else.
+                return
 
 
 class RemoveAll(Struct, frozen=True):
-    """A file or a whole directory is removed, whatever is in it."""
+    """Step that removes a file, or a directory with everything in it."""
 
     path: Path
 
@@ -103,7 +105,7 @@ class RemoveAll(Struct, frozen=True):
         return f"remove  {self.path}" + ("/ and all in it" if self.path.is_dir() else "")
 
     def do(self) -> None:
-        """Remove it."""
+        """Remove the file or the directory."""
         if self.path.is_dir() and not self.path.is_symlink():
             shutil.rmtree(self.path)
             Remove.tidy(self.path)
@@ -112,7 +114,7 @@ class RemoveAll(Struct, frozen=True):
 
 
 class Keep(Struct, frozen=True):
-    """A file stays as it is."""
+    """Step that leaves a file as it is, with the reason."""
 
     path: Path
     why: str = ""
@@ -121,21 +123,23 @@ class Keep(Struct, frozen=True):
         return f"keep    {self.path}" + (f"  ({self.why})" if self.why else "")
 
     def do(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class Run(Struct, frozen=True):
-    """A command is run."""
+    """Step that runs a command."""
 
     words: tuple[str, ...]
     may_fail: bool = False
-    """A machine without udev, or a unit that never failed, is no reason to stop halfway."""
+    """True if a failure must not end the installation: the machine may have no udev, or a unit
+    that never failed cannot be reset.
+    """
 
     def __str__(self) -> str:
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        """Raises `ExitError` with what it says unless it may fail."""
+        """Run the command; raise `ExitError` with its error output, unless it may fail."""
         try:
             done = called(self.words, RUN_S)
             failed = done.stderr.strip() if done.returncode else ""
@@ -155,5 +159,5 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
 
 
 def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    """A command that has ended; raises `OSError` or `subprocess.TimeoutExpired`."""
+    """Run a command to its end; raise `OSError` or `subprocess.TimeoutExpired`."""
     return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

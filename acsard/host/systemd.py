@@ -1,8 +1,8 @@
-"""What the service manager is told: ready, alive, how it goes, going down.
+"""Notifies the service manager: ready, alive, status and stopping.
 
-Without one (`$NOTIFY_SOCKET` unset) nothing is sent. The protocol is sd_notify's: a datagram of
-`NAME=value` lines. `WATCHDOG=1` comes from the control step itself: a loop that stands still is
-silent, and systemd ends it.
+Without a service manager (`$NOTIFY_SOCKET` unset) nothing is sent. The protocol is that of
+sd_notify: a datagram with `NAME=value` lines. The control step itself sends `WATCHDOG=1`, so a loop
+that stands still is silent, and systemd ends it.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from collections.abc import Mapping
 from acsard.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
-"""How often the watchdog is fed within its time; it is no timer of a late loop's leisure."""
+"""Number of times that the watchdog is fed within its timeout. No separate timer feeds it,
+because that would hide a loop that is late.
+"""
 
 STATUS_PERIOD_NS = NS_PER_S
 
 PATIENCE_S = 30
-"""By how much a start that waits for something asks systemd to wait with it."""
+"""Time by which a waiting start asks systemd to extend its timeout, s."""
 
 
 class Systemd:
-    """The service manager of this process, if there is one."""
+    """Connection to the service manager of this process, if there is one."""
 
     def __init__(self, environ: Mapping[str, str], pid: int) -> None:
         self._socket: socket.socket | None = None
@@ -48,23 +50,23 @@ class Systemd:
 
     @property
     def present(self) -> bool:
-        """Somebody listens."""
+        """True if a service manager is connected."""
         return self._socket is not None
 
     def ready(self) -> None:
-        """The start is over."""
+        """Report that the start is complete."""
         self._send("READY=1")
 
     def stopping(self) -> None:
-        """The way down has begun: the watchdog need not be fed any more."""
+        """Report that the daemon is ending, so that the watchdog need not be fed any more."""
         self._send("STOPPING=1\nSTATUS=ramping to zero")
 
     def waiting(self, why: str) -> None:
-        """The start waits for something; called again before `PATIENCE_S` is over."""
+        """Report that the start waits for something; call it again within `PATIENCE_S`."""
         self._send(f"EXTEND_TIMEOUT_USEC={PATIENCE_S * 1_000_000}\nSTATUS={why}")
 
     def status(self, text: str) -> None:
-        """How it goes, for `systemctl status`."""
+        """Report the status for `systemctl status`."""
         self._send(f"STATUS={text}")
 
     def alive(self) -> None:
@@ -72,7 +74,7 @@ class Systemd:
         self._send("WATCHDOG=1")
 
     def step(self, outputs: Outputs) -> None:
-        """After each control step: alive, and how it goes when that has changed."""
+        """Feed the watchdog after a control step, and report the status if it has changed."""
         if self._socket is None:
             return
         now_ns = outputs.now.mono_ns
@@ -86,7 +88,7 @@ class Systemd:
                 self._status = status
 
     def close(self) -> None:
-        """Nothing more to say."""
+        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -97,12 +99,13 @@ class Systemd:
         try:
             self._socket.send(text.encode())
         except OSError:
-            return False  # its queue is full or it is gone: the robot drives on
+            # The manager's queue is full, or it is gone. The robot drives on.
+            return False
         return True
 
 
 def status_of(outputs: Outputs) -> str:
-    """One line for `systemctl status`."""
+    """Return the status in one line, for `systemctl status`."""
     if outputs.mode == "driving":
         twist = outputs.applied
         turn = f", {twist.angular:.1f} rad/s" if abs(twist.angular) >= 0.05 else ""

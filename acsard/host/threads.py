@@ -1,7 +1,8 @@
-"""Blocking calls off the event loop, bounded in time.
+"""Runs blocking calls outside the event loop, with a time limit.
 
-Daemon threads of our own instead of the default executor: a call that never returns (a driver
-that hangs in close, a router that does not answer) must not keep the process from ending.
+The calls run in daemon threads of their own and not in the default executor. A call that never
+returns, such as a driver that hangs in close or a router that does not answer, must not keep the
+process from ending.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ T = TypeVar("T")
 
 
 class NoThreadError(TimeoutError):
-    """No thread was to be had: the call has not begun."""
+    """No thread could be started, so the call has not begun."""
 
 
 async def in_thread(
     call: Callable[[], T], timeout: float | None, late: Callable[[T], None] | None = None
 ) -> T:
-    """The result of `call`, or `TimeoutError` after `timeout` s (None: wait for ever), at once
-    `NoThreadError`.
+    """Return the result of `call`, or raise `TimeoutError` after `timeout` s (None: wait for ever).
 
-    `late` gets (in the thread) a result that nobody waits for any more, to give it back.
+    Raises `NoThreadError` at once if no thread can be started. If the caller no longer waits, the
+    thread passes the result to `late`, which gives it back.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -58,7 +59,7 @@ async def in_thread(
     except RuntimeError as error:
         raise NoThreadError(f"this process has no room for another thread ({error})") from None
     try:
-        # Not wait_for: before Python 3.12 it swallows a cancel that meets the result.
+        # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):
             return await future
     finally:

@@ -1,7 +1,7 @@
-"""A kernel timer the event loop can wait on, precise where asyncio's own rounds to milliseconds.
+"""A kernel timer for the event loop, more precise than asyncio's timers.
 
-asyncio on epoll rounds every wait up; a timerfd wakes it on time and counts what was missed.
-Python has the calls from 3.13 on; the C library's serve every version.
+On epoll asyncio rounds every wait up to milliseconds. A timerfd wakes the loop on time and counts
+missed expirations. Python has these calls from 3.13 on; the C library's work with every version.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class _Itimerspec(ctypes.Structure):
 class TimerFd:
     """One timer; `fileno` becomes readable when it expires.
 
-    The kernel has none on the clock we read: what is set is how long to wait from now.
+    The kernel does not offer a timerfd on CLOCK_MONOTONIC_RAW, so `set` passes the remaining time.
     """
 
     def __init__(self) -> None:
@@ -43,11 +43,11 @@ class TimerFd:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return int(self._fd)
 
     def set(self, at_ns: int) -> None:
-        """Expire at monotonic `at_ns`, once."""
+        """Expire once at the monotonic time `at_ns`."""
         wait_ns = max(1, at_ns - clock.mono_ns())
         value = self._spec.it_value
         value.tv_sec, value.tv_nsec = divmod(wait_ns, NS_PER_S)
@@ -55,7 +55,7 @@ class TimerFd:
             raise OSError(ctypes.get_errno(), "timerfd_settime failed")
 
     def expirations(self) -> int:
-        """How often it expired since the last call; 0 when it has not."""
+        """Return the number of expirations since the last call."""
         try:
             return int.from_bytes(os.read(self._fd, 8), sys.byteorder)
         except OSError as error:
@@ -64,5 +64,5 @@ class TimerFd:
             raise
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the descriptor."""
         os.close(self._fd)

@@ -1,1 +1,1 @@
-"""Shell: `acsard lan`: an authority of your own, and the certificates it gives."""
+"""`acsard lan`: a certificate authority of the user's own, and the certificates that it issues."""

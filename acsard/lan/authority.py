@@ -1,6 +1,6 @@
-"""Certificates and their authority, as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
+"""Certificates and their authority as files: `ca.pem`, `certificate.pem`, `key.pem`, `ca-key.pem`.
 
-P-256 keys; keys are written readable by their owner only.
+The keys are P-256 keys, in files that only their owner can read.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from acsard.bus.certificates import CA, CERTIFICATE, KEY
 from acsard.lan.identities import CA_KEY
 
 SLACK = timedelta(hours=1)
-"""Certificates count from a little before now: robots' clocks are not all right at the start."""
+"""Time by which a certificate is valid before its creation, because a robot's clock may be slow
+when the robot starts.
+"""
 
 
 class Authority:
-    """Signs certificates."""
+    """Certificate authority that signs certificates."""
 
     def __init__(self, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
         self._certificate, self._key = certificate, key
 
     @classmethod
     def make(cls, directory: Path, name: str, days: int) -> Authority:
-        """A new one, valid five times as long as what it signs, written to `directory`."""
+        """Create an authority in `directory`, valid five times as long as its certificates."""
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name[:64])])
@@ -47,21 +49,25 @@ class Authority:
 
     @classmethod
     def load(cls, directory: Path, password: Callable[[], str]) -> Authority:
-        """The one in `directory`; raises `OSError` or `ValueError`.
+        """Load the authority from `directory`.
 
-        `password` is asked for that of a key that is encrypted.
+        Raises `OSError` or `ValueError` if that is impossible. `password` is called for the
+        password if the key is encrypted.
         """
         data = (directory / CA_KEY).read_bytes()
         try:
             key = serialization.load_pem_private_key(data, None)
-        except TypeError:  # it is encrypted
+        # The key is encrypted.
+        except TypeError:
             key = serialization.load_pem_private_key(data, password().encode())
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise ValueError(f"{CA_KEY} is not a P-256 key")
         return cls(x509.load_pem_x509_certificate((directory / CA).read_bytes()), key)
 
     def names_in(self, directory: Path) -> list[str]:
-        """The host names and IP addresses of the certificate in `directory`; none without one."""
+        """Return the host names and IP addresses in the certificate of `directory`, if it
+        exists.
+        """
         try:
             found = x509.load_pem_x509_certificate((directory / CERTIFICATE).read_bytes())
             names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -71,9 +77,10 @@ class Authority:
         return [*names.get_values_for_type(x509.DNSName), *map(str, addresses)]
 
     def issue(self, directory: Path, name: str, addresses: list[str], days: float) -> None:
-        """A certificate for both ends of a link, with its key and ours, written to `directory`.
+        """Write a certificate for server and client use, its key and the authority's certificate.
 
-        `addresses` are the host names and IP addresses it is reached by.
+        `addresses` are the host names and IP addresses under which its holder is reached, and
+        `days` is how long it is valid.
         """
         directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
@@ -149,7 +156,7 @@ def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _write(path: Path, data: bytes, mode: int) -> None:
-    """A new file that was never readable by more than `mode` lets."""
+    """Write a new file that is never readable beyond `mode`."""
     path.unlink(missing_ok=True)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
         file.write(data)

@@ -1,7 +1,7 @@
-"""Who has which certificate: a directory with the robot's own, the authority, and all clients'.
+"""The directory of certificates: the robot's own, the authority, and those of all clients.
 
-The robot lets in who has a certificate of its authority, and the common name in it decides what
-they may do (`[access]`).
+The robot admits clients with a certificate of its authority. The common name in the certificate
+decides on their permissions (`[access]`).
 """
 
 from __future__ import annotations
@@ -27,15 +27,18 @@ if TYPE_CHECKING:
 
 PORT = 7449
 CA_KEY = "ca-key.pem"
-"""The authority's, which no client has."""
+"""Key of the authority. Clients do not get it."""
 
 
 ADDRESS = re.compile(r"[A-Za-z0-9:]([A-Za-z0-9.:-]{0,251}[A-Za-z0-9:])?\Z")
-"""A host name or IP address."""
+"""Matches a host name or an IP address."""
 
 
 def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -> list[str]:
-    """Make an authority, the robot's certificate and one for each role; the robot's names."""
+    """Create an authority, the robot's certificate and one for each role.
+
+    Returns the robot's names.
+    """
     if (directory / CA).exists() and not force:
         raise ExitError(
             Exit.FAILURE,
@@ -53,7 +56,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
 
 
 def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path:
-    """Make one more client's certificate; where it is."""
+    """Create one more client certificate, and return its directory."""
     authority = _load(directory)
     place = directory / "clients" / name
     if place.exists():
@@ -64,7 +67,10 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
 
 
 def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
-    """Replace the robot's own certificate; the names and addresses it has, the old ones too."""
+    """Replace the robot's own certificate.
+
+    Returns its names and addresses, with those of the old one.
+    """
     authority = _load(directory)
     names = [*_robot_names(authority.names_in(directory)), *addresses]
     authority.issue(directory, "robot", names, days)
@@ -72,14 +78,14 @@ def renew(directory: Path, addresses: Sequence[str], days: int) -> list[str]:
 
 
 def _robot_names(more: Sequence[str]) -> list[str]:
-    """What the robot is reached by: from elsewhere, by mDNS, on itself, by its addresses now."""
+    """Return the robot's names: for DNS, mDNS and itself, its present addresses, `more`."""
     host = socket.gethostname()
     names = [host, f"{host}.local", "localhost", "127.0.0.1", *own_addresses(), *more]
     return list(dict.fromkeys(names))
 
 
 def keys(config: Config, directory: Path) -> dict[str, object]:
-    """The keys by which the bus leaves the machine; where it does so already, it stays there."""
+    """Return the settings that open the bus to the network. Existing TLS endpoints stay."""
     listen = list(config.bus.listen)
     if not any(endpoint.startswith("tls/") for endpoint in listen):
         listen.append(f"tls/0.0.0.0:{PORT}")
@@ -97,7 +103,7 @@ def _maker() -> type[Authority]:
 
 
 def _load(directory: Path) -> Authority:
-    """The authority there, once we know that we may write beside it."""
+    """Load the authority from `directory`, after a check that certificates can be written there."""
     maker = _maker()
     _writable(directory)
     try:
@@ -111,7 +117,7 @@ def _load(directory: Path) -> Authority:
 
 
 def _password() -> str:
-    """Of an authority's key that somebody has encrypted."""
+    """Ask for the password of an encrypted authority key."""
     if not sys.stdin.isatty():
         raise ExitError(
             Exit.USAGE,
@@ -121,7 +127,10 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    """We may make it, or write to it; nothing is made yet."""
+    """Raise `ExitError` unless the directory can be created or written to.
+
+    Nothing is created yet.
+    """
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
         raise ExitError(Exit.FAILURE, f"{there} is not a directory; use --directory")

@@ -1,1 +1,1 @@
-"""What goes over the bus, pure: structs, the topic table, encodings, and both directions."""
+"""Messages on the bus, pure: structs, the topic table, encodings, reports and signatures."""

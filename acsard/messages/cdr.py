@@ -1,8 +1,9 @@
-"""Struct <-> CDR, the encoding of ROS 2: derived from any msgspec struct, knows nothing of robots.
+"""Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
 
-Plain CDR (XCDR1) behind its 4-byte header, aligned from the byte after it, little endian; both
-byte orders are read. Each struct (`cdr_types.py`) is compiled once: runs of numbers are packed in
-one call, so that a message costs a few steps and not one a field.
+The codec is derived from the struct type and knows nothing about robots. It writes plain CDR
+(XCDR1), little endian, behind the 4-byte encapsulation header; alignment counts from the byte after
+the header. It reads both byte orders. Each struct type (`cdr_types.py`) is compiled once, and
+neighbouring numbers are packed in one call, so a message costs a few calls and not one per field.
 """
 
 from __future__ import annotations
@@ -30,33 +31,39 @@ from acsard.values import AcsardError
 T = TypeVar("T")
 
 HEADER = b"\x00\x01\x00\x00"
-"""Encapsulation of plain CDR, little endian."""
+"""Encapsulation header of plain CDR, little endian."""
 
 _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
 class CdrError(AcsardError):
-    """Bytes that are not the message they should be."""
+    """Bytes that are not a valid message of the expected type."""
 
 
 class Cdr(Generic[T]):
-    """Encodes and decodes one struct type; raises `TypeError` for a type CDR cannot tell."""
+    """Codec of one struct type. Raises `TypeError` for a type that CDR cannot represent."""
 
     def __init__(self, cls: type[T]) -> None:
-        of_type: Any = cls  # to be hashed, which a type variable may not be
+        # A cache key must be hashable, and mypy does not know that of a type variable.
+        of_type: Any = cls
         self._parts, self._build = _compiled(of_type)
 
     def encode(self, message: T) -> bytes:
-        """The message with its header, little endian, without trailing padding."""
+        """Encode the message with its header, little endian, without trailing padding."""
         out = bytearray(HEADER)
         for part in self._parts:
             part.write(out, message)
         if not self._parts:
-            out.append(0)  # a struct without fields has one byte all the same
+            # In CDR a struct without fields takes one byte.
+            out.append(0)
         return bytes(out)
 
     def decode(self, payload: bytes) -> T:
-        """The message; surplus bytes are padding. Raises `CdrError` and nothing else."""
+        """Decode a message.
+
+        Raises `CdrError`, and no other exception, if the payload is not valid. Bytes after the
+        message are ignored as padding.
+        """
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
             raise CdrError(f"needs the header of plain CDR, has {payload[:4].hex(' ')}")
@@ -68,7 +75,10 @@ class Cdr(Generic[T]):
 
 
 class _Source:
-    """Bytes being read, aligned from the end of the header; never beyond their end."""
+    """Reader of a payload.
+
+    It aligns from the end of the header and never reads beyond the payload.
+    """
 
     def __init__(self, data: bytes, order: str) -> None:
         self.data, self.order = data, order
@@ -81,7 +91,7 @@ class _Source:
 
     def take_many(self, code: str, count: int) -> list[Any]:
         self.at += -(self.at - len(HEADER)) % SIZES[code]
-        # Not a layout to be kept: a stranger may send every length there is.
+        # Do not cache this layout: a stranger may send sequences of every length.
         values = self._unpack(struct.Struct(f"{self.order}{count}{code.replace('?', 'B')}"))
         return [_whole(code, value) for value in values] if code == "?" else list(values)
 
@@ -92,7 +102,7 @@ class _Source:
         return layout.unpack_from(self.data, start)
 
     def count(self, least: int) -> int:
-        """The length of a sequence whose items take at least so many bytes each."""
+        """Read the length of a sequence whose items take at least `least` bytes each."""
         (count,) = self.take("I")
         if count * least > len(self.data) - self.at:
             raise CdrError(f"a length of {count} in {len(self.data)} bytes")
@@ -102,7 +112,8 @@ class _Source:
         count = self.count(1)
         raw = self.data[self.at : self.at + count]
         self.at += count
-        if raw[-1:] not in (b"\0", b""):  # some writers give an empty string no byte at all
+        # Some writers encode an empty string without any byte, not even the final zero.
+        if raw[-1:] not in (b"\0", b""):
             raise CdrError("a string without its end")
         try:
             return raw[:-1].decode()
@@ -118,7 +129,7 @@ def _whole(code: str, value: Any) -> Any:
 
 @cache
 def _layout(order: str, codes: str, start: int) -> struct.Struct:
-    """These numbers from `start` (mod 8) on, each aligned to its size."""
+    """Return the layout of numbers that begin at `start` (mod 8), each aligned to its size."""
     text, at = order, start
     for code in codes:
         pad = -at % SIZES[code]
@@ -128,7 +139,7 @@ def _layout(order: str, codes: str, start: int) -> struct.Struct:
 
 
 def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
-    """What writes these numbers, for each start (mod 8)."""
+    """Return the function that packs these numbers, for each start from 0 to 7 (mod 8)."""
     return tuple(_layout("<", codes, start).pack for start in range(8))
 
 
@@ -137,7 +148,10 @@ _put_count = _packs("I")
 
 @lru_cache(256)
 def _text_bytes(text: str) -> bytes:
-    """A string from its length on; kept, because a robot says the same few again and again."""
+    """Encode a string with its length.
+
+    Results are cached, because a robot repeats the same few strings.
+    """
     raw = text.encode() + b"\0"
     return struct.pack("<I", len(raw)) + raw
 
@@ -151,7 +165,7 @@ Get = Callable[[Any], Any]
 
 
 class _Numbers:
-    """Neighbouring numbers, wherever in nested structs they live."""
+    """Neighbouring numbers of a message, which may belong to different nested structs."""
 
     def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
         self._codes = "".join(number_code(kind) for _, kind in run)
@@ -173,7 +187,7 @@ class _Numbers:
 
 
 class _Text:
-    """A string."""
+    """A string of a message."""
 
     def __init__(self, get: Get) -> None:
         self._get = get
@@ -186,7 +200,7 @@ class _Text:
 
 
 class _List:
-    """Many of one kind: a sequence of at most `most`, or an array of just as many."""
+    """Items of one type: a sequence of at most `most` items, or an array of exactly `most`."""
 
     def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
         self._get, self._most = get, most
@@ -213,7 +227,8 @@ class _List:
             out += self._packs[start](*items)
             return
         if self._code:
-            if items:  # no padding in front of nothing
+            # An empty sequence has no padding after its length.
+            if items:
                 out += bytes(-(len(out) - len(HEADER)) % SIZES[self._code])
                 out += struct.pack(f"<{len(items)}{self._code}", *items)
             return
@@ -249,7 +264,7 @@ _Part = _Numbers | _Text | _List
 
 @cache
 def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
-    """The parts of a struct in order, and what makes one of the values read from them."""
+    """Return the parts of a struct type in order, and the function that builds an instance."""
     info = struct_info(cls)
     parts: list[_Part] = []
     run: list[tuple[str, inspect.Type]] = []

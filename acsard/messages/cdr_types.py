@@ -1,7 +1,7 @@
-"""What CDR has to know of a struct type: its leaves in order, and how to build one of them.
+"""The part of a struct type that CDR needs: its leaf fields in order, and how to build an instance.
 
-`float` is float64; an `int` says its width by `Meta(extra={"cdr": code})` with a code of the
-struct module (`B i I q Q`); a list whose `Meta` fixes its length is an array.
+A `float` is a float64. An `int` declares its width by `Meta(extra={"cdr": code})` with a code of
+the struct module (`B i I q Q`). A list whose `Meta` fixes its length is an array.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from typing import Any
 from msgspec import inspect
 
 SIZES = {"d": 8, "q": 8, "Q": 8, "i": 4, "I": 4, "B": 1, "?": 1}
-"""Bytes of a number by its code; each is aligned to as many."""
+"""Size of a number in bytes by its code; a number is aligned to its own size."""
 
 Build = Callable[[Iterator[object]], object]
 Limit = tuple[float, float]
 
 
 def struct_info(cls: Any) -> inspect.StructType:
-    """The fields of a struct type; raises `TypeError` for anything else."""
+    """Return the type information of a struct type; raise `TypeError` for any other type."""
     info = inspect.type_info(cls)
     if not isinstance(info, inspect.StructType):
         raise TypeError(f"{cls} is no struct")
@@ -27,7 +27,7 @@ def struct_info(cls: Any) -> inspect.StructType:
 
 
 def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, inspect.Type]]:
-    """The dotted path and type of every field that is no struct itself, nested ones included."""
+    """Yield the dotted path and the type of every field, with the fields of nested structs."""
     for field in info.fields:
         kind = plain(field.type)
         if isinstance(kind, inspect.StructType):
@@ -37,19 +37,19 @@ def leaves(info: inspect.StructType, path: str = "") -> Iterator[tuple[str, insp
 
 
 def builder(info: inspect.StructType) -> Build:
-    """Makes a struct of the values of its leaves."""
+    """Return a function that builds a struct from an iterator over the values of its leaves."""
     kinds = [plain(field.type) for field in info.fields]
     children = [builder(kind) if isinstance(kind, inspect.StructType) else next for kind in kinds]
     return lambda values: info.cls(*[child(values) for child in children])
 
 
 def plain(kind: inspect.Type) -> inspect.Type:
-    """The type below its metadata."""
+    """Return the type without its metadata."""
     return kind.type if isinstance(kind, inspect.Metadata) else kind
 
 
 def number_code(kind: inspect.Type) -> str:
-    """The struct code of a number, "" for anything else."""
+    """Return the struct code of a number, or "" for any other type."""
     match plain(kind):
         case inspect.FloatType():
             return "d"
@@ -64,7 +64,7 @@ def number_code(kind: inspect.Type) -> str:
 
 
 def limit(kind: inspect.Type) -> Limit | None:
-    """The least and greatest value of an int that has bounds of its own."""
+    """Return the least and the greatest value of an int that has bounds, or None."""
     number = plain(kind)
     if not isinstance(number, inspect.IntType):
         return None

@@ -1,7 +1,9 @@
-"""Covariances of the plane -> the 6x6 that ROS messages have, row major: x y z, roll pitch yaw.
+"""Converts planar covariances to the 6x6 matrices of ROS messages.
 
-Wheels cannot measure z, roll and pitch: they get what is configured, in a range that RViz draws and
-a filter can invert. With `odometry.covariance = "constant"` both are the configured diagonals.
+A matrix is row major with the axes x, y, z, roll, pitch, yaw. Wheels cannot measure z, roll and
+pitch, so these axes get the configured variances, clamped to a range that RViz can draw and a
+filter can invert. With `odometry.covariance = "constant"` both matrices are the configured
+diagonals.
 """
 
 from __future__ import annotations
@@ -10,14 +12,14 @@ from acsard.config.settings import Diagonal, OdometryConfig
 from acsard.values import PoseCovariance, TwistVariances
 
 SMALLEST, LARGEST = 1e-6, 1e6
-"""Of the axes that are not measured."""
+"""Smallest and largest variance of an axis that is not measured."""
 
 UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
 """Covariance of a twist that is not measured at all."""
 
 
 class Covariances:
-    """Fills the matrices of nav_msgs/Odometry."""
+    """Builder of the covariance matrices of nav_msgs/Odometry."""
 
     def __init__(self, odometry: OdometryConfig) -> None:
         self._constant = odometry.covariance == "constant"
@@ -27,7 +29,10 @@ class Covariances:
         self._unmeasured_rates = _bounded(self._twist)
 
     def of_pose(self, p: PoseCovariance) -> list[float]:
-        """Of the pose in the odom frame, with the axes of odom at the robot."""
+        """Return the covariance of the pose in the odom frame.
+
+        The rotations are about the axes of odom, through the robot's position.
+        """
         if self._constant:
             return _diagonal(*self._pose)
         z, roll, pitch = self._unmeasured
@@ -43,7 +48,7 @@ class Covariances:
         # fmt: on
 
     def of_twist(self, v: TwistVariances) -> list[float]:
-        """Of the twist in the base frame."""
+        """Return the covariance of the twist in the base frame."""
         if self._constant:
             return _diagonal(*self._twist)
         return _diagonal(v.linear, v.lateral, *self._unmeasured_rates, v.angular)

@@ -1,8 +1,8 @@
-"""`Outputs` and `Snapshot` -> the rows of `diagnostics`, as rqt_robot_monitor shows them.
+"""Converts `Outputs` and `Snapshot` to the rows of `diagnostics`, as rqt_robot_monitor shows them.
 
-A row is there from the first message to the last or never: the monitor keeps what it has once
-seen, and calls it stale when it stays away. OK is a robot that needs nobody; WARN is what a person
-should know of; ERROR is what keeps it from driving.
+A row is in every message of a run or in none. The monitor keeps a row that it has once received,
+and shows it as stale when it stays away. Level OK means that the robot needs no attention. WARN
+means that a person should know about it. ERROR means that it keeps the robot from driving.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from acsard.values import (
 OK, WARN, ERROR = 0, 1, 2
 
 OF_MODE = {"stopped": WARN, "fault": ERROR}
-"""What latches waits for a person."""
+"""Levels of the modes that wait until a person clears a latch."""
 
 REFUSED_S = 2.0
-"""s that a refusal is shown: two of the messages, at their rate by default."""
+"""Time for which a refusal is shown, s: two messages at the default rate."""
 
 MISSED_SHARE = 0.01
-"""Of the last minute's periods; more are a warning."""
+"""Share of the last minute's periods above which missed periods are a warning."""
 
 NO_ROUTER, NOT_YET = "a peer, no router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
-    """One status, before it has the robot's name."""
+    """A diagnostic status, before the robot's name is added."""
 
     name: str
     level: int
@@ -54,7 +54,11 @@ class Row(Struct, frozen=True):
 def diagnostics(
     config: Config, outputs: Outputs, snapshot: Snapshot, certificate: tuple[int, str]
 ) -> DiagnosticArray:
-    """All rows; `certificate` is how bad and in words, without words where there is none."""
+    """Return all rows.
+
+    `certificate` is the level of the certificate's expiry and its description, which is empty
+    without a certificate.
+    """
     mode = {"mode": outputs.mode, "source": outputs.source}
     rows = [
         Row("mode", OF_MODE.get(outputs.mode, OK), outputs.reason, mode),
@@ -126,7 +130,7 @@ def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
 
 
 def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
-    """What front and rear say of each other."""
+    """Return the row about the agreement of the front and rear wheels."""
     left, right = doubt.differ
     values = {
         "left_out": ", ".join(doubt.left_out),
@@ -139,7 +143,7 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
-    """The row of the gyro, none without one."""
+    """Return the row of the gyro, or nothing if no gyro is configured."""
     if gyro.does == "off":
         return []
     values, track = {"delay_s": f"{gyro.delay:.3f}"}, ""
@@ -158,7 +162,7 @@ def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
 
 
 def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
-    """The row of what `bus.connect` names, none where it names nothing."""
+    """Return the row of the endpoints in `bus.connect`, or nothing if it names none."""
     missing, peers = routers.missing, routers.peers
     values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
     values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
@@ -171,7 +175,7 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
 
 
 def _recording(recording: Recording) -> list[Row]:
-    """The row of the black box, none without one."""
+    """Return the row of the recorder, or nothing if recording is switched off."""
     if not recording.where:
         return []
     missing = {"steps_missing": str(recording.missing)}
@@ -180,7 +184,7 @@ def _recording(recording: Recording) -> list[Row]:
 
 
 def _latch_file(trouble: str | None) -> list[Row]:
-    """Return the row of the latch file, or nothing where latches are not kept."""
+    """Return the row of the latch file, or nothing if latches are not stored."""
     if trouble is None:
         return []
     return [Row("latch file", WARN if trouble else OK, trouble or "written", {})]

@@ -1,8 +1,8 @@
-"""msgpack, JSON and CDR by name, and what an incoming sample is encoded in.
+"""The encodings msgpack, JSON and CDR, and the detection of an incoming payload's encoding.
 
-An Encoding that says so is believed; without one the first bytes decide: `{` (after white space)
-is JSON, a msgpack map header is msgpack, `00 00` or `00 01` is CDR. Decoding raises `DecodeError`
-and nothing else.
+A Zenoh Encoding that names one of them decides. Otherwise the first bytes decide: `{` (after white
+space) is JSON, a msgpack map header is msgpack, and `00 00` or `00 01` is CDR. Decoding raises
+`DecodeError` and no other exception.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _text = msgspec.json.Encoder()
 
 
 class DecodeError(AcsardError):
-    """A payload that cannot be used; `reason` is the name it is counted under."""
+    """A payload that cannot be used; `reason` is the counter's name."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -41,12 +41,12 @@ _AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
 
 
 def encoding_name(form: Format, type_name: str = "") -> str:
-    """The Zenoh Encoding of a payload of ours."""
+    """Return the Zenoh Encoding of a payload that the daemon publishes."""
     return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
 
 
 def encode(message: object, form: Format) -> bytes:
-    """The message as bytes; raises `DecodeError` for CDR of a type it cannot tell."""
+    """Encode the message; raise `DecodeError` for CDR of a type that CDR cannot represent."""
     if form == "cdr":
         return _codec(type(message)).encode(message)
     return _pack.encode(message) if form == "msgpack" else _text.encode(message)
@@ -62,7 +62,7 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 
 def detect(encoding: str, payload: bytes) -> Format:
-    """How the payload is encoded; raises `DecodeError` when that cannot be told."""
+    """Return the encoding of the payload; raise `DecodeError` if it is unknown."""
     mime = encoding.partition(";")[0]
     for form in FORMATS:
         if mime == _MIME[form]:
@@ -83,7 +83,7 @@ def detect(encoding: str, payload: bytes) -> Format:
 
 
 class Decoder(Generic[T]):
-    """Decodes payloads of one type in any of the encodings."""
+    """Decoder of payloads of one type in any of the encodings."""
 
     def __init__(self, cls: type[T]) -> None:
         self._cls = cls
@@ -91,7 +91,7 @@ class Decoder(Generic[T]):
         self._text = msgspec.json.Decoder(cls)
 
     def decode(self, encoding: str, payload: bytes) -> T:
-        """The message; raises `DecodeError` for anything that is not one."""
+        """Decode a message; raise `DecodeError` if the payload is not a valid one."""
         form = detect(encoding, payload)
         if form == "cdr":
             return decode_cdr(self._cls, payload)
@@ -105,7 +105,7 @@ class Decoder(Generic[T]):
 
 
 def _where(words: str, payload: bytes) -> str:
-    """msgspec's words for what is no JSON, with line and column for the byte in them."""
+    """Replace the byte offset in msgspec's JSON error by the line and the column."""
     match = _AT_BYTE.fullmatch(words)
     if match is None:
         return words
@@ -117,7 +117,7 @@ def _where(words: str, payload: bytes) -> str:
 
 
 def decode_cdr(cls: type[T], payload: bytes) -> T:
-    """The message in a CDR payload; raises `DecodeError`."""
+    """Decode a CDR payload; raise `DecodeError` if it is not valid."""
     try:
         return _codec(cls).decode(payload)
     except CdrError as error:

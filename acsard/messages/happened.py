@@ -1,7 +1,8 @@
-"""The last events as `events` has them: what goes on and on is one row, with how often it was.
+"""The last events for the topic `events`.
 
-A machine that misses a period every second would push a fault out of twenty rows in as many
-seconds. What is news stays a row of its own; the log has a line of each.
+An event that repeats is one row with a count. A machine that misses a period every second would
+otherwise push a fault out of the twenty rows within 20 s. An event that brings news keeps a row of
+its own. The log has a line for each event.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from acsard.messages.schema import Events, Happening, Time
 from acsard.values import NS_PER_S, Event, Instant
 
 LAST = 20
-"""Rows that are kept: more than happens between two looks of who is slow."""
+"""Number of rows: more events than usually happen between two looks of a slow reader."""
 
 PAUSE_NS = 60 * NS_PER_S
-"""Without more of the same for so long, the next one is a row of its own."""
+"""Pause without a repetition after which the next event of the same name gets a new row."""
 
 
 class _Row(Struct, frozen=True):
@@ -28,14 +29,14 @@ class _Row(Struct, frozen=True):
 
 
 class Happened:
-    """The last rows, oldest first; one that happens again goes to the end."""
+    """The last rows, oldest first. A row whose event repeats moves to the end."""
 
     def __init__(self) -> None:
         self._rows: deque[_Row] = deque(maxlen=LAST)
         self._total = 0
 
     def add(self, events: Iterable[Event], now: Instant) -> None:
-        """These have just been told."""
+        """Add events that have just been reported."""
         for event in events:
             self._total += 1
             same = None if event.news else self._same(event, now)
@@ -45,13 +46,13 @@ class Happened:
             self._rows.append(_Row(now, event))
 
     def told(self) -> Events | None:
-        """All that is kept; None when nothing has happened yet."""
+        """Return the message with all rows, or None before the first event."""
         if not self._rows:
             return None
         return Events(_time(self._rows[-1]), self._total, [_happening(row) for row in self._rows])
 
     def _same(self, event: Event, now: Instant) -> _Row | None:
-        """The row that it is more of."""
+        """Return the row that this event repeats, or None."""
         since_ns = now.mono_ns - PAUSE_NS
         for row in self._rows:
             if row.event.name == event.name and not row.event.news and row.at.mono_ns >= since_ns:

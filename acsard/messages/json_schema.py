@@ -1,8 +1,9 @@
-"""The JSON Schemas that `schema/<Type>` answers with: what goes out, what comes in, `config`.
+"""The JSON Schemas of published types, received types and `Config`, for `schema/<Type>`.
 
-What goes out has all its fields, and in later versions more: all are required, others allowed.
-What comes in may leave out what has a default, and an unknown field is refused. A type that goes
-both ways has two schemas: by its name what goes out, with `In` behind it what comes in.
+A published message has all its fields, and later versions may add more: all fields are required and
+others are allowed. A received message may omit fields with a default, and unknown fields are
+refused. A type that is used in both directions has two schemas: its name for publishing, and the
+name with `In` appended for receiving.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ ENOUGH: dict[type, list[str]] = {
     JointState: ["name", "velocity"],
     Imu: ["angular_velocity"],
 }
-"""The fields that must come in, where those are not all that have no default."""
+"""Required fields of a received type, if they are not exactly the fields without a default."""
 
 Schema = dict[str, Any]
 
 
 def going_out(cls: type, name: str) -> Schema:
-    """The schema of a type as the daemon writes it."""
+    """Return the schema of a type as the daemon writes it."""
     schema = _described(cls, name)
     for part in (schema, *schema["$defs"].values()):
         if "properties" in part:
@@ -52,13 +53,13 @@ def going_out(cls: type, name: str) -> Schema:
 
 
 def coming_in(cls: type, name: str) -> Schema:
-    """The schema of a type as the daemon takes it."""
+    """Return the schema of a type as the daemon accepts it."""
     schema = _described(cls, name)
     return schema | {"required": ENOUGH[cls]} if cls in ENOUGH else schema
 
 
 def _described(cls: type, name: str) -> Schema:
-    # A pattern is ECMAScript's, which has no \Z and whose $ is just that.
+    # A pattern is an ECMAScript expression, which has no \Z; its $ matches only at the end.
     text = msgspec.json.encode(msgspec.json.schema(cls)).replace(rb'\\Z"', b'$"')
     whole: Schema = msgspec.json.decode(text)
     parts, own = whole["$defs"], whole["$ref"].rpartition("/")[2]
@@ -74,4 +75,4 @@ SCHEMAS: dict[str, Schema] = {
     **{f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In") for cls in BOTH_WAYS},
     "Config": going_out(Config, "Config"),
 }
-"""By the name that stands in the key."""
+"""Every schema by its name, as in the key `schema/<Type>`."""

@@ -1,6 +1,6 @@
-"""`Outputs` -> messages: what is due now, and the present value of any published key.
+"""Converts `Outputs` to messages: those that are due, and the present value of any published key.
 
-Only what somebody listens to is built. All messages of one feedback line carry its stamp.
+Only messages with a subscriber are built. All messages of one feedback line carry its stamp.
 """
 
 from __future__ import annotations
@@ -54,15 +54,15 @@ Look = Callable[[], Snapshot]
 
 
 class _Rate:
-    """Lets something happen at most so often; 0 Hz means always."""
+    """Rate limit of one topic; 0 Hz means no limit."""
 
     def __init__(self, hz: float) -> None:
         self._period_ns = int(NS_PER_S / hz) if hz else 0
         self._next_ns = -2 * self._period_ns
 
     def due(self, now_ns: int, at_once: bool = False) -> bool:
-        # A twentieth of the period as grace, or a step a microsecond early would wait for the
-        # next one.
+        # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
+        # would wait for the next period.
         if not at_once and now_ns < self._next_ns - self._period_ns // 20:
             return False
         behind = at_once or now_ns - self._next_ns > self._period_ns
@@ -71,13 +71,18 @@ class _Rate:
 
 
 class Report:
-    """Builds messages from outputs; remembers only the last of them, and the last events."""
+    """Builder of messages.
+
+    It remembers only the last outputs, the last estimate and the last events.
+    """
 
     def __init__(
         self, config: Config, start: Instant, certificate_ends_ns: int | None = None
     ) -> None:
         self.certificate_ends_ns = certificate_ends_ns
-        """Wall-clock time; the door tells it where the daemon may not read it."""
+        """Wall-clock time at which the certificate ends, ns. The TLS gateway reports it if the
+        daemon may not read the certificate.
+        """
         self._names = list(config.joints.as_tuple())
         self._start = start
         self._estimate: Estimate | None = None
@@ -86,7 +91,7 @@ class Report:
         self.use(config)
 
     def use(self, config: Config) -> None:
-        """By this configuration from now on."""
+        """Use this configuration from now on."""
         self._config = config
         self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
         self._covariances = Covariances(config.odometry)
@@ -94,9 +99,10 @@ class Report:
     def due(
         self, outputs: Outputs, wanted: Collection[str], look: Look
     ) -> Iterator[tuple[str, Message]]:
-        """The (key, message) pairs to publish after this step, of the keys in `wanted`.
+        """Yield the (key, message) pairs to publish after this step, for the keys in `wanted`.
 
-        One by one, feedback first: a `state` takes as long to build as ten of the others.
+        They come one by one, feedback first, because a `state` takes as long to build as ten
+        others.
         """
         self._outputs = outputs
         if outputs.events:
@@ -104,7 +110,8 @@ class Report:
         if outputs.estimates:
             self._estimate = outputs.estimates[-1]
         elif not (outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted):
-            return iter(())  # most steps of a robot that nobody watches closely
+            # Most steps end here when no client follows the robot closely.
+            return iter(())
         return self._due(outputs, wanted, look)
 
     def _due(
@@ -132,7 +139,7 @@ class Report:
             yield "diagnostics", self._diagnostics(outputs, look())
 
     def current(self, key: str, look: Look) -> Message | None:
-        """The present value of a published key; None when there has been none yet."""
+        """Return the present value of a published key, or None if it has no value yet."""
         estimate, outputs = self._estimate, self._outputs
         match key:
             case "tf_static":
@@ -155,7 +162,7 @@ class Report:
                 return None
 
     def tf_static(self) -> TFMessage:
-        """The transforms that never change, all in one message; those switched off are left out."""
+        """Return all static transforms in one message, without those that are switched off."""
         base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
         lidar, footprint = self._config.lidar, self._config.footprint
         transforms = []
@@ -239,7 +246,10 @@ class Report:
         )
 
     def _certificate(self, now: Instant) -> tuple[int, str]:
-        """How bad (0 ok, 1 warning, 2 error) and in words; no words without a certificate."""
+        """Return the level (0 ok, 1 warning, 2 error) and the words about the certificate.
+
+        The words are empty without TLS.
+        """
         if not self._config.bus.tls:
             return 0, ""
         return expiry(self.certificate_ends_ns, now.wall_ns)
@@ -257,12 +267,12 @@ def _twist(twist: BodyTwist) -> Twist:
 
 
 def from_yaw(yaw: float) -> Quaternion:
-    """The rotation by `yaw` rad about z."""
+    """Return the rotation by `yaw` rad about z."""
     return Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """The rotation by roll, then pitch, then yaw about the fixed axes x, y, z (REP-103), rad."""
+    """Return the rotation by roll, pitch and yaw about the fixed axes x, y, z (REP-103), rad."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)

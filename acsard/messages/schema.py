@@ -1,7 +1,7 @@
-"""The published structs, shaped and named like their ROS 2 messages, a unit beside each field.
+"""The message structs, shaped and named like their ROS 2 counterparts, with the unit of each field.
 
-One schema, several encodings: a field means the same thing as msgpack and as JSON. Incoming
-structs refuse unknown fields, so a misspelt axis is an error and not a standstill.
+One schema serves several encodings: a field means the same in msgpack, JSON and CDR. Structs refuse
+unknown fields, so a misspelt axis in a command is an error and not a robot that stands still.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from acsard.mcu.link_state import State
 from acsard.messages.topics import Direction
 from acsard.values import NS_PER_S, ROLES, EventName, GyroDoes, Level, Plain
 
-# What `cdr.py` has to know: the width of an int in CDR, the length of an array.
+# Annotations for `cdr.py`: the width of an int, and the fixed length of an array.
 Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
 Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
 Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
@@ -25,14 +25,19 @@ Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
 Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
 
 LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
-"""Number of a latch, small enough for a JavaScript number."""
+"""Number of a latch, exact as a JavaScript number."""
 
 FEW = Meta(max_length=64)
-"""More joints than any robot of ours; what a stranger sends must not take long to refuse."""
+"""Bound of a list: more joints than any robot of ours has, so that a stranger's long list is
+refused quickly.
+"""
 
 
 def one_of(values: Iterable[object]) -> Meta:
-    """Says in the JSON Schema which values there are; who decodes does not refuse a later one."""
+    """List the possible values in the JSON Schema.
+
+    Decoding accepts other values of a later version.
+    """
     return Meta(extra_json_schema={"enum": list(values)})
 
 
@@ -48,24 +53,24 @@ class Time(Message, frozen=True):
 
     @classmethod
     def from_ns(cls, wall_ns: int) -> Time:
-        """The time `wall_ns` nanoseconds after 1970; held to what an int32 can tell (1901-2038)."""
+        """Convert ns since 1970 to a `Time`, clamped to int32 seconds (1901 to 2038)."""
         sec, nanosec = divmod(wall_ns, NS_PER_S)
         return cls(max(-(2**31), min(2**31 - 1, sec)), nanosec)
 
     def to_ns(self) -> int:
-        """Nanoseconds since 1970."""
+        """Return the time in ns since 1970."""
         return self.sec * NS_PER_S + self.nanosec
 
 
 class Header(Message, frozen=True):
-    """When the data was sampled and in which frame it is."""
+    """Time at which the data was sampled, and the frame in which it is expressed."""
 
     stamp: Time = Time()
     frame_id: str = ""
 
 
 class Vector3(Message, frozen=True):
-    """Three components; the unit is that of the field it fills."""
+    """Three components in the unit of the field that holds them."""
 
     x: float = 0.0
     y: float = 0.0
@@ -73,7 +78,7 @@ class Vector3(Message, frozen=True):
 
 
 class Quaternion(Message, frozen=True):
-    """A rotation as unit quaternion."""
+    """A rotation as a unit quaternion."""
 
     x: float = 0.0
     y: float = 0.0
@@ -82,49 +87,49 @@ class Quaternion(Message, frozen=True):
 
 
 class Twist(Message, frozen=True):
-    """Velocity: `linear` m/s, `angular` rad/s. A planar base follows linear.x and angular.z."""
+    """Velocity: `linear` m/s, `angular` rad/s. A planar base uses only linear.x and angular.z."""
 
     linear: Vector3
     angular: Vector3
 
 
 class TwistStamped(Message, frozen=True):
-    """A twist with the time it was meant at."""
+    """A twist with the time for which it was meant."""
 
     header: Header
     twist: Twist
 
 
 class Pose(Message, frozen=True):
-    """`position` m and `orientation`."""
+    """Pose: `position` in m, and `orientation`."""
 
     position: Vector3
     orientation: Quaternion
 
 
 class PoseStamped(Message, frozen=True):
-    """A pose in `header.frame_id` at the time of `header.stamp`."""
+    """A pose in `header.frame_id` at the time `header.stamp`."""
 
     header: Header
     pose: Pose
 
 
 class PoseWithCovariance(Message, frozen=True):
-    """A pose and its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
+    """A pose with its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
 
     pose: Pose
     covariance: Covariance
 
 
 class TwistWithCovariance(Message, frozen=True):
-    """A twist and its 6x6 covariance, row major, m/s and rad/s."""
+    """A twist with its 6x6 covariance, row major, m/s and rad/s."""
 
     twist: Twist
     covariance: Covariance
 
 
 class Odometry(Message, frozen=True):
-    """Pose of `child_frame_id` in `header.frame_id`, twist in `child_frame_id`."""
+    """Pose of `child_frame_id` in `header.frame_id`, with the twist in `child_frame_id`."""
 
     header: Header
     child_frame_id: str
@@ -133,14 +138,14 @@ class Odometry(Message, frozen=True):
 
 
 class Transform(Message, frozen=True):
-    """`translation` m and `rotation`."""
+    """A transform: `translation` in m, and `rotation`."""
 
     translation: Vector3
     rotation: Quaternion
 
 
 class TransformStamped(Message, frozen=True):
-    """Where `child_frame_id` is in `header.frame_id`."""
+    """Pose of `child_frame_id` in `header.frame_id`."""
 
     header: Header
     child_frame_id: str
@@ -166,7 +171,7 @@ class JointState(Message, frozen=True):
 class Imu(Message, frozen=True):
     """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
 
-    A covariance that begins with -1 says that this is not measured.
+    A covariance whose first element is -1 marks a quantity that is not measured.
     """
 
     header: Header
@@ -179,7 +184,9 @@ class Imu(Message, frozen=True):
 
 
 class SourceState(Message, frozen=True):
-    """One commander: seconds since its last accepted command (null: none) and what it waits for."""
+    """A source of commands: `age` in s since its last accepted command (null: none yet), and the
+    condition that it waits for, in words.
+    """
 
     name: str
     priority: int
@@ -204,9 +211,9 @@ class Figure(Message, frozen=True):
 
 
 class RobotState(Message, frozen=True):
-    """The compact summary: mode and why, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
+    """Summary of the robot: mode and reason, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
 
-    While no feedback comes, no speed is known: `linear` and `angular` are null, `wheels` is empty.
+    Without feedback the speeds are unknown: `linear` and `angular` are null, `wheels` is empty.
     """
 
     stamp: Time
@@ -223,55 +230,58 @@ class RobotState(Message, frozen=True):
     source: str
     sources: list[SourceState]
     refused: str
-    """The last command that was refused and why; empty when none was."""
+    """The last refused command and the reason; empty if no command was refused."""
     counters: dict[str, int]
     certificate: str = ""
-    """How long the bus's TLS certificate is valid, in words; empty without TLS."""
+    """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
-    """How fast it is, by the names in `runtime/figures.py`; at most a second old."""
+    """Durations of the control loop by the names in `runtime/figures.py`, at most a second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
-    """What the gyro does for odometry: `values.GyroDoes`."""
+    """Use of the gyro in odometry, a value of `values.GyroDoes`."""
     encoders: list[int] = []
-    """Counts per wheel turn found in the speeds, in the order of `wheels`; 0: they show none."""
+    """Counts per wheel turn, inferred from the speeds, in the order of `wheels`; 0 if unknown."""
     doubt: str = ""
-    """The wheel that is left out of the pose, or the side that slips, in words; empty else."""
+    """The wheel that is left out of the pose, or the side that slips, in words; else empty."""
     sender: str = ""
-    """The public name of the sender of `source` that is followed."""
+    """Public name of the followed sender of `source`."""
     track: str = ""
-    """The effective track over the wheel separation, as the gyro teaches it and as configured, and
-    which is in use, in words; empty until one is learned."""
+    """Effective track divided by the wheel separation, as learned from the gyro and as
+    configured, and which of them is in use, in words; empty until one is learned.
+    """
     recording: str = ""
-    """Why nothing is recorded just now, though it is asked for, in words; empty else."""
+    """Why nothing is recorded at present although recording is on, in words; else empty."""
     latch: LatchNumber = 0
     """Number of the fault, else of the stop, else of "inactive"; 0 while none is latched."""
     latch_file: str = ""
-    """Why a stop would not survive a restart, in words; empty if it would, or in the simulator."""
+    """Why a stop would not survive a restart, in words; empty if it would, and in the simulator."""
     feedback_age: float | None = None
     """Seconds since the last good line of the microcontroller; null before the first one."""
 
 
 class DoorState(Message, frozen=True):
-    """What the door to the network tells the daemon."""
+    """Status that the TLS gateway (the process `door`) reports to the daemon."""
 
     opened: Annotated[int, Meta(ge=0, lt=1 << 62)]
-    """When, in ns of the machine's monotonic clock: another number is another door."""
+    """Start time of the gateway in ns of the machine's monotonic clock. Another value means that
+    the gateway has restarted.
+    """
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
-    """From outside, now."""
+    """Number of connections from the network at present."""
     crowded: Annotated[int, Meta(ge=0, lt=1 << 31)]
-    """Looks, four a second, at which all connections were taken."""
+    """Number of checks, four a second, at which all connections were in use."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
-    """Wall-clock time in ns; 0 where the library to read it is missing."""
+    """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
 
 
 class KeyValue(Message, frozen=True):
-    """One diagnostic figure, as text."""
+    """A diagnostic value as text."""
 
     key: str
     value: str
 
 
 class DiagnosticStatus(Message, frozen=True):
-    """`level` 0 ok, 1 warning, 2 error, 3 stale."""
+    """A diagnostic status; `level` is 0 ok, 1 warning, 2 error, 3 stale."""
 
     level: Annotated[Byte, one_of(range(4))]
     name: str
@@ -288,39 +298,45 @@ class DiagnosticArray(Message, frozen=True):
 
 
 class Happening(Message, frozen=True):
-    """An event as the log has it."""
+    """An event as in the log."""
 
     stamp: Time
     name: Annotated[str, one_of(get_args(EventName))]
     level: Annotated[str, one_of(get_args(Level))]
     text: str
     by: str
-    """Who asked, sent or commands; empty when that is nobody."""
+    """Client that asked, sent or commands; empty if no client did."""
     count: int
-    """How many times: since the last of this name, or of what goes on and on, without a minute's
-    rest, since it began."""
+    """Number of occurrences since the previous event of this name. For an event that goes on
+    without a pause of a minute, it is the number since the event began.
+    """
 
 
 class Events(Message, frozen=True):
-    """The last events, oldest first; what goes on and on is one, as of the last time."""
+    """The last events, oldest first.
+
+    An event that goes on is one row, with the time of its last repetition.
+    """
 
     stamp: Time
-    """When the last of them was."""
+    """Time of the last event."""
     total: int
-    """How many there were since the start. One that goes on counts each time, and is the last then:
-    new are, of so many as the total has grown by, those that differ from what was known."""
+    """Number of events since the start, with each repetition counted. A repeated event moves to
+    the end. Of the last N rows, where N is the growth of `total`, those that a reader does not
+    have yet are new.
+    """
     events: list[Happening]
 
 
 class ServiceReply(Message, frozen=True):
-    """Did the service do it, and what happened or what to do instead."""
+    """Result of a service call, with a message about the outcome or the remedy."""
 
     success: bool
     message: str
 
 
 class SetPose(Message, frozen=True):
-    """Where base_link is to be in odom: m, m, rad."""
+    """Pose that base_link gets in odom: `x` and `y` in m, `yaw` in rad."""
 
     x: float
     y: float
@@ -334,13 +350,13 @@ class Release(Message, frozen=True):
 
 
 class Settings(Message, frozen=True):
-    """What is to be set: values by their keys in `acsard.toml`, tables and key joined by dots."""
+    """New values of settings, by their dotted keys in `acsard.toml`."""
 
     settings: Annotated[dict[str, Plain], FEW]
 
 
 class Info(Message, frozen=True):
-    """Who is this daemon."""
+    """Identity of the daemon."""
 
     id: str
     version: str
@@ -361,7 +377,7 @@ class HardwareInterface(Message, frozen=True):
     unit: Annotated[str, one_of(("rad", "rad/s"))]
     available: bool
     claimed: bool
-    """A command interface is claimed while a source drives."""
+    """True for a command interface while a source drives."""
 
 
 class Interfaces(Message, frozen=True):
@@ -381,16 +397,16 @@ class TopicInfo(Message, frozen=True):
 
 
 class Topics(Message, frozen=True):
-    """The topic table of this daemon, with its full keys."""
+    """The topic table of this daemon, with full keys."""
 
     topics: list[TopicInfo]
 
 
 class WhoAmI(Message, frozen=True):
-    """Who asks, as the daemon sees it."""
+    """The caller of the query as the daemon sees it."""
 
     role: Annotated[str, one_of(ROLES)]
-    """At least this, by the access rules."""
+    """A role that the caller has at least, by the access rules."""
     sender: str
     """The caller's public name and its transport, as in the log."""
 
@@ -419,4 +435,4 @@ MESSAGES: dict[str, type[Message]] = {
         WhoAmI,
     )
 }
-"""Every type that crosses the bus by itself, by name: what `schema/<Type>` answers for."""
+"""Every type that is a message of its own, by name. The key `schema/<Type>` answers for these."""

@@ -1,6 +1,6 @@
-"""Where the robot is and how it moves, as a person reads it; pure.
+"""Formats the pose and the motion of the robot in one line for a person; pure.
 
-Covariances, stamps and frames are for programs: those have the JSON.
+Covariances, stamps and frames are left out: programs read them in the JSON.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from acsard.messages.text import printable
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
-    """A pose, each figure with its unit: m, m, rad."""
+    """Format a pose with units: x and y in m, yaw in degrees. The arguments are in m and rad."""
     return [
         f"x {_signed(x, 3, 8)} m",
         f"y {_signed(y, 3, 8)} m",
@@ -23,12 +23,12 @@ def place(x: float, y: float, yaw: float) -> list[str]:
 
 
 def speeds(linear: float | None, angular: float | None) -> list[str]:
-    """Format a twist, each figure with its unit: m/s, rad/s, or "-" if it is not known."""
+    """Format a twist with units: m/s and rad/s, or "-" for an unknown speed."""
     return [f"forward {_signed(linear, 2, 5)} m/s", f"turn {_signed(angular, 2, 5)} rad/s"]
 
 
 def short(message: object) -> str:
-    """The message in a line; only of a type in `SHORT`."""
+    """Format a message in one line; its type must be in `SHORT`."""
     return "  ".join(SHORT[type(message)](message))
 
 
@@ -54,7 +54,8 @@ def _twist(twist: Twist) -> list[str]:
 def _signed(value: float | None, decimals: int, width: int) -> str:
     if value is None:
         return "-".rjust(width)
-    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no "-0.00"
+    # Adding 0.0 turns "-0.00" into "+0.00".
+    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"
     return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
 
 
@@ -64,4 +65,4 @@ SHORT: dict[type, Callable[[Any], list[str]]] = {
     PoseStamped: lambda message: _pose(message.pose),
     TwistStamped: lambda message: _twist(message.twist),
 }
-"""What has a short form, and how it is made."""
+"""Types with a short form, and the function that makes it."""

@@ -1,12 +1,12 @@
-"""The attachment that names the sender of a command or a call, and the name that the daemon shows.
+"""The attachment that names the sender of a command or a call, and the sender's public name.
 
 An attachment is a map in JSON or msgpack:
 
     {"sender": "joystick/8Xg2kq0vRw-1yEJc7hPzUA", "stamp": 1795154884365624370, "sequence": 12}
 
 The sender id is `NAME/SECRET`. Only the program and the daemon know it, because it proves which
-program is speaking. The daemon keeps and publishes `public_name` of it, from which no program can
-find an attachment that counts as the same sender. Any other attachment is ignored.
+program sends. The daemon keeps and publishes its `public_name`, from which no program can construct
+an attachment that counts as the same sender. Any other attachment is ignored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from msgspec import Meta, Struct
 MOST = (1 << 63) - 1
 
 MAX_SENDER = 64
-"""Characters of a sender id."""
+"""Largest number of characters in a sender id."""
 
 MAX_NAME = 40
 """Characters of a sender's name that are shown. The rest of a sender id is room for the secret."""
@@ -30,21 +30,24 @@ DIGITS = 16
 """Hexadecimal digits of the hash that are shown: 64 bits, too many to find a second id for."""
 
 MARKS = " @._-:/+"
-"""Characters that a name may have beside letters and digits. The words that the daemon puts around
-a name use none of them as a delimiter."""
+"""Characters besides letters and digits that a name may contain. The texts that the daemon puts
+around a name use none of them as a delimiter.
+"""
 
 
 class Signature(Struct, frozen=True, omit_defaults=True):
-    """`sender` is the id of one program, `stamp` is in ns since 1970, `sequence` grows by 1."""
+    """The sender's id, the stamp of the command in ns since 1970, and a number that grows by 1."""
 
     sender: Annotated[str, Meta(min_length=1, max_length=MAX_SENDER)]
     stamp: Annotated[int, Meta(gt=0, le=MOST)] | None = None
     sequence: Annotated[int, Meta(ge=0, le=MOST)] | None = None
     steady: bool = False
-    """Nobody adjusts the clock of `stamp` while this sender lives, so a late stamp is late."""
+    """True if the clock of `stamp` is never adjusted while this sender runs, so a late stamp
+    means a late command.
+    """
 
     def pack(self) -> bytes:
-        """As our client sends it."""
+        """Encode the attachment as acsard's own client sends it."""
         return msgspec.msgpack.encode(self)
 
 
@@ -62,7 +65,7 @@ def unpack(attachment: bytes) -> Signature | None:
         return None
 
 
-# Every command needs it: hashing takes 7 us, a look-up 0.15 us.
+# Every command needs the name: hashing takes 7 us, a cache look-up 0.15 us.
 @lru_cache(maxsize=1024)
 def public_name(sender: str, certificate: str = "") -> str:
     """Return the name that the daemon uses and publishes for a sender id.

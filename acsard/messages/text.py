@@ -1,4 +1,4 @@
-"""Text from elsewhere, made harmless for a terminal: names, reasons and messages of strangers."""
+"""Makes text from strangers, such as names, reasons and messages, harmless for a terminal."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import re
 
 
 def printable(text: str) -> str:
-    """The text without what a terminal would obey, on one line."""
+    """Return the text on one line, without control characters that a terminal would obey."""
     return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
 
 
 def lines(text: str) -> str:
-    """The same of a text that may have lines."""
+    """Make a text of several lines printable, and keep its line breaks."""
     return "\n".join(map(printable, text.split("\n")))
 
 
@@ -19,7 +19,7 @@ _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
 
 
 def json_line(text: str) -> str:
-    """JSON with what cannot be printed escaped: it stays the same JSON."""
+    """Escape the unprintable characters of a JSON text; the JSON value stays the same."""
     return _ABOVE_ASCII.sub(
         lambda m: m[0] if m[0].isprintable() or ord(m[0]) > 0xFFFF else f"\\u{ord(m[0]):04x}", text
     )

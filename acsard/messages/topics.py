@@ -1,7 +1,7 @@
-"""**The** table: every key below `acsard/<id>/`, its direction, type, rate and meaning.
+"""The table of all keys below `acsard/<id>/`, with direction, type, rate and meaning.
 
-The bus declares from it, the command line and the README list it, `topics` answers with it. A key
-that is not here does not exist.
+The bus declares its keys from this table, the command line and the README list it, and the query
+`topics` answers with it. A key that is not in the table does not exist.
 """
 
 from __future__ import annotations
@@ -20,12 +20,16 @@ from acsard.values import ROOT, Verb
 _PLACE = re.compile("<[A-Za-z]+>")
 
 Direction = Literal["out", "in", "query", "service"]
-"""A query only asks and may be asked by wildcard; a service acts, and only by its exact key."""
+"""Direction of a topic. A query only reads, and may be asked by a wildcard. A service acts, and
+runs only for its exact key.
+"""
 
 
 class Topic(Struct, frozen=True):
-    """One row. `key` may hold `<source>`, `<certificate>`, `<Type>`, `<key>` or `<role>` where a
-    name goes."""
+    """One row of the table.
+
+    `key` may hold a placeholder: `<source>`, `<certificate>`, `<Type>`, `<key>` or `<role>`.
+    """
 
     key: str
     direction: Direction
@@ -34,13 +38,13 @@ class Topic(Struct, frozen=True):
     note: str
     latched: bool = False
     simulated: bool = False
-    """Only the built-in simulator has it: on a real robot the key does not exist."""
+    """True for a key that exists only with the built-in simulator."""
     gyro: bool = False
-    """Only with `[odometry] gyro = true`."""
+    """True for a key that exists only with `[odometry] gyro = true`."""
 
     @property
     def pattern(self) -> str:
-        """The key with each placeholder as a Zenoh wildcard."""
+        """The key with each placeholder replaced by a Zenoh wildcard."""
         return _PLACE.sub("*", self.key.replace("<key>", "**"))
 
 
@@ -58,20 +62,22 @@ _SERVICE_NOTES: dict[Verb, str] = {
 
 
 IMU = "imu"
-"""What a gyro says; the simulator's own comes in on it as anybody's."""
+"""Key of the gyro's samples. The simulator publishes its own gyro on the same key."""
 
 
 WHOAMI = "whoami/<role>"
-"""A key for each role, that who has less cannot ask: the access rules are the proof."""
+"""One key for each role. Zenoh's access rules let a client query only the keys of its own role
+and of lower ones, so an answer proves the role.
+"""
 
 
 def whoami_key(role: str) -> str:
-    """The key that answers who has at least this role."""
+    """Return the key that answers clients with at least this role."""
     return WHOAMI.replace("<role>", role)
 
 
 def service_key(verb: str) -> str:
-    """The key of a service."""
+    """Return the key of a service."""
     return f"srv/{verb}"
 
 
@@ -79,12 +85,12 @@ JSON_TREE = "json/"
 
 
 def json_key(key: str) -> str:
-    """Where a published key is there once more, in JSON."""
+    """Return the key on which a published topic also appears in JSON."""
     return JSON_TREE + key
 
 
 VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
-"""What each service asks of the robot, by its key."""
+"""The verb of each service, by its key."""
 
 TOPICS: tuple[Topic, ...] = (
     Topic("odom", "out", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
@@ -121,65 +127,74 @@ PUBLISHED: tuple[Topic, ...] = tuple(
     for topic in TOPICS
     if topic.direction == "out" and topic.key not in ("alive", json_key("<key>"))
 )
-"""The topics with a payload; each also answers queries with its last value."""
+"""The topics with a payload. Each also answers queries with its last value."""
 
 
 def offered(config: Config) -> tuple[Topic, ...]:
-    """The rows that a daemon of this configuration has."""
+    """Return the rows that a daemon with this configuration has."""
     simulated, gyro = config.mcu.simulated, config.odometry.gyro
     rows = (topic for topic in TOPICS if simulated or not topic.simulated)
     return tuple(topic for topic in rows if gyro or not topic.gyro)
 
 
 def published(config: Config) -> tuple[Topic, ...]:
-    """Those of them that it publishes; the simulator also what its gyro says."""
+    """Return the rows that a daemon with this configuration publishes.
+
+    The simulator also publishes its gyro.
+    """
     own = config.mcu.simulated
     return tuple(t for t in offered(config) if t in PUBLISHED or (own and t.key == IMU))
 
 
 def full_key(robot_id: str, key: str) -> str:
-    """The key on the bus."""
+    """Return the complete key on the bus."""
     return f"{ROOT}/{robot_id}/{key}"
 
 
 COMMANDS = ("cmd", "wheel_cmd")
-"""The first chunk of each key that commands come in on."""
+"""First part of each key on which commands arrive."""
 
 
 def command_key(kind: str, source: str, certificate: str = "") -> str:
     """Return the key that a source commands on.
 
-    `certificate` is the common name of the sender's certificate: over TLS each certificate has a
-    key of its own, on which the access rules let no other one put. Without one the key is that of
-    programs on the robot's own machine.
+    `certificate` is the common name of the sender's certificate. Over TLS each certificate has a
+    key of its own, and the access rules let no other certificate put there. Without a certificate
+    the key is that of programs on the robot's own machine.
     """
     return f"{kind}/{source}/{certificate}" if certificate else f"{kind}/{source}"
 
 
 def source_keys(sources: Iterable[str], certificate: str = "") -> list[str]:
-    """The keys that these sources command on under one certificate, "*" for all certificates."""
+    """Return the keys on which these sources command; `certificate` may be "*" for all of them."""
     names = list(sources)
     return [command_key(kind, name, certificate) for kind in COMMANDS for name in names]
 
 
 def unknown(key: str) -> bool:
-    """No row is like it, but it may be a stranger's."""
+    """Return whether no row of the table matches the key.
+
+    Keys below `json/`, `cmd/` and `wheel_cmd/` count as known, because they depend on the
+    configuration.
+    """
     return row_of(key) is None and not key.startswith((JSON_TREE, "cmd/", "wheel_cmd/"))
 
 
 def key_hint(key: str) -> str:
-    """What was probably meant by a key that is not there, or where they all are."""
+    """Return the most similar key of the table, or the advice to list them."""
     known = [topic.key for topic in TOPICS if "<" not in topic.key]
     return hint(key, known, "`acsard topics` lists the keys")
 
 
 def by_key(key: str) -> Topic | None:
-    """The row of this key as written in the table, or None."""
+    """Return the row whose key is written exactly like this in the table, or None."""
     return next((topic for topic in TOPICS if topic.key == key), None)
 
 
 def row_of(key: str) -> Topic | None:
-    """The row that a key below the robot's id belongs to, as `cmd/app` to `cmd/<source>`."""
+    """Return the row that matches a key below the robot's id, as `cmd/app` matches
+    `cmd/<source>`.
+    """
     found = (topic for topic in TOPICS if _like(topic.key).fullmatch(key))
     return next(found, None)
 

@@ -1,11 +1,24 @@
-"""Shell, with a pure core: the black box. What came into every step and what went out of it.
+"""The black box: records the inputs and the outputs of every control step, and replays them.
 
-`steps` is what a recording says of a step, `batch` and `columns` make bytes of many, `earlier`
-reads those of before, `plausible` refuses what no step got, `replay` lives it again, `merge` puts
-another configuration under a state, `unpickling` makes a robot of bytes, whoever wrote them,
-`story` tells it in sentences, `room` says which of them go, `published` has the messages that went
-out, `table` the lines of a CSV file, `bag` what stands beside a file for ROS: all pure. `state`
-makes bytes of a robot, `file` reads and writes MCAP, `closing` its end, `recovery` makes whole what
-was cut, `replayed` lives one again, `export` writes it for other programs, `directory` bounds all
-of them, `recorder` has the thread.
+The pure modules:
+- `steps`: one step as a recording stores it.
+- `batch`, `layout`, `columns`: the encoding of many steps; `earlier` reads the previous format.
+- `plausible`: refuses a batch with values that no daemon records.
+- `replay`: runs recorded inputs through `Robot.step` again and compares the outputs.
+- `merge`: applies another configuration to a recorded robot state.
+- `unpickling`: rebuilds a robot from bytes that a stranger may have written.
+- `story`: describes a recording in sentences.
+- `room`, `around`: decide which recordings are deleted and which are retained.
+- `published`: rebuilds the messages that were published.
+- `table`: writes the lines of a CSV file.
+- `bag`: writes the `metadata.yaml` of a ROS bag.
+
+The modules that do I/O:
+- `recorder`: takes steps from the control loop; `disk` writes them in a thread.
+- `directory`: bounds the directory of recordings.
+- `file`, `walk`, `closing`: write and read one MCAP file and its end.
+- `recovery`: finishes a file that was cut off.
+- `state`: encodes a robot as bytes, and decodes it.
+- `replayed`: replays a file and describes the result.
+- `export`: writes files for other programs; `beside` puts each in its place atomically.
 """

@@ -1,7 +1,8 @@
-"""What a directory says of the MCAP file in it, for `ros2 bag` and whatever else opens bags.
+"""Writes the `metadata.yaml` beside an MCAP file, which makes a ROS bag of the directory.
 
-Format 5, with numbers for the qualities of service: every ROS 2 since Humble reads it. The same
-text of the qualities stands beside each channel in the file, where `ros2 bag play FILE` finds it.
+The metadata has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
+reads. The file itself holds the same QoS text for each channel, where `ros2 bag play FILE` finds
+it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _ENDLESS = "{sec: 9223372036, nsec: 854775807}"
 
 
 class Topic(Struct, frozen=True):
-    """A topic of the file."""
+    """Topic of the bag, with its ROS type, its QoS and its number of messages."""
 
     name: str
     type: str
@@ -31,7 +32,7 @@ class Topic(Struct, frozen=True):
 
 
 def offered(qos: Qos) -> str:
-    """The quality of service as a list of one, YAML."""
+    """Return the QoS profile as a YAML list with one entry."""
     return "\n".join(
         [
             "- history: 1",
@@ -49,7 +50,10 @@ def offered(qos: Qos) -> str:
 
 
 def metadata(file: str, topics: Sequence[Topic], first_ns: int, last_ns: int) -> str:
-    """`metadata.yaml` of a directory with this one file; times are wall-clock, of its messages."""
+    """Return the `metadata.yaml` of a bag that consists of this one MCAP file.
+
+    `first_ns` and `last_ns` are the wall-clock times of the first and the last message.
+    """
     count = sum(topic.count for topic in topics)
     begins = f"nanoseconds_since_epoch: {first_ns}"
     lasts = f"nanoseconds: {last_ns - first_ns}"
@@ -85,5 +89,5 @@ def metadata(file: str, topics: Sequence[Topic], first_ns: int, last_ns: int) ->
 
 
 def _quoted(text: str) -> str:
-    """A YAML string; a name from a configuration or a path may hold what YAML means."""
+    """Quote a YAML string: a name from a configuration or a path may contain YAML syntax."""
     return msgspec.json.encode(text).decode()

@@ -1,6 +1,7 @@
-"""Steps <-> bytes: a batch of at most a second, what is alike in them next to each other.
+"""Encodes steps as batches of at most about one second, and decodes them.
 
-The shape of the bytes is `layout.py`'s. All that is in a `Step` comes back exactly.
+A batch stores equal kinds of values next to each other, in the layout of `layout.py`. Decoding
+returns every `Step` exactly as it was encoded.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ from acsard.values import (
 
 
 class _First(Struct, frozen=True, array_like=True):
-    """All that is read of a batch where no more is asked."""
+    """The part of a batch that `first_of` decodes."""
 
     number: int
 
 
 class BatchError(AcsardError):
-    """These bytes are no batch of steps."""
+    """Bytes that are not a valid batch of steps."""
 
 
 _decoder = msgspec.msgpack.Decoder(Batch)
@@ -55,14 +56,15 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 _decoder_of_1 = msgspec.msgpack.Decoder(earlier.Batch1)
 
 
-# encode
+# Encoding
 
 
 def encode(first: int, taken: Sequence[Taken], reason: str | None = None) -> bytes:
-    """The bytes of these steps, the first of them number `first`; 1 to 256 of them.
+    """Encode 1 to 256 steps; the first of them has the number `first`.
 
-    `reason` is the last one of the batch before, where there is one in the same file: long words
-    that stay the same for hours.
+    `reason` is the status reason of the last step of the batch before, or None for the first batch
+    of a file. A reason is a long text that often stays the same for hours, so a repeated one is not
+    stored.
     """
     inputs, outputs, _ = taken[0]
     start = _first_instant(inputs)
@@ -118,7 +120,7 @@ def _shape(taken: Taken) -> Shape:
 
 
 def _lane(taken: list[Taken], start: Instant, shapes: dict[Shape, int]) -> Lane:
-    """Those steps; `shapes` gets the shapes that are new."""
+    """Encode the steps of one lane, and add their new shapes to `shapes`."""
     kinds = bytes([shapes.setdefault(_shape(t), len(shapes)) for t in taken])
     return Lane(kinds, pack([t.inputs.now.mono_ns - start.mono_ns for t in taken]))
 
@@ -164,13 +166,19 @@ def _brief(status: Status, reason: str | None) -> Status:
     return mode, SAME if now == reason else now, link, source
 
 
-# decode
+# Decoding
 
 
 def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
-    """The steps again; raises `BatchError` for bytes that are none.
+    """Decode a batch.
 
-    `reason` is the last one of the batch before, `form` the format of the file.
+    Args:
+        data: the bytes of the batch.
+        reason: the status reason of the last step of the batch before.
+        form: the format of the recording, as in `About.format`.
+
+    Raises:
+        BatchError: the bytes are not a valid batch.
     """
     try:
         if form == earlier.FORMAT:
@@ -185,7 +193,7 @@ def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
 
 
 def first_of(data: bytes) -> int | None:
-    """The number of the first of the steps, of whatever format; None for bytes that are none."""
+    """Return the number of the first step of a batch of any format, or None for other bytes."""
     try:
         return _decoder_of_first.decode(data).number
     except msgspec.MsgspecError:
@@ -221,7 +229,9 @@ def _times(lane: Lane) -> list[int]:
 
 
 def _placed(batch: Batch) -> list[tuple[int, bool, int]]:
-    """Of each step when it was, whether it is no tick, and its kind."""
+    """Return for each step the ns since `mono_ns`, whether it is not a tick, and its shape
+    index.
+    """
     ticks, others = (
         [(ns, late, kind) for ns, kind in zip(_times(lane), lane.kinds, strict=True)]
         for late, lane in ((False, batch.ticks), (True, batch.others))
@@ -283,7 +293,7 @@ def _whole(brief: Status, reason: str) -> Status:
 
 
 def _instants(spread: Spread) -> Iterator[tuple[list[Instant], Instant]]:
-    """Of each step: when its reads were, and it itself."""
+    """Yield for each step the instants of its port reads and its own instant."""
     ages, offsets = iter(spread.ages), iter(spread.offsets)
     for now_ns, shape in zip(spread.times, spread.shapes, strict=True):
         times = [now_ns - next(ages) for _ in range(shape.reads)]

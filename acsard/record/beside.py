@@ -1,6 +1,8 @@
-"""A file made of a recording stands there whole or not at all: it is written beside its name and
-gets it at the end. What stood there before goes only by force, and only if it can have been such a
-file or a bag: never a recording, nor a directory with anything else in it.
+"""Writes a file or a directory atomically, and never over a recording.
+
+The content is written beside the target under another name and renamed at the end, so the target is
+complete or absent. With `force` an existing target is replaced, but only if it is a plain file or a
+ROS bag. A recording, or a directory that holds anything else, is never replaced.
 """
 
 from __future__ import annotations
@@ -18,15 +20,15 @@ from acsard.record.file import Recording
 METADATA = "metadata.yaml"
 
 OF_A_BAG = (".mcap", ".db3")
-"""What else the directory of a rosbag2 holds."""
+"""Suffixes of the data files of a rosbag2 directory."""
 
 
 @contextmanager
 def beside(new: Path, force: bool) -> Iterator[Path]:
-    """Where to write what is to be `new`, which it is at the end, if all went well.
+    """Yield the path to write to, and rename it to `new` when the block succeeds.
 
-    Raises `FileExistsError` where something is there that must not go, any other `OSError` too;
-    then `new` is as it was and nothing is left behind.
+    Raises `FileExistsError` if `new` must not be replaced, and any other `OSError`. After an error
+    `new` is unchanged and no temporary file is left.
     """
     _require_free(new, force)
     part = _near(new, "part")
@@ -40,13 +42,17 @@ def beside(new: Path, force: bool) -> Iterator[Path]:
 
 
 def synced(stream: BinaryIO) -> None:
-    """What was written is on the disk."""
+    """Flush the stream and sync its file to the disk."""
     stream.flush()
     os.fsync(stream.fileno())
 
 
 def _put(part: Path, new: Path) -> None:
-    """What replaces a directory cannot do so at once: the old one goes when the new is there."""
+    """Rename `part` to `new`.
+
+    A directory cannot be replaced in one call, so the old one is deleted after the new one is in
+    place.
+    """
     if not new.is_dir():
         os.replace(part, new)
         return
@@ -97,7 +103,10 @@ def _is_recording(path: Path) -> bool:
 
 
 def _remove(path: Path) -> None:
-    """File by file: what is more than a bag is not removed."""
+    """Remove a file, or a bag's directory file by file.
+
+    A recursive delete could remove more than a bag.
+    """
     if path.is_dir() and not path.is_symlink():
         for one in path.iterdir():
             one.unlink()

@@ -1,4 +1,4 @@
-"""What a recording says of itself at its end, and what there is to say of one that was cut."""
+"""The metadata record at the end of a recording: its times, its summary and how it was cut off."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from msgspec import Meta, Struct
 from acsard.messages.text import printable
 
 END = "acsard end"
-"""The metadata that is the closing."""
+"""Name of the MCAP metadata record that holds the `Closing`."""
 
 DAMAGE = (
     McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
     ValueError, OverflowError, EOFError, MemoryError,
 )  # fmt: skip
-"""All that the library raises for bytes that are no MCAP."""
+"""Exceptions that the MCAP library raises for bytes that are not valid MCAP."""
 
 Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
-"""A time that calendars have."""
+"""Time in ns since 1970 that fits in a signed 64-bit integer."""
 
 CUTS = {
     "bug": "cut: the daemon ended by a fault of its own",
@@ -33,26 +33,32 @@ CUTS = {
     "late": "cut: the daemon was told to end, and the disk was too slow for the rest",
     "open": "cut, or still being written, when it was recovered",
 }
-"""Why a file does not end as the daemon was told to: all but the first were finished later."""
+"""Causes for a file that does not end with the daemon's ordinary end, each with its words.
+
+The daemon itself writes only the end of a `bug`; a file with another cause is finished later.
+"""
 
 
 class Closing(Struct, frozen=True):
-    """What a finished file says of itself at its end, so that a list need not read all of it."""
+    """Content of the last metadata record, so that a list need not read the whole file."""
 
     wall_ns: Ns
-    """When it began."""
+    """Wall-clock time at which the recording began, ns since 1970."""
     last_ns: Ns
-    """When its last message begins."""
+    """Wall-clock time of the last message, ns since 1970. For steps it is that of the first one."""
     said: str
-    """What happened, in a few words."""
+    """Summary of the events in a few words, as from `story.summary`."""
     cut: str = ""
-    """A word of `CUTS`; "" where the daemon ended as it was told to."""
+    """Key of `CUTS`, or "" if the daemon ended in the ordinary way."""
     why: str = ""
-    """Of a fault of its own: in which step, and what it says."""
+    """For the cause `bug`: the step in which the daemon failed, and the exception."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
-    """In words; "" where there is nothing to say. A word of a later version is only a cut."""
+    """Describe how the recording ends; "" if it ended in the ordinary way.
+
+    A key that only a later version knows is described as "cut".
+    """
     if not cut:
         return ""
     words = CUTS.get(cut, "cut")
@@ -60,17 +66,18 @@ def how_it_ends(cut: str, why: str = "") -> str:
 
 
 def fields(last: Closing) -> dict[str, str]:
-    """As metadata have it."""
+    """Return the closing as MCAP metadata, which holds strings only."""
     return {key: str(value) for key, value in msgspec.to_builtins(last).items()}
 
 
 def closing(path: Path) -> Closing | None:
-    """What the file says of itself at its end; None where it has none, or it cannot be read."""
+    """Read the closing of a file. Return None if it has no closing or cannot be read."""
     try:
         with path.open("rb") as stream:
             for metadata in make_reader(stream).iter_metadata():
                 if metadata.name == END:
                     return msgspec.convert(metadata.metadata, Closing, strict=False)
     except (OSError, *DAMAGE):
-        pass  # who reads all of it will say what is wrong
+        # A caller that reads the whole file reports the damage.
+        pass
     return None

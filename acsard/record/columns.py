@@ -1,9 +1,10 @@
-"""Whole numbers of one kind -> few bits, and back.
+"""Packs a column of integers into few bits, and unpacks it.
 
-Of each number a column keeps how far it is from where it is expected: on a straight line, or a step
-on from the number before, or from the one eight places before. That is told in units of what
-divides all of them: near ones in few bits, whatever their sign, far ones in as many as they need.
-What is the shortest is seen by trying.
+A column stores the difference of each number from its predicted value. The prediction is a straight
+line, the number before plus a constant step, or the number eight places before plus a constant
+step. Differences are counted in units of their common divisor and written as exponential Golomb
+codes. A small difference of either sign takes few bits, a large one takes as many as it needs.
+`pack` tries the predictions and keeps the shortest.
 """
 
 from __future__ import annotations
@@ -16,40 +17,47 @@ from typing import NamedTuple
 from msgspec import Struct
 
 PLACES = (1, 8)
-"""How far back the number may be that another is expected from. What does several things in turn,
-as the simulated microcontroller does eight, takes a time of its own for each."""
+"""Distances, in places, to the number from which the next one is predicted.
+
+A source that serves several things in turn takes a time of its own for each; the simulated board
+has a cycle of eight.
+"""
 
 EXACT = -1
-"""In place of an order: all are exactly where they are expected, and nothing is left to tell."""
+"""Stands in place of `Column.order` if every number equals its prediction, so no codes follow."""
 
 MOST = 1 << 16
-"""Numbers in a column: those that are exact take no room, so a damaged count could ask for any."""
+"""Largest count of numbers in a column. An exact column takes no bytes, so without this bound a
+damaged count could ask for any amount of memory.
+"""
 
 LONGEST = 64
-"""Bits of a number at most."""
+"""Largest order of the codes, and largest number of leading zeros in a code."""
 
 
 class Column(Struct, frozen=True, array_like=True):
-    """Numbers; their count is told elsewhere."""
+    """Packed integers. Their count is not part of the column."""
 
     places: int = 0
-    """From which number before; 0 is along a line."""
+    """Distance to the number that predicts the next one; 0 if a straight line predicts all."""
     order: int = EXACT
-    """Of the codes (exponential Golomb): so many bits have those that are near."""
+    """Order of the exponential Golomb codes: a small difference has about this number of bits."""
     base: int = 0
-    """Where the line begins; else the first number."""
+    """Value at which the straight line begins, or the first number for the other predictions."""
     unit: int = 1
     rise: int = 0
-    """In units: of the line, from the first number to the last; else of the step."""
+    """Total rise of the straight line from the first number to the last, or the constant step,
+    both in units of `unit`.
+    """
     bits: bytes = b""
-    """The highest bit that is set comes before the first code."""
+    """The codes, after a leading bit that is always set."""
 
 
 EMPTY = Column()
 
 
 def pack(values: Sequence[int]) -> Column:
-    """The shortest column of `values`, each of at most 62 bits."""
+    """Pack `values` into the shortest column. Each value has at most 62 bits."""
     if not values:
         return EMPTY
     first = values[0]
@@ -65,7 +73,10 @@ def pack(values: Sequence[int]) -> Column:
 
 
 def unpack(column: Column, count: int) -> list[int]:
-    """The `count` numbers again; raises `ValueError` when they do not fit."""
+    """Return the `count` numbers of a column.
+
+    Raises `ValueError` if the column does not hold them.
+    """
     if not count:
         return []
     if count > MOST or not EXACT <= column.order <= LONGEST:
@@ -83,13 +94,13 @@ def unpack(column: Column, count: int) -> list[int]:
 
 
 class _Try(NamedTuple):
-    """A way to tell numbers."""
+    """Candidate prediction for a column."""
 
     places: int
     base: int
     rise: int
     folded: list[int]
-    """What is left to tell."""
+    """Differences from the prediction, folded to non-negative integers."""
 
 
 def _along(units: list[int], rise: int) -> _Try:
@@ -99,7 +110,10 @@ def _along(units: list[int], rise: int) -> _Try:
 
 
 def _from_before(units: list[int], places: int) -> _Try:
-    """The first ones are told from the one before, without a step."""
+    """Predict each number from the one `places` before.
+
+    The first `places` numbers are predicted from the number before each, without a step.
+    """
     steps = [b - a for a, b in zip(units, units[places:], strict=False)]
     step = _median(steps)
     first = [0, *[b - a for a, b in pairwise(units[:places])]]
@@ -111,7 +125,7 @@ def _median(values: Sequence[int]) -> int:
 
 
 def _rise(values: Sequence[int]) -> int:
-    """Of the straight line with the least squares, from the first to the last."""
+    """Return the total rise of the least-squares straight line through the values."""
     last = len(values) - 1
     return 6 * sum([(2 * n - last) * v for n, v in enumerate(values)]) // (last + 1) // (last + 2)
 
@@ -122,12 +136,12 @@ def _line(rise: int, count: int) -> list[int]:
 
 
 def _folded(values: list[int]) -> list[int]:
-    """0, -1, 1, -2 ... as 0, 1, 2, 3 ..."""
+    """Fold signed integers 0, -1, 1, -2 ... to 0, 1, 2, 3 ..."""
     return [n << 1 if n >= 0 else ~(n << 1) for n in values]
 
 
 def _codes(folded: list[int]) -> tuple[int, bytes]:
-    """The order that makes them short, and the bits."""
+    """Return the order that gives the shortest codes, and the encoded bits."""
     if not any(folded):
         return EXACT, b""
     near = _median(folded).bit_length()
@@ -139,7 +153,11 @@ def _codes(folded: list[int]) -> tuple[int, bytes]:
 
 
 def _length(folded: list[int], order: int) -> int:
-    """Half of the bits that vary: each number takes twice its own length, less the order."""
+    """Return the number of bits of all codes, plus one bit for each.
+
+    The code of n has 2 * bit_length(n + 2**order) - order - 1 bits. The added bit is the same for
+    every order, so it does not change which order is the best.
+    """
     more = 1 << order
     return 2 * sum([(n + more).bit_length() for n in folded]) - order * len(folded)
 

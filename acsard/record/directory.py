@@ -1,11 +1,12 @@
-"""A directory of recordings, bounded in bytes, days and by the room there is on the disk.
+"""The directory of recordings, bounded in bytes, in days and by the free space of the disk.
 
-    000012-20261121T070027Z.mcap.part   being written, or cut by a crash
+    000012-20261121T070027Z.mcap.part   being written, or cut off by a crash
     000012-20261121T070027Z.mcap        finished
-    000012-20261121T070027Z.near.mcap   finished, less than a minute from what happened
-    000012-20261121T070027Z.kept.mcap   finished, and something happened in it
+    000012-20261121T070027Z.near.mcap   finished, less than a minute from an incident
+    000012-20261121T070027Z.kept.mcap   finished, and an incident happened in it
 
-The number gives the order, whatever the clocks said. `room` says which of them go.
+The number gives the order of the files, even if the wall clock was set. `room` decides which files
+are deleted.
 """
 
 from __future__ import annotations
@@ -32,12 +33,15 @@ from acsard.values import NS_PER_S, Instant
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Where the service records. Root alone gets to the directory around it, and the page, whose unit
-has it mounted read-only. No group would do: a dynamic one has no name, and later systemds (257)
-keep a state directory as nobody's on the disk."""
+"""Modes of the directory and its files when the daemon records as a systemd service: open to all.
+
+They are safe because only root can enter the directory above, and the unit of the robot's page
+mounts this one read-only. A group cannot give this access: a dynamic group has no name, and later
+versions of systemd (257) keep a state directory as nobody's on the disk.
+"""
 
 PRIVATE = Path("/var/lib/private")
-"""Of services with a user of their own; only root gets in there."""
+"""Parent of the state directories of services with a dynamic user; only root can enter it."""
 
 KEPT = ".kept.mcap"
 NEAR = ".near.mcap"
@@ -45,25 +49,27 @@ WHOLE = ".mcap"
 PART = ".mcap.part"
 
 LEFT = ".left"
-"""The ending of the mark of a file that no crash has cut."""
+"""Suffix of the marker file that says that a `.part` file was not cut off by a crash."""
 
 ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
 TRIM_ROUNDS = 600
-"""Between two looks for what is too old: a file may grow for an hour."""
+"""Calls of `tend`, one per second, between two searches for files that are too old. A file may
+grow for an hour, so ten minutes are often enough.
+"""
 
 S_PER_DAY = 86400
 
 STAMP = "%Y%m%dT%H%M%SZ"
-"""UTC, in the name of a file: when it began."""
+"""Format of the time at which a file began, in UTC, as its name holds it."""
 
 
 def listed(directory: Path) -> list[Path]:
-    """The recordings in it, oldest first."""
+    """Return the recordings in a directory, oldest first."""
     found = [
         path
         for path in directory.iterdir()
-        # A link or a pipe of such a name is none of ours, and may not even end.
+        # A link or a pipe with such a name is not a recording, and reading a pipe may never end.
         if _number(path) is not None and path.is_file() and not path.is_symlink()
     ]
     return sorted(found, key=lambda path: (_number(path), path.name))
@@ -83,21 +89,24 @@ def _stem(path: Path) -> str:
 
 
 def _stem_of(mark: Path) -> str:
-    """Of the file that it is a mark of."""
+    """Return the stem of the recording to which a marker file belongs."""
     return mark.name[1:].partition(PART)[0]
 
 
 def leave(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """The disk is too slow for the end of this file, or takes no more: no crash has cut it.
+    """Mark a `.part` file whose end the disk did not take, so that it does not pass for a crash.
 
-    A mark beside it says so, and what the file is: by its name, which a full disk takes, and whole
-    or not at all. Raises `OSError`.
+    The name of an empty marker file holds the retention class and the cause. A full disk still
+    takes a name, and it is there completely or not at all. Raises `OSError`.
     """
     part.with_name(f".{part.name}.{kind}.{cut}{LEFT}").touch()
 
 
 def _left(part: Path) -> tuple[Kind, str] | None:
-    """What the file is that no crash has cut, and what has; None where a crash may have."""
+    """Return the retention class and the cause from a file's marker.
+
+    Returns None for a file without a marker: a crash may have cut it off.
+    """
     for mark in part.parent.glob(f".{part.name}.*{LEFT}"):
         first, _, cut = mark.name.removeprefix(f".{part.name}.").removesuffix(LEFT).partition(".")
         for kind in ENDINGS:
@@ -107,39 +116,47 @@ def _left(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """What a daemon knows of its recordings from its start on, whatever becomes of the disk."""
+    """State that lasts as long as the daemon, even if `Ring` is opened again after a disk error."""
 
     numbers: set[int] = field(default_factory=set)
-    """Of the files that ended in it."""
+    """Numbers of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """The files that the disk has cut in it, by name. What else is cut, a crash has cut before."""
+    """Retention classes, by name, of the files that a disk error cut off in this run. Any other
+    cut file was cut off by a crash before this run.
+    """
     given: int = 0
-    """bytes of recordings that went for a disk that refused, and has taken nothing since."""
+    """Bytes deleted since a disk refused to write, as long as it still refuses."""
     clock: Steady = field(default_factory=Steady)
 
 
 class Ring:
-    """Makes room, begins and ends files. Everything may raise `OSError`."""
+    """Directory of recordings, in which files begin, end and are deleted.
+
+    Every method may raise `OSError`.
+    """
 
     def __init__(
         self, settings: RecordConfig, run: Run | None = None, refused: bool = False
     ) -> None:
-        """Take the directory, and make whole what was cut; `refused` says that the disk was
-        full."""
+        """Lock the directory, make room in it, and finish the files that were cut off.
+
+        `refused` says that the last write failed because the disk was full.
+        """
         self._directory = Path(settings.directory)
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self._run = run or Run()
         self._rounds = self.file_bytes = 0
         self.said: list[str] = []
-        """What did not become whole, and why."""
+        """Messages about files that could not be finished."""
         self.cut_ns: int | None = None
-        """When a crash has cut the newest, ns since 1970."""
+        """Time at which a crash cut off the newest file, ns since 1970, or None."""
         here = self._directory.resolve()
         self._open = os.environ.get(RECORD) == settings.directory and here.is_relative_to(PRIVATE)
         if not self._directory.is_dir():
             self._directory.mkdir(parents=True)
-            self._directory.chmod(DIRECTORY_MODE)  # whatever the umask takes away
-        # Nobody else may open this one: who can, can hold it.
+            # The umask may have removed bits of the mode.
+            self._directory.chmod(DIRECTORY_MODE)
+        # No other user may open this file: a process that can open it can hold the lock.
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -148,12 +165,15 @@ class Ring:
             raise OSError(error.errno, "another daemon records there") from None
         try:
             for left in self._directory.glob(f".*{PART}.new"):
-                left.unlink()  # a copy that did not become whole
-            self.trim(None, refused)  # first: what is made whole needs room
+                # This copy was not completed.
+                left.unlink()
+            # Make room first, because finishing a file needs some.
+            self.trim(None, refused)
             self._recover()
             for mark in self._directory.glob(f".*{PART}.*{LEFT}"):
                 if not mark.with_name(f"{_stem_of(mark)}{PART}").exists():
-                    mark.unlink()  # what it was of is whole now
+                    # The file of this marker is finished.
+                    mark.unlink()
         except OSError:
             self.close()
             raise
@@ -165,13 +185,15 @@ class Ring:
             try:
                 seen, left, disk = part.stat(), _left(part), self._disk()
             except FileNotFoundError:
-                continue  # somebody removes it just now
+                # Another process has just removed the file.
+                continue
             ours = self._run.cut.get(part.name)
             kind, cut = (ours, "disk") if ours else left or ("kept", "crash")
             whole = part.with_name(_stem(part) + ENDINGS[kind])
             try:
                 said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
-            except OSError as error:  # to record what comes is more than that
+            # Recording new steps is more important than finishing an old file.
+            except OSError as error:
                 said = f"{part.name} cannot be made whole: {error.strerror}"
             self.said += [said] if said else []
             if ours:
@@ -181,28 +203,33 @@ class Ring:
                 self._near(part, seen.st_mtime_ns)
 
     def _near(self, part: Path, cut_ns: int) -> None:
-        """What ended less than a minute before it stays, too."""
+        """Retain the files that ended less than a minute before the crash that cut off `part`."""
         for path in listed(self._directory):
-            with suppress(FileNotFoundError):  # somebody removes it just now
+            # Another process may have just removed the file.
+            with suppress(FileNotFoundError):
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = (_number(path) or 0) < (_number(part) or 0)
                 if earlier and before_ns < AROUND_NS:
                     self.keep(path)
 
     def _let_in(self) -> None:
-        """Also to what a version has left that recorded for itself alone."""
+        """Give the service's modes to the directory and to all files in it.
+
+        An earlier version of acsard may have left files that only its own user can read.
+        """
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
-            with suppress(OSError):  # somebody else's: to record comes first
+            # The file may belong to another user. Recording goes on in any case.
+            with suppress(OSError):
                 if stat.S_IMODE(path.stat().st_mode) != mode:
                     path.chmod(mode)
 
     def close(self) -> None:
-        """Give the directory back."""
+        """Release the lock of the directory."""
         os.close(self._lock)
 
     def begin(self, about: About) -> Writing:
-        """A new file, after the newest."""
+        """Begin a new file, with a number above every other."""
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
@@ -212,7 +239,10 @@ class Ring:
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file, as `Writing.finish`; where it is now."""
+        """Finish a file as `Writing.finish` does.
+
+        Returns its new path, named by its retention class.
+        """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
@@ -221,21 +251,28 @@ class Ring:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """What ended less than a minute ago by the wall clock, and when by the other one, ns."""
+        """Yield the files that ended less than a minute ago by the wall clock.
+
+        Each comes with its retention class and its end in ns of the monotonic clock.
+        """
         for one in self._ended():
             ago_ns = now.wall_ns - int(one.at_s * NS_PER_S)
             if 0 <= ago_ns < AROUND_NS:
                 yield self._directory / one.name, one.kind, now.mono_ns - ago_ns
 
     def keep(self, path: Path) -> None:
-        """Something happened close to what is in this finished file."""
+        """Retain a finished plain file, because an incident happened within a minute of it."""
         if path.name.endswith(WHOLE) and _kind(path) == "plain":
-            with suppress(FileNotFoundError):  # somebody has removed it
+            # Another process may have removed the file.
+            with suppress(FileNotFoundError):
                 path.rename(path.with_name(_stem(path) + NEAR))
             self._sync()
 
     def tend(self, now: Instant) -> None:
-        """Once a second: where others want the room, or days have gone by, the oldest go."""
+        """Delete the oldest files when the disk is low, and in every `TRIM_ROUNDS`-th call.
+
+        Call it once a second.
+        """
         jumped_ns = self._run.clock.look(now)
         if jumped_ns:
             self._set(jumped_ns)
@@ -244,18 +281,22 @@ class Ring:
             self.trim(now)
 
     def _set(self, jumped_ns: int) -> None:
-        """The clock was set: what ended in this run is no older for that."""
+        """Shift the file times of this run by the step of the wall clock, so that the files do
+        not look older or newer than they are.
+        """
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
-                with suppress(FileNotFoundError):  # somebody removes it just now
+                # Another process may have just removed the file.
+                with suppress(FileNotFoundError):
                     seen = path.stat()
                     at_ns = max(0, seen.st_mtime_ns + jumped_ns)
                     os.utime(path, ns=(seen.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Remove what is too much or too old; what is being written stays.
+        """Delete the files that exceed the bounds in bytes or in age.
 
-        `now` is None where no clock was looked at.
+        The file that is being written stays. `now` is None before a clock has been read; then no
+        file counts as too old.
         """
         ended, disk = self._ended(), self._disk()
         believed = now is not None and self._run.clock.believed(now)
@@ -267,7 +308,8 @@ class Ring:
         if refused:
             self._run.given += sum(one.size for one in ended if one.name in gone)
         for name in gone:
-            with suppress(OSError):  # somebody else's: to record comes first
+            # The file may belong to another user. Recording goes on in any case.
+            with suppress(OSError):
                 (self._directory / name).unlink()
         own = sum(one.size for one in ended)
         self.file_bytes = share(self._bytes, own, disk)
@@ -277,7 +319,8 @@ class Ring:
         for path in listed(self._directory):
             if path.name.endswith(PART):
                 continue
-            with suppress(FileNotFoundError):  # somebody removes it just now
+            # Another process may have just removed the file.
+            with suppress(FileNotFoundError):
                 seen, number = path.stat(), _number(path) or 0
                 here = number in self._run.numbers
                 size, at_s = seen.st_size, seen.st_mtime
@@ -286,12 +329,13 @@ class Ring:
 
     def _disk(self) -> Disk:
         told = os.statvfs(self._directory)
-        if not told.f_blocks:  # it does not say
+        # The file system does not report its size.
+        if not told.f_blocks:
             return Disk(0, self._bytes)
         return Disk(told.f_blocks * told.f_frsize, told.f_bavail * told.f_frsize)
 
     def _sync(self) -> None:
-        """The names are on the disk too."""
+        """Sync the directory, so that the names of the files are on the disk."""
         handle = os.open(self._directory, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(handle)

@@ -1,8 +1,9 @@
-"""The disk's side of the black box: the ring of files, the one being written, and how it goes.
+"""The recorder's thread: writes steps to the current file and reacts to disk errors.
 
-One thread has it. A round takes what has come since the last: writes, syncs, begins and ends files,
-keeps those around what happened. A disk that refuses costs what came in that round, is left alone
-for some, and is tried again; what follows begins a new file with the robot's state.
+A single thread calls `round` about once a second. It writes and syncs the steps that have arrived,
+begins and ends files, and retains the files around an incident. If the disk refuses, the steps of
+that round are lost and counted. The recorder then pauses for `RETRY_ROUNDS` rounds and tries again
+with a new file, which begins with the robot's state.
 """
 
 from __future__ import annotations
@@ -27,30 +28,30 @@ from acsard.record.story import told
 from acsard.values import NS_PER_S, Event, Instant
 
 RETRY_ROUNDS = 5
-"""Between two tries of a disk that refused."""
+"""Rounds to wait, about one second each, after the disk refused."""
 
 BATCH = 256
-"""Steps in a message at most: as many as a second has, unless commands pour in."""
+"""Largest number of steps in one message. One second has fewer, unless many commands arrive."""
 
 LONGEST_NS = 3600 * NS_PER_S
-"""What a file holds at most."""
+"""Longest time that one file may cover."""
 
 HAPPENED = frozenset({"fault", "stop", "link_down", "link_stale", "port_lost"})
-"""Events whose minutes are kept."""
+"""Events that count as incidents: the files within a minute of them are retained."""
 
 
 class Bug(NamedTuple):
-    """The fault of its own that the daemon ends by."""
+    """A failure of the daemon itself, which ends it."""
 
     why: str
     at: Instant | None
-    """Of the step that it ended, if it was in one."""
+    """Instant of the step that failed; None if the daemon failed outside a step."""
     unfinished: bytes
-    """That step; empty where it cannot be written."""
+    """Encoded inputs of that step; empty if they cannot be encoded."""
 
 
 class OnDisk:
-    """The ring, the file, and how the disk takes it."""
+    """The directory, the file that is being written, and the state of the disk."""
 
     def __init__(
         self,
@@ -63,33 +64,38 @@ class OnDisk:
         self.where = config.record.directory
         self.trouble = ""
         self.missing = 0
-        """Steps that came while the disk took nothing."""
+        """Number of steps lost because the disk refused to write."""
         self._config, self._say, self._ask = config, say, ask
         self._ring: Ring | None = None
         self._writing: Writing | None = None
         self._start: Start | None = Start(0, b"", config)
-        """What the next file begins with; None when steps before it are missing."""
+        """Start of the next file; None if steps were lost, so that a new robot state is needed."""
         self._around = Around[Path]()
         self._number = self._began_ns = 0
         self._last = Instant(0, 0)
         self._reason: str | None = None
-        """The last one written to this file."""
+        """Status reason of the last step that was written to this file."""
         self._told = self._refused = False
         self._looked_back = False
-        """At what the run before this one has left."""
+        """True once the files of the previous run have been examined."""
         self._run = Run()
         self._cut_ns: int | None = None
-        """When a crash has cut what was before this run, wall clock, once that is whole; looked at
-        once."""
+        """Wall-clock time at which a crash cut off the previous run's file, ns since 1970. It is
+        set when that file is finished and used once.
+        """
         self.bug: Bug | None = None
-        """By which the daemon ends; looked at in the last round."""
+        """The failure that ends the daemon; read in the last round."""
         self._pause = 0
         self._handed = self._safe = 0
-        """Steps of this round: given to the file, or counted as missing, and how many of them are
-        synced, or counted. What a disk that refuses has not synced is gone."""
+        """Steps of this round that were written to the file or counted as missing, and how many
+        of them are synced or counted. Steps that are not synced when the disk refuses are lost.
+        """
 
     def round(self, items: list[Taken | Start], over: bool) -> None:
-        """Write what came, or count it as missing."""
+        """Write the items that have arrived, or count them as missing.
+
+        `over` marks the last round.
+        """
         self._handed = self._safe = 0
         try:
             if self._pause == 0 or over:
@@ -109,15 +115,19 @@ class OnDisk:
             self._ask()
 
     def leave(self, cut: Literal["late", "disk"]) -> None:
-        """Whatever becomes of the file that is being written, no crash has cut it. Called in a
-        thread of its own where the daemon ends while this one still waits for the disk."""
+        """Mark the file that is being written, so that it does not pass for one cut off by a crash.
+
+        If the daemon ends while this object's thread still waits for the disk, another thread calls
+        this.
+        """
         writing = self._writing
         if writing is not None:
-            with suppress(OSError):  # then the next start takes it for a crash's
+            # Without the marker, the next start treats the file as cut off by a crash.
+            with suppress(OSError):
                 leave(writing.path, self._around.kind, cut)
 
     def _take(self) -> Ring:
-        """The directory, and what is told of it."""
+        """Open the directory, and report the files that could not be finished."""
         ring = Ring(self._config.record, self._run, self._refused)
         self._refused, self._cut_ns = False, ring.cut_ns or self._cut_ns
         for text in ring.said:
@@ -174,18 +184,18 @@ class OnDisk:
             self._writing.add("state", now.wall_ns, start.state)
 
     def _look_back(self, ring: Ring, now: Instant) -> None:
-        """The minute before what happens, and after what happened, goes on over a restart."""
+        """Carry the minute before and after an incident over a restart of the daemon."""
         for path, kind, ended_ns in ring.just_ended(now):
             self._around.earlier(path, kind, ended_ns)
         self._looked_back = True
 
     def _happened(self, ring: Ring, now: Instant) -> None:
-        """This file stays, and what is less than a minute before it."""
+        """Retain the current file and those that ended less than a minute before."""
         for path in self._around.happened(now.mono_ns):
             ring.keep(path)
 
     def _die(self, ring: Ring, bug: Bug) -> None:
-        """What came into the last step, and that the file stays, as after a crash."""
+        """Write the inputs of the step that failed, and retain the file as after a crash."""
         if bug.at is not None and self._writing is None and self._start is not None:
             self._begin(ring, self._start, bug.at)
         if self._writing is None:

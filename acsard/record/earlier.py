@@ -1,7 +1,8 @@
-"""Batches of format 1, which recordings had until version 0.1.0: read, and written no more.
+"""Reads batches of format 1, which recordings had until version 0.1.0.
 
-A column was the difference of each number from the median, in units of what divides all of them;
-all lowest bytes came first, then all next ones.
+Nothing writes this format any more. A column of format 1 holds the difference of each number from
+the median, in units of the common divisor of all differences. All lowest bytes come first, then all
+second bytes, and so on.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ class Batch1(Struct, frozen=True, array_like=True):
     count: int
     kinds: bytes
     ticks: bytes
-    """ns from the tick before (the first: from `mono_ns`) to each tick."""
+    """Column with the ns from each tick to the next; the first counts from `mono_ns`."""
     others: bytes
-    """ns from the step before to each step that is none."""
+    """Column with the ns from the step before to each step that is not a tick."""
     offsets: bytes
-    """From instant to instant."""
+    """Column with the change of the wall clock's offset from instant to instant, ns."""
     ages: bytes
     lengths: bytes
     received: bytes
     written: bytes
     xs: bytes
-    """From pose to pose."""
+    """Column with the change from pose to pose, um; `ys` and `yaws` alike, `yaws` in urad."""
     ys: bytes
     yaws: bytes
     checksum: int
@@ -46,7 +47,10 @@ class Batch1(Struct, frozen=True, array_like=True):
 
 
 def spread(batch: Batch1) -> Spread:
-    """Its columns unpacked; raises `ValueError` or `IndexError` where they do not fit."""
+    """Unpack the columns of a batch.
+
+    Raises `ValueError` or `IndexError` if their lengths do not match.
+    """
     if min([n for shape in batch.shapes for n in shape], default=0) < 0:
         raise ValueError("a number below 0")
     kinds = unpack(batch.kinds, batch.count)
@@ -72,7 +76,10 @@ def spread(batch: Batch1) -> Spread:
 
 
 def unpack(data: bytes, count: int) -> list[int]:
-    """The `count` numbers of a column; raises `ValueError` when they do not fit."""
+    """Return the `count` numbers of a column.
+
+    Raises `ValueError` if the column does not hold them.
+    """
     if not count:
         return []
     if count > MOST or len(data) < _HEAD.size:

@@ -1,4 +1,4 @@
-"""A recording -> files for other programs: what the robot said then, or a table of what it did."""
+"""Exports a recording for other programs: as ROS messages in MCAP or a ROS bag, or as CSV."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from acsard.values import NS_PER_S, Outputs
 Kind = Literal["mcap", "csv", "rosbag2"]
 
 SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
-"""What a name is made with where none is given."""
+"""Suffix of the exported file if the user gives no name."""
 
 
 class Span(NamedTuple):
-    """From when to when, s after the beginning, however the clock was set in between."""
+    """Time span to export, s after the beginning by the monotonic clock."""
 
     begin: float = -math.inf
     end: float = math.inf
@@ -41,26 +41,26 @@ WHOLE = Span()
 
 
 class Done(Struct, frozen=True):
-    """What was written."""
+    """Result of an export."""
 
     count: int
-    """Messages, or lines of a table."""
+    """Number of messages, or of lines of a table."""
     trouble: str
-    """Why it ends before the recording does, "" when it does not."""
+    """Why the export ends before the recording does; "" if it is complete."""
 
 
 class _Sink(Protocol):
     count: int
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        """Write what there is of a step that has been lived."""
+        """Write the output of a replayed step."""
 
     def finish(self) -> None:
-        """Write the end."""
+        """Write the end of the file."""
 
 
 class _Messages:
-    """Writes MCAP."""
+    """Writer of ROS messages to an MCAP file."""
 
     def __init__(self, stream: BinaryIO, robot: Robot, about: About, name: str) -> None:
         self._publisher = Publisher(robot, about.started_ns or about.wall_ns)
@@ -75,7 +75,7 @@ class _Messages:
         self._counts: dict[int, int] = {}
         self.count = 0
         self.times: tuple[int, int] = (0, 0)
-        """Of the first and the last message."""
+        """Wall-clock times of the first and the last message, ns."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
         for one in self._publisher.step(step, outputs):
@@ -94,7 +94,7 @@ class _Messages:
         self.count += 1
 
     def _open(self, channel: Channel, source: str) -> int:
-        """The number of a channel that is new, by the file."""
+        """Register a new channel, and return its number in the file."""
         kind = channel.schema_name
         if kind not in self._schemas:
             text = channel.schema.encode()
@@ -120,7 +120,7 @@ class _Messages:
 
 
 class _Table:
-    """Writes CSV."""
+    """Writer of the table as CSV."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -144,11 +144,11 @@ def export(
     progress: Progress = quietly,
     force: bool = False,
 ) -> Done:
-    """Write `new`, a file or, of `rosbag2`, a directory.
+    """Export a recording to `new`: a file, or a directory for `rosbag2`.
 
-    `other` is a configuration in place of the recording's own. Raises `RecordingError` where there
-    is nothing to write, `FileExistsError` where it would take the place of something, unless
-    `force`, and any other `OSError`; then nothing is left behind.
+    `other` replaces the recording's own configuration. Raises `RecordingError` if there is nothing
+    to write, `FileExistsError` if `new` must not be replaced (with `force` it may, see `beside`),
+    and any other `OSError`. After an error no partial file is left.
     """
     course = Course(recording, other)
 
@@ -193,7 +193,10 @@ def _all(course: Course, sink: _Sink, span: Span, progress: Progress) -> None:
 
 
 def measured(recording: Recording) -> bytes:
-    """The table that `acsard calibrate` reads; raises `RecordingError` if it were no use."""
+    """Return the CSV table that `acsard calibrate` reads.
+
+    Raises `RecordingError` if the recording has no gyro samples, because calibration cannot use it.
+    """
     course = Course(recording)
     lines, turned = [table.MEASURED_HEADER], False
     with course.living():

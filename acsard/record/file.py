@@ -1,10 +1,14 @@
-"""One recording as an MCAP file: written chunk by chunk, read whatever became of it.
+"""One recording as an MCAP file: written chunk by chunk, and readable even if cut off or damaged.
 
-Four channels: `steps` (`batch.py`'s), `events` (JSON, one each), `state` (a robot as
-`state.py` writes it, first of all where the file does not begin with the daemon), `unfinished`
-(what came into the step that a fault of the daemon's own ended). A metadata record says whose it
-is, an attachment is its `acsard.toml`. A file that was cut has no end: what is whole of it is read
-all the same, and `rewrite` makes a finished file of it.
+A file has four channels:
+- `steps`: batches of steps, as `batch.py` encodes them.
+- `events`: one event per message, in JSON.
+- `state`: a robot, as `state.py` writes it. It comes first if the file begins after the daemon.
+- `unfinished`: the inputs of the step in which the daemon failed.
+
+A metadata record says which robot and which version recorded it, and an attachment holds its
+`acsard.toml`. A file that was cut off has no end. Its whole chunks can still be read, and `rewrite`
+makes a finished file of them.
 """
 
 from __future__ import annotations
@@ -32,39 +36,43 @@ from acsard.record.walk import walk
 from acsard.values import NS_PER_S
 
 CHUNK_BYTES = 32 * 1024
-"""Uncompressed; what is not flushed before is written then."""
+"""Uncompressed size at which a chunk is written if no flush comes before."""
 
 MODE = 0o640
-"""The service's group may read it."""
+"""Mode of a recording: the service's group may read it."""
 
 FORMATS = (earlier.FORMAT, FORMAT)
-"""Of the messages in it: those that are read here."""
+"""Formats of the messages that this version reads."""
 
 Topic = Literal["steps", "events", "state", "unfinished"]
 
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-"""In the order of their numbers, from 1. The first chunk tells them, which may be a damaged one."""
+"""Channels in the order of their numbers, from 1. The first chunk defines the channels, but it
+may be damaged, so the reader relies on this order.
+"""
 
 
 class About(Struct, frozen=True):
-    """Whose recording it is."""
+    """Metadata of a recording: which robot, program and configuration made it."""
 
     robot: str
     version: str
-    """Of acsard."""
+    """Version of acsard."""
     python: str
     mono_ns: Ns
     wall_ns: Ns
-    """Both clocks when it began."""
+    """Wall-clock time at which the recording began, ns since 1970; `mono_ns` is the same instant
+    by the monotonic clock.
+    """
     config: str = ""
-    """The `acsard.toml` in force, all keys in it."""
+    """The `acsard.toml` in force, with every key."""
     format: str = FORMAT
     started_ns: Ns = 0
-    """Wall-clock time of the daemon's start, which may be hours before; 0 where it is not known."""
+    """Wall-clock time of the daemon's start, ns since 1970, perhaps hours before; 0 if unknown."""
 
 
 class Gist:
-    """What a list says of a recording, taken from its messages one by one."""
+    """Summary of a recording, collected from its messages."""
 
     def __init__(self, about: About) -> None:
         self._wall_ns = self._last_ns = about.wall_ns
@@ -72,7 +80,7 @@ class Gist:
         self._starts = False
 
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Any; what an event tells comes by `event`."""
+        """Take a message of any channel. The content of an event comes through `event`."""
         self._last_ns = max(self._last_ns, wall_ns)
         if topic == "steps":
             self._starts = self._starts or first_of(data) == 0
@@ -81,19 +89,25 @@ class Gist:
                 self._starts = self._starts or unfinished(data).number == 0
 
     def event(self, told: Told) -> None:
-        """What happened."""
+        """Take an event for the summary."""
         if told.name in NEWS:
             self._news.append(told)
 
     def closing(self, cut: str = "", why: str = "") -> Closing:
-        """All of it; `cut`, a word of `CUTS`, and `why` say how the daemon ended, where not as it
-        was told to."""
+        """Return the closing of the file.
+
+        `cut` is a key of `CUTS` and `why` its explanation if the daemon did not end in the ordinary
+        way.
+        """
         said = summary(self._news, self._starts)
         return Closing(self._wall_ns, self._last_ns, said, cut, why)
 
 
 class Writing:
-    """A recording that grows. Everything may raise `OSError`; then nothing more is written."""
+    """A recording that is being written.
+
+    Every method may raise `OSError`, and after that the object must not be written to.
+    """
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
@@ -106,7 +120,8 @@ class Writing:
             raise
 
     def _open(self, about: About) -> None:
-        os.fchmod(self._file.fileno(), self._mode)  # whatever the umask takes away
+        # The umask may have removed bits of the mode.
+        os.fchmod(self._file.fileno(), self._mode)
         self._writer = Writer(
             self._file, CHUNK_BYTES, index_types=IndexType.ATTACHMENT | IndexType.METADATA
         )
@@ -129,29 +144,30 @@ class Writing:
 
     @property
     def size(self) -> int:
-        """Bytes written so far."""
+        """Number of bytes written so far."""
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Write a message; it is in the file when its chunk is full, or by `flush`."""
+        """Add a message. It reaches the file when its chunk is full, or by `flush`."""
         self._gist.message(topic, wall_ns, data)
         self._writer.add_message(self._channels[topic], max(0, wall_ns), data, max(0, wall_ns))
 
     def event(self, told: Told) -> None:
-        """Write an event, and remember what a list says of it."""
+        """Add an event, and take it for the summary."""
         wall_ns = int(told.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(told))
         self._gist.event(told)
 
     def flush(self) -> None:
-        """What was added is a whole chunk, and on the disk."""
+        """Write the messages added so far as a whole chunk, and sync it to the disk."""
         self._writer.flush()
         os.fsync(self._file.fileno())
-        if not os.fstat(self._file.fileno()).st_nlink:  # the disk takes it, and nobody will find it
+        # The disk accepts the data, but nobody can find a file without a name.
+        if not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it; `cut` and `why` as for `Gist.closing`."""
+        """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
         self._writer.add_metadata(END, fields(self._gist.closing(cut, why)))
         self._writer.finish()
         self._file.flush()
@@ -159,42 +175,49 @@ class Writing:
         self._file.close()
 
     def close(self) -> None:
-        """Close it as it is: without an end, if it has none yet."""
+        """Close the file without writing an end."""
         try:
             self._file.close()
         except OSError:
-            pass  # a disk that takes nothing takes no rest of a buffer either
+            # A disk that refuses to write does not take the rest of a buffer either.
+            pass
 
 
 class Recording:
-    """A file read from its beginning to where it is whole."""
+    """A recording read from a file, as far as the file is whole."""
 
     def __init__(self, path: Path) -> None:
-        """Raises `RecordingError` if it cannot be read, or is no recording of acsard's."""
+        """Read the file.
+
+        Raises `RecordingError` if it cannot be read or is not a recording of acsard.
+        """
         self.path = path
         try:
             self._data = path.read_bytes()
         except OSError as error:
             raise RecordingError(f"cannot read {path}: {error.strerror}") from None
         self.ended = False
-        """It was read to its end, and has one."""
+        """True once the file was read to its end, and it has an end record."""
         self.damaged = 0
-        """Places in the midst of others, a chunk mostly, that could not be read."""
+        """Number of damaged places, mostly chunks, between readable ones."""
         self.cut = ""
-        """A word of `CUTS` where the daemon has not ended as it was told to."""
+        """Key of `CUTS` if the daemon did not end in the ordinary way, else ""."""
         self.why = ""
-        """By which fault of its own."""
+        """For the cause `bug`: the step in which the daemon failed, and the exception."""
         self.unfinished: bytes | None = None
-        """The step that was ended by it."""
+        """Encoded inputs of the step in which the daemon failed."""
         self.about = self._about()
 
     @property
     def whole(self) -> bool:
-        """It has an end, and nothing before it is damaged."""
+        """True if the file has an end and nothing before it is damaged."""
         return self.ended and not self.damaged
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
-        """Topic, wall-clock time in ns and bytes of each; sets what there is to say of all."""
+        """Yield the topic, the wall-clock time in ns and the bytes of each message.
+
+        Reading also sets `ended`, `damaged`, `cut`, `why` and `unfinished`.
+        """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
         topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
@@ -237,10 +260,10 @@ class Recording:
 
 
 def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
-    """All that is whole of it as a new, finished file; the number of messages.
+    """Write all readable messages to a new, finished file at `path`, and return their number.
 
-    `cut` says why, where it has no end. Raises `OSError`, and leaves nothing behind where it
-    cannot be written.
+    `cut` is the cause to store if the recording lacks its end. Raises `OSError`, or
+    `RecordingError` for an event that cannot be decoded; then no file is left at `path`.
     """
     writing = Writing(path, recording.about)
     try:
@@ -260,7 +283,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def event_of(recording: Recording, data: bytes) -> Told:
-    """Raises `RecordingError` where it is none."""
+    """Decode an event; raise `RecordingError` if the bytes are not an event."""
     try:
         return msgspec.json.decode(data, type=Told)
     except msgspec.MsgspecError as error:

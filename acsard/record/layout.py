@@ -1,5 +1,7 @@
-"""The shape of a batch of steps, as `batch.py` writes and reads it. Another is another format:
-what reads this one goes to a module of its own then, as `earlier.py` is for the first.
+"""The layout of a batch of steps, which `batch.py` writes and reads.
+
+A change of this layout is a new format. The reader of the old one then moves to a module of its
+own, as `earlier.py` is for format 1.
 """
 
 from __future__ import annotations
@@ -13,23 +15,23 @@ from acsard.record.steps import Micropose, Status
 from acsard.values import Command, Event, GyroSample, Refusal, Request
 
 FORMAT = "2"
-"""Of what is in a recording: another number is another meaning."""
+"""Format of the messages in a recording. A new number means a new encoding."""
 
 SAME = "\x00"
-"""In place of a reason: as before."""
+"""Stands in place of a status reason that equals the one before."""
 
 TICK, OPEN, AT_ONCE, LEAVING, SUPERSEDED, LINE, LEFT = (1 << n for n in range(7))
-"""What is so or not of a step: the bits of `Shape.flags`."""
+"""The bits of `Shape.flags`, each a fact about a step."""
 
 
 class Rare(Struct, frozen=True, omit_defaults=True):
-    """What most steps have not: absent is as in the step before, or nothing."""
+    """Values that most steps do not have. An absent value is as in the step before, or empty."""
 
     opened: int | None = None
     trouble: str | None = None
     status: Status | None = None
     left: bytes = b""
-    """What left in place of the line."""
+    """Bytes that were sent to the board in place of the decided line."""
     missed: int = 0
     guard_trip: str = ""
     commands: tuple[Command, ...] = ()
@@ -44,17 +46,17 @@ NOTHING = Rare()
 
 
 class Shape(NamedTuple):
-    """What one step has as many others have it."""
+    """Properties of one step that many other steps share."""
 
     flags: int
     reads: int
     poses: int
     line: int
-    """Bytes."""
+    """Length of the line in bytes."""
 
 
 class Standing(NamedTuple):
-    """What stays for long; as it was at the first step."""
+    """Values that stay the same for a long time, as they are at the first step of the batch."""
 
     opened: int
     trouble: str
@@ -62,38 +64,41 @@ class Standing(NamedTuple):
 
 
 class Lane(Struct, frozen=True, array_like=True):
-    """Steps that come in their own rhythm."""
+    """Steps of one rhythm: the ticks, or all others."""
 
     kinds: bytes
-    """Which of the shapes each has."""
+    """Index into `Batch.shapes` for each step, one byte each."""
     times: Column
-    """ns from `mono_ns`."""
+    """Time of each step in ns from `Batch.mono_ns`."""
 
 
 class Batch(Struct, frozen=True, array_like=True):
-    """As it is written."""
+    """A batch of steps as it is written."""
 
     first: int
     mono_ns: int
     offset_ns: int
-    """The two clocks at the first instant: what the columns are differences from."""
+    """Offset of the wall clock from the monotonic clock at the first instant, ns. The columns
+    hold differences from this offset and from `mono_ns`.
+    """
     standing: Standing
     shapes: tuple[Shape, ...]
-    """The kinds of steps there are, few of them."""
+    """The distinct shapes of the batch's steps, which are few."""
     ticks: Lane
     others: Lane
-    """The steps that are no ticks: a line was read, or a command is to go at once."""
+    """The steps that are not ticks: a feedback line was read, or a command is sent at once."""
     order: bytes
-    """Of each step whether it is a tick; empty where their times say it (a tick is the first of
-    several at one time)."""
+    """One byte for each step that says whether it is a tick. It is empty if the times give the
+    order; of several steps at one time a tick comes first.
+    """
     offsets: Column
-    """How the wall clock went against the other since: at each read, then at its step."""
+    """Change of the wall clock's offset from `offset_ns`, ns, at each read and then at the step."""
     ages: Column
-    """ns of each read of the port, at its step; then how long it is, and all its bytes."""
+    """Age of each read of the port at its step, ns."""
     lengths: Column
     received: bytes
     written: bytes
-    """All lines."""
+    """All lines of the batch, joined."""
     xs: Column
     ys: Column
     yaws: Column
@@ -102,16 +107,16 @@ class Batch(Struct, frozen=True, array_like=True):
 
 
 class Spread(NamedTuple):
-    """A batch with its columns unpacked, of whatever format."""
+    """A batch of any format with its columns unpacked."""
 
     first: int
     standing: Standing
     shapes: list[Shape]
-    """Of each step."""
+    """Shape of each step."""
     times: list[int]
-    """Of each step, monotonic ns."""
+    """Monotonic time of each step, ns."""
     offsets: list[int]
-    """ns from the monotonic clock to the wall clock: at each read, then at its step."""
+    """Offset of the wall clock from the monotonic clock, ns, at each read and then at the step."""
     ages: list[int]
     lengths: list[int]
     received: bytes

@@ -1,8 +1,9 @@
-"""Puts another configuration under a state, for "what would it have done".
+"""Applies another configuration to a recorded robot state, to replay the drive with it.
 
-Three robots: one as it was in the middle of a drive, one as it begins by the same configuration,
-one as it begins by another. What the first still has as the second began with, it takes from the
-third; what happened to it since stays. No part of a robot has to know of this.
+Three robots take part: the recorded one in the middle of a drive, a new one with the recording's
+configuration, and a new one with the other configuration. A part of the recorded robot that still
+equals the second takes its value from the third. A part that has changed since keeps its value. No
+part of a robot needs code for this.
 """
 
 from __future__ import annotations
@@ -18,23 +19,28 @@ PLAIN = (bool, int, float, str, bytes, type(None))
 
 
 def adopt(robot: Robot, begun: Robot, other: Robot) -> None:
-    """Change `robot` in place; `begun` and `other` are as their configurations make them."""
+    """Change `robot` in place.
+
+    `begun` is a new robot of the recording's configuration, and `other` one of the other
+    configuration.
+    """
     _Walk().into(robot, begun, other)
 
 
 class _Walk:
     def __init__(self) -> None:
         self._seen: dict[int, Any] = {}
-        """Kept alive, so that no other gets its number."""
+        """Visited objects by `id`. The reference keeps each alive, so its `id` stays unique."""
 
     def into(self, now: Any, begun: Any, other: Any) -> None:
-        """Go through the parts of an object."""
+        """Merge each attribute of an object."""
         if id(now) in self._seen:
             return
         self._seen[id(now)] = now
         for name in _names(other):
             theirs = getattr(other, name)
-            if not hasattr(now, name):  # of another version: it begins as a new one does
+            # The recording is of another version. Start with the value of a new robot.
+            if not hasattr(now, name):
                 setattr(now, name, theirs)
                 continue
             mine = getattr(now, name)
@@ -43,7 +49,7 @@ class _Walk:
                 setattr(now, name, merged)
 
     def merged(self, now: Any, begun: Any, other: Any) -> Any:
-        """What to have in place of `now`: itself, perhaps with other parts, or `other`."""
+        """Return the merged value: `now`, perhaps with changed parts, or `other`."""
         if type(now) is not type(other):
             return other if _same(now, begun) else now
         match now:
@@ -71,7 +77,7 @@ def _same(now: Any, begun: Any) -> bool:
 
 
 def _names(thing: object) -> list[str]:
-    """The attributes an object has of its own."""
+    """Return the names of an object's own attributes."""
     slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
     named = [*getattr(thing, "__dict__", ()), *slots]
     return [name for name in named if hasattr(thing, name)]

@@ -1,4 +1,4 @@
-"""What no daemon has recorded: numbers that come from somebody who made a file by hand."""
+"""Refuses a decoded batch with values that no daemon records, because somebody forged the file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from collections.abc import Iterable, Iterator
 from acsard.record.layout import Rare, Spread
 
 LONGEST_NS = 1 << 61
-"""Since a computer was switched on, and the age of a read: 73 years."""
+"""Bound of the time since the computer's start and of the age of a read: 73 years."""
 
 LATEST_NS = 1 << 62
-"""From the monotonic clock to the wall clock: the year 2116. All three together have 64 bits."""
+"""Bound of the offset between the monotonic and the wall clock, which the wall clock reaches in
+the year 2116. The sum of all three fits in 64 bits.
+"""
 
 
 def implausible(spread: Spread) -> str:
-    """Why these are no steps of a robot's, "" when they may be."""
+    """Return why these steps cannot come from a robot, or "" if they can."""
     bounds = ((spread.times, LONGEST_NS), (spread.ages, LONGEST_NS), (spread.offsets, LATEST_NS))
     if any(max(map(abs, times), default=0) >= most for times, most in bounds):
         return "a time that no clock shows"
@@ -25,7 +27,7 @@ def implausible(spread: Spread) -> str:
 
 
 def _numbers(rare: Iterable[Rare]) -> Iterator[float]:
-    """Those that are looked at before they become inputs; commands are, once more, by the robot."""
+    """Yield the numbers that must be finite. The robot itself checks those of commands."""
     for one in rare:
         for request in one.requests:
             if request.pose is not None:

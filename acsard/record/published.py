@@ -1,7 +1,8 @@
-"""What a robot that lives again says meanwhile: every message as it was on the bus then.
+"""Rebuilds the messages that a robot published, while its recording is replayed.
 
-Built by the same report, as if somebody had listened to everything all the time. What the daemon
-measured of itself is in no recording: the rows of `diagnostics` that tell it are left out.
+The daemon's `Report` builds the messages, as if a client had subscribed to every topic all the
+time. A recording does not hold the daemon's measurements of itself, so the rows of `diagnostics`
+that contain them are left out.
 """
 
 from __future__ import annotations
@@ -21,11 +22,14 @@ from acsard.ros.transports import left_out
 from acsard.values import Command, Instant, Outputs
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
-"""Rows that are made of more than what came into the steps."""
+"""Rows of `diagnostics` that need more than the inputs of the steps."""
 
 
 class Published(NamedTuple):
-    """A message and when it went; `source` of a commander's channel."""
+    """Message with the time at which it was published.
+
+    `source` names the commander of a command channel.
+    """
 
     channel: Channel
     source: str
@@ -34,10 +38,16 @@ class Published(NamedTuple):
 
 
 class Publisher:
-    """Takes step after step, some may be left out."""
+    """Source of the messages of a replayed robot.
+
+    It takes the steps in order; some may be omitted.
+    """
 
     def __init__(self, robot: Robot, started_ns: int) -> None:
-        """The daemon's start by the wall clock is the stamp of what never changes."""
+        """Start.
+
+        `started_ns`, the wall-clock time of the daemon's start, stamps the static messages.
+        """
         self._robot, self._config = robot, robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
         self._wanted = self._listened()
@@ -49,8 +59,9 @@ class Publisher:
         return frozenset(names & BY_KEY.keys())
 
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
-        """What was said around a step that has just been lived: heard first, log lines last."""
-        if self._robot.config is not self._config:  # a setting was changed
+        """Yield the messages of a step after its replay: commands first, log lines last."""
+        # A setting was changed.
+        if self._robot.config is not self._config:
             self._config = self._robot.config
             self._report.use(self._config)
             self._wanted = self._listened()
@@ -69,7 +80,7 @@ class Publisher:
         return lambda: self._robot.snapshot(now.mono_ns)
 
     def _latched(self, now: Instant) -> Iterator[Published]:
-        """Once, and again when a setting has made it another one."""
+        """Yield `tf_static` once, and again when a setting has changed it."""
         if self._latches and "tf_static" in self._wanted:
             self._latches = False
             static = self._report.tf_static()
@@ -85,7 +96,7 @@ class Publisher:
 
 
 def _recorded(message: Any) -> Any:
-    """The message without what no recording knows."""
+    """Return the message without the fields that a recording does not hold."""
     match message:
         case RobotState():
             return replace(message, certificate="", figures={})

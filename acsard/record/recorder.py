@@ -1,8 +1,9 @@
-"""The black box of a running daemon: takes each step's inputs and outputs, never waits.
+"""The black box of a running daemon: takes the inputs and outputs of each step, and never waits.
 
-The loop puts references into a bounded queue. A thread makes bytes of them, a chunk a second, each
-synced to the disk. A queue that is full, because the disk is slow or stuck, loses steps and counts
-them; what follows begins a new file with the robot's state, so that it can be lived again.
+The control loop puts references into a bounded queue. A thread encodes them, writes one chunk a
+second and syncs it to the disk. If the disk is slow or stuck, the queue fills, and further steps
+are lost and counted. The recording then goes on in a new file that begins with the robot's state,
+so that it can be replayed.
 """
 
 from __future__ import annotations
@@ -21,51 +22,58 @@ from acsard.robot import Robot
 from acsard.values import Event, Inputs, Outputs, Recording
 
 MOST = 4096
-"""Steps that wait for the thread: a disk may take 10 s, at 100 Hz, before any is lost."""
+"""Largest number of steps in the queue. At 100 Hz a disk may stall for 10 s without a loss."""
 
 FLUSH_S = 0.98
-"""Between two chunks; with what it takes to write one, there is one each second."""
+"""Pause between two chunks. With the time that one takes to write, there is one each second."""
 
 MOST_TEXT = 200
-"""Characters of what a fault of our own says."""
+"""Largest number of characters of an exception's text."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""How long the end waits for the last chunk; and for a mark in its place."""
+"""Times that `close` waits for the last chunk, and for a marker in its place."""
 
 
 class Recorder:
-    """`step` is for the control loop; everything else happens in the thread."""
+    """The recorder. The control loop calls `step`; the thread does everything else."""
 
     def __init__(self, config: Config, tell: Callable[[Event], None], started_ns: int = 0) -> None:
-        """`tell` takes the recorder's own events, from within `step`; the daemon's start by the
-        wall clock is the stamp of what it says once and for all."""
+        """Start the thread.
+
+        Args:
+            config: the configuration at the daemon's start.
+            tell: takes the recorder's own events; it is called from within `step`.
+            started_ns: wall-clock time of the daemon's start, ns since 1970. An export stamps the
+                messages
+                that never change with it.
+        """
         self._queue: deque[Taken | Start] = deque()
         self._tell = tell
         self._said: deque[Event] = deque()
         self._number = 0
-        """Steps so far."""
+        """Number of steps so far."""
         self._missing = 0
-        """Steps that found the queue full."""
+        """Number of steps lost because the queue was full."""
         self._full = False
         self._died: Inputs | None = None
-        """What came into the step that did not end."""
+        """Inputs of the step that failed."""
         self._wants_state = False
-        """Set by the thread, cleared by `step`: begin a new file."""
+        """Request for a new file: the thread sets it, and `step` clears it."""
         self._disk = OnDisk(config, self._say, self._ask, started_ns)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)
         self._thread.start()
 
-    # the control loop's side
+    # The control loop's side
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Let the first file begin with this robot instead of one made of the configuration."""
+        """Let the first file begin with this robot, not with a new one of the configuration."""
         self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
 
     def step(
         self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a step that is over. `left` is the line of it that left, or None."""
+        """Take a finished step; `left` is the line that was sent to the board, or None."""
         queue = self._queue
         self._number += 1
         if self._said:
@@ -87,21 +95,22 @@ class Recorder:
             queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
 
     def died(self, inputs: Inputs) -> None:
-        """A fault of our own ended the step that these came into; the daemon ends by it."""
+        """Take the inputs of a step in which the daemon failed. The daemon ends because of it."""
         self._died = inputs
 
     @property
     def status(self) -> Recording:
-        """How it goes, for `state` and `diagnostics`."""
+        """Status of the recording, for `state` and `diagnostics`."""
         trouble = "the disk is too slow" if self._full else self._disk.trouble
         if not self._thread.is_alive():
             trouble = "the recorder has ended by a fault of its own; the log has it"
         return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last chunk and the end of the file, if the disk lets us in time.
+        """Write the last chunk and the end of the file, if the disk is quick enough.
 
-        `error` is what the daemon ends by; what is no `Exception` was asked for.
+        `error` is the exception that ends the daemon. A `BaseException` that is not an `Exception`
+        is an ordinary end.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
@@ -110,23 +119,25 @@ class Recorder:
         self._over.set()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive() and self._disk.bug is None:
-            # A disk that hangs must not hold up the end of the daemon as well.
+            # A disk that hangs must not delay the end of the daemon as well.
             marking = threading.Thread(target=self._disk.leave, args=["late"], daemon=True)
             marking.start()
             marking.join(MARK_S)
 
     def _bug(self, error: Exception) -> Bug:
         why = type(error).__name__
-        with suppress(Exception):  # one that cannot be told is one all the same
+        # An exception whose text cannot be produced is reported by its type.
+        with suppress(Exception):
             why = f"{why}: {error}"[:MOST_TEXT].encode(errors="replace").decode()
         if self._died is None:
             return Bug(why, None, b"")
         number, data = self._number, b""
-        with suppress(Exception):  # what ended a step may be what no file takes
+        # The input that made the step fail may also be one that cannot be encoded.
+        with suppress(Exception):
             data = Unfinished(number, self._died).encode()
         return Bug(f"in step {number}, {why}", self._died.now, data)
 
-    # the thread's side
+    # The thread's side
 
     def _say(self, event: Event) -> None:
         self._said.append(event)

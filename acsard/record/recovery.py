@@ -1,7 +1,7 @@
-"""A recording that was cut -> a finished one: beside it, or in its place where there is no room.
+"""Finishes a recording that was cut off: as a copy, or in place if the disk has no room.
 
-Nothing that anybody could read is thrown away: what this version cannot read is left as it is, and
-so is what the disk has no room to end.
+No readable data is thrown away. A file that this version cannot read stays as it is, and so does a
+file whose end the disk has no room for.
 """
 
 from __future__ import annotations
@@ -21,17 +21,20 @@ from acsard.record.file import Gist, Recording, event_of, rewrite
 from acsard.record.walk import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""What a disk says that has no room."""
+"""Error numbers of a disk without room."""
 
 NOTHING_BYTES = 64 << 10
-"""What is larger than a beginning and a chunk had something in it, be it unreadable here."""
+"""A file above this size is more than a header and one chunk, so it held data, even if this
+version cannot read it.
+"""
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Make a finished file `whole` of `part`; what there is to tell of it, "" where it went well.
+    """Make a finished file `whole` of `part`.
 
-    `cut` is a word of `CUTS`; `room` says that the disk has some for a copy. One with nothing in it
-    goes; one that cannot be read here, or not be ended, only gets the other name. Raises `OSError`.
+    Returns a message for the log, or "" without trouble. `cut` is a key of `CUTS`; `room` says that
+    the disk has room for a copy. A file without content is deleted. A file that cannot be read or
+    ended is only renamed. Raises `OSError`.
     """
     seen, told = part.stat(), ""
     try:
@@ -53,12 +56,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     except RecordingError as error:
         part.rename(whole)
         return f"it was cut and stays so, as {whole.name}: {error}"
-    os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))  # when it ended, not when it was found
+    # The file time must be the time of the recording's end, not of its recovery.
+    os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))
     return told
 
 
 def _begins(part: Path) -> bool:
-    """It can be told whose it is; without that nobody can read any of it."""
+    """Return whether the file has its configuration. Without it, none of the file can be read."""
     records = (found.record for found in walk(part.read_bytes()))
     return any(isinstance(record, Attachment) for record in records)
 
@@ -68,7 +72,7 @@ def _has_chunks(part: Path) -> bool:
 
 
 def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """A copy, without what is damaged; False where the disk is full."""
+    """Write a copy without the damaged parts; return False if the disk is full."""
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
     try:
@@ -83,9 +87,11 @@ def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """The end goes behind the last whole chunk, over what is torn; False where the disk does not
-    take it: then the file is as it was. No chunk is given up for the room: some disks give none
-    back, and all of them would go."""
+    """Write the end behind the last whole chunk, over the torn part.
+
+    Returns False if the disk has no room; then the file is as it was. No chunk is given up to gain
+    room: some disks give none back, and then all chunks would be lost.
+    """
     gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
         gist.message(topic, wall_ns, data)
@@ -96,7 +102,8 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
     end = _end(gist.closing(cut))
     before = part.read_bytes()
     at = max((found.end for found in walk(before) if found.inside), default=0)
-    if not at:  # somebody else has changed it since
+    # Another process has changed the file since it was read.
+    if not at:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
     with part.open("r+b", buffering=0) as stream:
         try:
@@ -114,7 +121,7 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """There, and on the disk; raises `OSError`, when some of it may be there."""
+    """Write `data` at a position and sync it; after an `OSError` a part may have been written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -122,7 +129,7 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: Closing) -> bytes:
-    """The least that makes a file a finished one: no index, which is read without, too."""
+    """Return the smallest end of a valid MCAP file, without an index. Readers do not need one."""
     builder = RecordBuilder()
     Metadata(END, fields(last)).write(builder)
     DataEnd(0).write(builder)

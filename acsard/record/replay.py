@@ -1,8 +1,8 @@
-"""Lives a recording again: `Robot.step` over the same inputs, compared with what was said then.
+"""Replays a recording: runs `Robot.step` over the recorded inputs and compares the outputs.
 
-Nothing but the inputs and the configuration decides what a robot does, so by the same code and
-configuration every line, mode and pose comes out the same. By others, the differences are the
-answer to "what would it have done".
+A robot's behaviour depends only on its inputs and its configuration. The same code and
+configuration therefore reproduce every line, mode and pose. With other code or another
+configuration, the differences show how the robot would have behaved.
 """
 
 from __future__ import annotations
@@ -30,56 +30,60 @@ FAULT = "fault"
 
 
 class Seen(Struct, frozen=True):
-    """What one side knew of a step."""
+    """Outputs of one side, recorded or replayed, for a step."""
 
     line: bytes | None
     status: Status
     poses: tuple[Micropose, ...]
     trip: str = ""
-    """Why the guard replaced the line."""
+    """Why the guard replaced the line; "" if it did not."""
 
 
 class Difference(Struct, frozen=True):
-    """A step that did not come out as it did then."""
+    """A step whose replay differs from the recording."""
 
     number: int
     at: Instant
     what: tuple[str, ...]
-    """Of `line`, `left`, `mode`, `pose`."""
+    """The outputs that differ, out of `line`, `left`, `mode` and `pose`."""
     then: Seen
     now: Seen
 
 
 class Tally(Struct):
-    """What a replay found so far."""
+    """Totals of a replay so far."""
 
     steps: int = 0
     lines: int = 0
-    """Lines then, and those of now that were none then."""
+    """Number of steps in which the recording, the replay or both have a line."""
     lines_same: int = 0
     poses: int = 0
     poses_same: int = 0
     modes_same: int = 0
     exact: bool = True
-    """Every pose is the same to the last bit."""
+    """True while every recorded checksum matches: all poses are equal to the last bit."""
     first: Difference | None = None
     fault: Difference | None = None
-    """Where a fault began that was none then."""
+    """First step in which the replay is in fault and the recording is not."""
     apart: float = 0.0
-    """m between the two poses, at most."""
+    """Largest distance between the recorded and the replayed pose, m."""
     fastest: tuple[int, int] = (0, 0)
-    """The fastest wheel of a line, then and now, hundredths of rad/s."""
+    """Speed of the fastest wheel in any line, recorded and replayed, in hundredths of rad/s."""
     end: tuple[Micropose, Micropose] | None = None
-    """The last poses, then and now."""
+    """The last poses, recorded and replayed."""
 
     @property
     def same(self) -> bool:
-        """Every line, mode and pose."""
+        """True if every line, mode and pose is equal."""
         return self.first is None
 
 
 def lived(robot: Robot, step: Step) -> Outputs:
-    """What the robot says of it now; what the loop counts beside the robot is counted as then."""
+    """Run a step on the robot, and return its outputs.
+
+    The robot's counters of sent and superseded lines, which the daemon's loop keeps, are counted as
+    in the recording.
+    """
     outputs = robot.step(step.inputs)
     said, inputs = step.said, step.inputs
     if said.left is not None:
@@ -90,15 +94,15 @@ def lived(robot: Robot, step: Step) -> Outputs:
 
 
 class Replay:
-    """One robot that lives again, step by step."""
+    """A robot that replays a recording step by step."""
 
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start from `robot` and the guard's `memory` before the first step, or from nothing."""
+        """Start with `robot` and the guard's `memory`, or with a new robot."""
         self.robot = robot or Robot(config)
         self.outputs: Outputs | None = None
-        """What the last step decided now."""
+        """Outputs of the last replayed step."""
         self._config = self.robot.config
         self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
         self._checksum = 0
@@ -106,17 +110,21 @@ class Replay:
         self.tally = Tally()
 
     def step(self, step: Step) -> Difference | None:
-        """Live it; what came out otherwise than then, None when nothing did."""
+        """Replay a step.
+
+        Returns its difference from the recording, or None if all outputs are equal.
+        """
         if step.begins:
             self._checksum = 0
         outputs = self.outputs = lived(self.robot, step)
-        if self.robot.config is not self._config:  # a setting was changed
+        # A setting was changed.
+        if self.robot.config is not self._config:
             self._config = self.robot.config
             self._guard.use(self._config)
         line, trip = self._guard.check(outputs)
         self._checksum = checksum(outputs.estimates, self._checksum)
         if step.said.left is not None:
-            # What the board got then is what it obeys, whatever would go now.
+            # The board obeyed the line that was sent then, even if the replay decides another.
             self._guard.left(step.said.left)
         now = Seen(outputs.line, status_of(outputs), microposes(outputs.estimates), trip)
         difference = self._compare(step, now, line)
@@ -126,7 +134,7 @@ class Replay:
         return difference
 
     def _keep(self, difference: Difference) -> None:
-        """What is told of them all."""
+        """Keep the first difference, and the first new fault."""
         tally = self.tally
         tally.first = tally.first or difference
         if difference.now.status[0] == FAULT != difference.then.status[0]:
@@ -172,7 +180,7 @@ class Replay:
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """The fastest wheel of a line, hundredths of rad/s; 0 where there is none to read."""
+    """Return the highest wheel speed in a line, hundredths of rad/s; 0 if it cannot be read."""
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

@@ -1,4 +1,4 @@
-"""A recording lived again: file -> replay -> what to say of it."""
+"""Replays a recording file, and describes the result for the command line."""
 
 from __future__ import annotations
 
@@ -25,34 +25,37 @@ from acsard.values import Outputs
 HUNDREDTHS = 100.0
 
 Progress = Callable[[int], None]
-"""Called now and then with the wall-clock time that it has come to, ns."""
+"""Callback for progress; it takes the wall-clock time that the replay has reached, ns."""
 
 EVERY = 1024
-"""Steps from one call of it to the next."""
+"""Number of steps between two calls of the progress callback."""
 
 
 def quietly(wall_ns: int) -> None:
-    """Progress that nobody looks at."""
+    """Ignore the progress."""
 
 
 LACKS = (
     AttributeError, TypeError, ValueError, LookupError, ArithmeticError, RecursionError
 )  # fmt: skip
-"""What a robot raises that has not the parts it ought to have."""
+"""Exceptions that a robot raises if its recorded state lacks parts that this version expects."""
 
 
 class Lived(NamedTuple):
-    """What came of it."""
+    """Result of a replay."""
 
     tally: Tally
     trouble: str
-    """Why it was not lived to the end of the file, "" when it was."""
+    """Why the replay ended before the end of the file; "" if it is complete."""
     again: str = ""
-    """What becomes of the step that a fault of the daemon's own ended, "" where none did."""
+    """How this version handles the step in which the daemon failed; "" without a failure."""
 
 
 def config_of(recording: Recording) -> Config:
-    """The configuration it was made with; raises `RecordingError`."""
+    """Return the configuration of a recording.
+
+    Raises `RecordingError` if this version cannot read it.
+    """
     try:
         return parse(recording.about.config.encode())
     except ConfigError as error:
@@ -62,7 +65,7 @@ def config_of(recording: Recording) -> Config:
 
 
 def steps(recording: Recording) -> Iterator[Step]:
-    """Every step that can be read, in order; where some are missing their numbers say so."""
+    """Yield every step that can be read, in order. A gap shows in the steps' numbers."""
     reason = ""
     for topic, _, data in recording.messages():
         if topic == "steps":
@@ -76,33 +79,43 @@ def steps(recording: Recording) -> Iterator[Step]:
 
 
 class Course:
-    """The steps of a recording from its beginning on, and the robot they begin with."""
+    """The steps of a recording up to the first gap, and the robot that they begin with."""
 
     def __init__(self, recording: Recording, other: Config | None = None) -> None:
-        """With its own configuration, or with another; raises `RecordingError`."""
+        """Use the recording's own configuration, or `other`.
+
+        Raises `RecordingError` if that is impossible.
+        """
         self.config = other or config_of(recording)
-        """What it begins with."""
+        """Configuration at the beginning."""
         self.trouble = ""
-        """Why it was not gone to the end of the file, "" when it was."""
+        """Why `steps` ended before the end of the file; "" if it did not."""
         self.number: int | None = None
-        """Of the step that was gone last."""
+        """Number of the last step that `steps` yielded."""
         self._recording = recording
         self._state, begins = _state(recording), Robot(self.config)
         self.robot, self.memory = self._state or (begins, Memory())
         if self._state is not None:
-            # by newer code, its parts may have what it knows nothing of
+            # A state recorded by other code may lack parts that this version has, so adopt them
+            # from a new robot.
             begun = Robot(config_of(recording))
             with self.living():
                 adopt(self.robot, begun, begins)
 
     @contextmanager
     def living(self) -> Iterator[None]:
-        """Around what lives it; raises `RecordingError` where its state lacks what is asked."""
+        """Turn errors of a recorded state that lacks needed parts into `RecordingError`.
+
+        Wrap every use of `robot` in this context.
+        """
         with _known(self._recording, self._state):
             yield
 
     def steps(self) -> Iterator[Step]:
-        """One after the other, while none is missing; raises `RecordingError`."""
+        """Yield the steps until one is missing.
+
+        Raises `RecordingError` if the first steps are missing, or no step can be read.
+        """
         path = self._recording.path
         for step in steps(self._recording):
             number = self.number
@@ -119,7 +132,10 @@ class Course:
 
 
 def live(recording: Recording, other: Config | None = None, progress: Progress = quietly) -> Lived:
-    """Replay it with its own configuration, or with another; raises `RecordingError`."""
+    """Replay a recording with its own configuration, or `other`.
+
+    Raises `RecordingError` if impossible.
+    """
     course = Course(recording, other)
     with course.living():
         replay = Replay(course.config, course.robot, course.memory)
@@ -132,7 +148,10 @@ def live(recording: Recording, other: Config | None = None, progress: Progress =
 
 
 def _again(recording: Recording, robot: Robot, last: int | None) -> str:
-    """What becomes now of the step that ended the daemon, if it comes after the last one."""
+    """Run the step in which the daemon failed, and describe the result.
+
+    This works only if the step follows the last recorded one.
+    """
     if recording.unfinished is None:
         return ""
     try:
@@ -150,13 +169,13 @@ def _again(recording: Recording, robot: Robot, last: int | None) -> str:
 
 
 class Onlooker:
-    """Lives a recording for who looks on: all that can be read of it, whatever is missing."""
+    """Replay of a recording for display: everything that can be read, even if steps are missing."""
 
     def __init__(self, recording: Recording) -> None:
-        """Raises `RecordingError`."""
+        """Read the recording; raise `RecordingError` if its configuration cannot be read."""
         self._recording = recording
         self.notes: list[str] = []
-        """What is not as it was then, in words."""
+        """Notes for the user about how this replay may differ from the recorded drive."""
         self.config = config_of(recording)
         try:
             self._began = _state(recording)
@@ -170,14 +189,17 @@ class Onlooker:
 
     @contextmanager
     def living(self) -> Iterator[None]:
-        """Around what asks the robot; raises `RecordingError` where its state lacks the answer."""
+        """Turn errors of a recorded state that lacks needed parts into `RecordingError`.
+
+        Wrap every use of the robot in this context.
+        """
         with _known(self._recording, self._began):
             yield
 
     def steps(self) -> Iterator[tuple[Step, Outputs, Robot]]:
-        """Each step as it was recorded, what it decides now, and the robot after it.
+        """Yield each recorded step, its replayed outputs, and the robot after it.
 
-        Raises `RecordingError` where its state lacks what is asked of it.
+        Raises `RecordingError` if the recorded state lacks parts that a step needs.
         """
         number = None
         for step in steps(self._recording):
@@ -204,8 +226,11 @@ def _state(recording: Recording) -> State | None:
 
 @contextmanager
 def _known(recording: Recording, state: State | None) -> Iterator[None]:
-    """A robot of other code, or that a stranger has made, may lack what is asked of it, or have
-    something else in its place, however deep in it."""
+    """Turn errors of an incomplete robot into `RecordingError`.
+
+    The robot may come from other code or a forged file, so any part of it may be missing or of a
+    wrong type.
+    """
     try:
         yield
     except RecordingError:
@@ -225,7 +250,7 @@ def _foreign(recording: Recording, why: str) -> RecordingError:
 
 
 def verdict(tally: Tally) -> str:
-    """The answer in one line."""
+    """Return the result of a replay in one line."""
     lines = f"{tally.lines_same:,} of {tally.lines:,} lines the same".replace(",", " ")
     poses = f"{tally.poses_same:,} of {tally.poses:,} poses".replace(",", " ")
     modes = f"{tally.modes_same:,} of {tally.steps:,} modes".replace(",", " ")
@@ -234,7 +259,7 @@ def verdict(tally: Tally) -> str:
 
 
 def compared(other: bool) -> str:
-    """What the verdict has counted."""
+    """Explain the figures of `verdict`; `other` is true for another configuration."""
     by = "that configuration" if other else "this version"
     return (
         "(compared: every line to the board, every pose by odometry to the um, and the mode in "
@@ -243,7 +268,10 @@ def compared(other: bool) -> str:
 
 
 def differs(difference: Difference, began_ns: int) -> list[str]:
-    """What each side knew where they first part, in lines."""
+    """Return lines that show both sides of the first difference.
+
+    `began_ns` is the monotonic time of the beginning.
+    """
     seconds = (difference.at.mono_ns - began_ns) / 1e9
     what = ", ".join(difference.what)
     return [
@@ -267,14 +295,17 @@ def _side(name: str, seen: Seen) -> list[str]:
 
 
 SHAPE_LINES = ("limits.", "drive.", "mcu.wheels.")
-"""The tables that make of the same command another line."""
+"""Prefixes of the settings that change which line a command produces."""
 
 MOST_KEYS = 8
 
 
 def because(then: Config, now: Config, tally: Tally, began_ns: int) -> list[str]:
-    """What the other configuration changes, in words: which settings, what was sent by them, and
-    that the wheels of the recording did not obey it."""
+    """Explain in lines why another configuration leads to other results.
+
+    The lines name the changed settings, the first line that differs by them, and a new fault. They
+    also warn that the recorded wheels did not obey the new configuration.
+    """
     before, after = (dict(flat(effective(config))) for config in (then, now))
     keys = [key for key in before | after if before.get(key) != after.get(key)]
     told = [f"{key} {_set(key, before)} then, {_set(key, after)} now" for key in keys]
@@ -303,7 +334,7 @@ def _set(key: str, settings: Mapping[str, object]) -> str:
 
 
 def otherwise(tally: Tally) -> list[str]:
-    """What another configuration, or other code, would have done, in words and figures."""
+    """Describe in lines how the robot would have behaved with other code or settings."""
     then_most, now_most = (speed / HUNDREDTHS for speed in tally.fastest)
     rows = [
         f"{tally.lines - tally.lines_same} of {tally.lines} lines would be others, "

@@ -1,7 +1,8 @@
-"""Which recordings go, so that there is room for the next ones, and when a clock tells their age.
+"""Decides which recordings are deleted to make room, and whether the wall clock can tell their age.
 
-What is kept for what happened in it goes last. A disk also has others on it: a part of it is left
-to them, and where they have taken that too, only what would be overwritten soon gives way.
+The recordings of incidents are deleted last. Other programs use the disk too, so a part of it is
+left to them. If they have used up that part, unprotected recordings other than the newest are
+deleted. The rest is deleted only when there would soon be no room to record at all.
 """
 
 from __future__ import annotations
@@ -14,87 +15,93 @@ from msgspec import Struct
 from acsard.values import NS_PER_S, Instant
 
 Kind = Literal["plain", "near", "kept"]
-"""`kept`: something happened in it; `near`: close to that."""
+"""Retention class: `kept` had an incident in it, `near` was written within a minute of one."""
 
 AROUND_NS = 60 * NS_PER_S
-"""Before and after something that happened, what is near to it."""
+"""Time before and after an incident within which recordings are retained."""
 
 KEPT_FILES = 50
-"""So many of those in which something happened stay, the newest, with what is near to them."""
+"""Number of the newest recordings with an incident that are retained, with those near them."""
 
 FILES = 100
-"""A file may have this part of all bytes: what is kept is about half."""
+"""A file may have the 100th part of all bytes, so the retained ones are about half of the total."""
 
 LEAST_BYTES = 100_000
-"""A file may have as many, however small the disk is."""
+"""Size that a file may have even on a small disk, in bytes."""
 
 SPARE = 0.05
 SPARE_BYTES = 1_000_000_000
-"""The part of a disk that is left to others, and how much of a large one."""
+"""Share of the disk that is left to other programs, and its upper bound in bytes."""
 
 NEEDED = 0.2
-"""Of what is left to others: with less than that there soon is no room to record at all."""
+"""Share of the spare room, below which there would soon be no room to record at all."""
 
 JUMP_NS = 60 * NS_PER_S
-"""A wall clock that went so far from the other one has been set."""
+"""A change of the wall clock against the monotonic clock above which it counts as set."""
 
 STEADY_NS = 600 * NS_PER_S
-"""So long it must not have been set before it tells the age of anything."""
+"""Time without a step of the wall clock after which it may tell the age of a recording."""
 
 
 class Disk(NamedTuple):
-    """bytes."""
+    """Size and free space of a disk, in bytes."""
 
     total: int
     free: int
 
     @property
     def spare(self) -> int:
-        """What is left to others."""
+        """Bytes that are left to other programs."""
         return min(int(self.total * SPARE), SPARE_BYTES)
 
     @property
     def low(self) -> bool:
-        """Others have less than what is left to them."""
+        """True if other programs have less than the room left to them."""
         return self.free < self.spare
 
 
 class Ended(NamedTuple):
-    """A recording that is finished."""
+    """A finished recording."""
 
     name: str
     number: int
     kind: Kind
     size: int
-    """bytes."""
+    """Size in bytes."""
     at_s: float
-    """When it ended, s since 1970, by the clock of then."""
+    """Time at which it ended, s since 1970, by the wall clock of that time."""
     here: bool = False
-    """In this run of the daemon: however old it looks, it is not."""
+    """True if it ended in this run of the daemon. Such a file never counts as too old."""
 
 
 class Bounds(NamedTuple):
-    """What all of them may have."""
+    """Bounds for all recordings together."""
 
     size: int
-    """bytes."""
+    """Largest total size in bytes."""
     oldest_s: float
-    """What ended before is too old, s since 1970; -inf where no clock tells."""
+    """Recordings that ended before this time are too old, s since 1970; -inf without a clock."""
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
-    """bytes of one file, where all may have `bound`, and have `own` now."""
+    """Return the largest size of one file in bytes.
+
+    `bound` is the largest total size of all recordings, and `own` their present size.
+    """
     return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
 
 
 def too_much(
     ended: Sequence[Ended], bounds: Bounds, disk: Disk, given: int | None = None
 ) -> set[str]:
-    """The names of those that go, of all that ended, by their numbers.
+    """Return the names of the recordings to delete.
 
-    There is to be room for one file more. `given` is of a disk that took nothing any more, whatever
-    it says of its room: at least one goes. It is how many bytes went for that before, in vain: then
-    none goes that is kept, and none at all beyond what any file may have.
+    `ended` is in the order of their numbers. One more file must fit afterwards. `given` is None
+    unless the disk refuses to write, whatever free space it reports. Then it is the number of bytes
+    that were deleted for that disk without success:
+    - With 0, at least one recording is deleted.
+    - Above 0 but below `LEAST_BYTES`, one more is deleted, but no protected one.
+    - From `LEAST_BYTES` on, none is deleted for this reason.
     """
     stays = _protected(ended)
     plain = [one for one in ended if one.name not in stays]
@@ -117,7 +124,7 @@ def too_much(
 
 
 def _protected(ended: Sequence[Ended]) -> set[str]:
-    """The last in which something happened, and what is near to them."""
+    """Return the names of the newest recordings with an incident, and of those near them."""
     last = {one.name for one in [one for one in ended if one.kind == "kept"][-KEPT_FILES:]}
     return {
         one.name
@@ -129,7 +136,7 @@ def _protected(ended: Sequence[Ended]) -> set[str]:
 
 
 def _runs(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Those that are not plain, as far as they follow on one another."""
+    """Yield the groups of recordings that are not plain and have consecutive numbers."""
     run: list[Ended] = []
     for one in ended:
         if one.kind == "plain":
@@ -142,15 +149,15 @@ def _runs(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
 
 
 class Steady(Struct):
-    """Whether the wall clock is to be believed: it was not set for a while."""
+    """Watch over the wall clock, which can be believed if it was not set for a while."""
 
     _since_ns: int | None = None
-    """Monotonic."""
+    """Monotonic time since which the wall clock was not set, ns; None before the first look."""
     _ahead_ns: int = 0
-    """Of the monotonic clock."""
+    """Offset of the wall clock from the monotonic clock at the last look, ns."""
 
     def look(self, now: Instant) -> int:
-        """How far it was set since the last look, ns; 0 where it was not."""
+        """Return how far the wall clock was set since the last look, ns; 0 if it was not set."""
         ahead_ns = now.wall_ns - now.mono_ns
         jumped_ns = 0 if self._since_ns is None else ahead_ns - self._ahead_ns
         self._ahead_ns = ahead_ns
@@ -160,5 +167,5 @@ class Steady(Struct):
         return 0
 
     def believed(self, now: Instant) -> bool:
-        """It was looked at, and not set, for long enough."""
+        """Return whether the wall clock was watched, and not set, for `STEADY_NS`."""
         return self._since_ns is not None and now.mono_ns - self._since_ns >= STEADY_NS

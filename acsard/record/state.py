@@ -1,8 +1,8 @@
-"""A robot between two steps -> bytes, and back: where a recording that begins later begins.
+"""Encodes a robot between two steps as bytes, and decodes it, for files that begin during a drive.
 
-Written by pickle, which copies a robot in a fraction of a millisecond. Read by `unpickling.py`,
-which makes nothing but values and the robot's own parts: what a stranger's file asks for beyond
-that is refused.
+`freeze` uses pickle, which copies a robot in a fraction of a millisecond. `thaw` uses
+`unpickling.py`, which makes only values and the robot's own parts, and refuses anything else that a
+forged file asks for.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ ROOMS = (
     "acsard.values", "acsard.robot", "acsard.guard", "acsard.config.settings",
     "acsard.drive.", "acsard.mcu.",
 )  # fmt: skip
-"""Whose classes a robot is made of; none of them does anything when it is made."""
+"""Modules and packages that define the parts of a robot. Making an instance of such a class runs
+no code with effects elsewhere.
+"""
 
 BESIDE: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
@@ -35,12 +37,14 @@ BESIDE: dict[tuple[str, str], type] = {
 PROTOCOL = 5
 
 MOST_TEXT = 200
-"""Characters of what is wrong with it."""
+"""Largest number of characters of an error's text."""
 
 TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
-"""Python 3.11 before 3.11.4, Debian 12's own, writes members of an enum by `getattr`."""
+"""Extra reducers. Python 3.11 before 3.11.4, as in Debian 12, pickles enum members through
+`getattr`, which `unpickling.py` refuses.
+"""
 
 
 MOVED = {
@@ -48,23 +52,23 @@ MOVED = {
     "acsard.mcu.link": "acsard.mcu.link_state",
     "acsard.drive.lying_wheels.witness": "acsard.drive.lying_wheels.verdict",
 }
-"""Modules by the names that they had when older recordings were made."""
+"""New names of the modules that older recordings name otherwise."""
 
 
 class StateError(AcsardError):
-    """These bytes hold no robot, or one of other parts."""
+    """Bytes that do not hold a robot, or hold one that this version cannot make."""
 
 
 class State(NamedTuple):
-    """All that the steps to come depend on, beside what comes in."""
+    """Everything besides the inputs that the next steps depend on."""
 
     robot: Robot
     memory: Memory
-    """What the guard remembers."""
+    """Memory of the guard."""
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
-    """Write the robot and the memory of its guard as they are now."""
+    """Encode the robot and the memory of its guard as they are now."""
     written = io.BytesIO()
     pickler = pickle.Pickler(written, PROTOCOL)
     pickler.dispatch_table = TABLE
@@ -73,7 +77,10 @@ def freeze(robot: Robot, memory: Memory) -> bytes:
 
 
 def thaw(data: bytes) -> State:
-    """The robot as it was; raises `StateError` if that cannot be made here."""
+    """Decode a robot and its guard's memory.
+
+    Raises `StateError` if this version cannot make them.
+    """
     try:
         made = unpickled(data, part)
     except ValueError as error:
@@ -86,15 +93,16 @@ def thaw(data: bytes) -> State:
 
 
 def short(error: Exception) -> str:
-    """Its words, which may be a stranger's."""
+    """Return the error's text, bounded and printable: it may quote a forged file."""
     return printable(str(error))[:MOST_TEXT]
 
 
 def part(module: str, name: str) -> type:
-    """A class that a robot has parts of; raises `ValueError` for any other.
+    """Return the class of a part of a robot.
 
-    By its own name, and of a module that is there: nothing is imported, nothing is found by way of
-    another, and what only names or raises something is none.
+    Raises `ValueError` for any other name. The class must have been defined in that module under
+    that name, and the module must be loaded already: nothing is imported. Re-exported names,
+    functions and attributes of attributes are refused.
     """
     module = MOVED.get(module, module)
     if (module, name) in BESIDE:

@@ -1,7 +1,7 @@
-"""A step as a recording tells it: all that came in, and what went out.
+"""One control step as a recording stores it: all of its inputs, and its outputs.
 
-The poses are told in um and urad; a checksum holds every bit of all estimates. How many steps
-become bytes is `batch.py`'s.
+Poses are stored in um and urad. A checksum covers every bit of all estimates. `batch.py` encodes
+many steps.
 """
 
 from __future__ import annotations
@@ -22,34 +22,37 @@ from acsard.values import AcsardError, Estimate, Event, Inputs, Outputs, Recordi
 MICRO = 1e6
 
 Status = tuple[str, str, str, str]
-"""Mode, reason, link, source."""
+"""Mode, reason, link and source, as in `Outputs`."""
 
 Micropose = tuple[int, int, int]
-"""x, y in um and yaw in urad."""
+"""Pose as integers: x and y in um, yaw in urad."""
 
 _DOUBLES = struct.Struct("<9d")
 
 
 class Taken(NamedTuple):
-    """A step as the control loop hands it over: references, nothing copied."""
+    """A step as the control loop hands it over, by reference."""
 
     inputs: Inputs
     outputs: Outputs
     left: bytes | None
-    """What was handed to the port, None when nothing went."""
+    """Line that was handed to the port, or None if none was."""
 
 
 class Start(NamedTuple):
-    """What a file begins with: the robot after the step before number `number`."""
+    """Beginning of a file: the robot as it is before step `number`."""
 
     number: int
     state: bytes
     config: Config
-    """In force then: settings may have been changed since the daemon began."""
+    """Configuration in force then. Settings may have changed since the daemon's start."""
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
-    """What follows without a break, and what it begins with if it begins anew."""
+    """Split the queue's items at each `Start`, and yield each start with the steps that follow it.
+
+    The first group comes with None: its steps continue the current file.
+    """
     start: Start | None = None
     steps: list[Taken] = []
     for item in items:
@@ -62,7 +65,7 @@ def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]
 
 
 class BlackBox(Protocol):
-    """What records every step, and never waits."""
+    """Interface of the recorder for the control loop. No method waits."""
 
     def begins(self, robot: Robot, guard: Guard) -> None:
         """Record the robot and its guard before the first step."""
@@ -70,51 +73,51 @@ class BlackBox(Protocol):
     def step(
         self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a step that is over. `left` is the line of it that left, or None."""
+        """Take a finished step; `left` is the line that was sent to the board, or None."""
 
     def died(self, inputs: Inputs) -> None:
-        """A fault of our own ended the step that these came into; the daemon ends by it."""
+        """Take the inputs of a step in which the daemon failed. The daemon ends because of it."""
 
     @property
     def status(self) -> Recording:
-        """How it does."""
+        """Status of the recording."""
 
 
 class Said(Struct, frozen=True):
-    """What a step decided."""
+    """Outputs of a step."""
 
     line: bytes | None
     left: bytes | None
     status: Status
     poses: tuple[Micropose, ...]
-    """One for each feedback line that was believed."""
+    """One pose for each feedback line that odometry accepted."""
     events: tuple[Event, ...] = ()
     checksum: int | None = None
-    """Of all estimates since the first step of the batch, to the last bit; with its last step."""
+    """CRC-32 of all estimates since the first step of the batch; only in the batch's last step."""
 
 
 class Step(Struct, frozen=True):
-    """One step again; `number` counts them since the start of the daemon."""
+    """A decoded step. `number` counts the steps since the daemon's start."""
 
     number: int
     inputs: Inputs
     said: Said
     begins: bool = False
-    """The first of its batch: `checksum` begins anew."""
+    """True for the first step of a batch, at which the checksum restarts."""
 
 
 class UnfinishedError(AcsardError):
-    """These bytes are no step that was not finished."""
+    """Bytes that are not an unfinished step."""
 
 
 class Unfinished(Struct, frozen=True):
-    """A step that a fault of the daemon's own ended: what came into it. Nothing came out of it."""
+    """Inputs of the step in which the daemon failed. The step did not produce outputs."""
 
     number: int
     inputs: Inputs
 
     def encode(self) -> bytes:
-        """With the names of its parts: a later version may add some."""
+        """Encode the step with field names, because a later version may add fields."""
         return msgspec.msgpack.encode(self)
 
 
@@ -122,7 +125,7 @@ _unfinished = msgspec.msgpack.Decoder(Unfinished)
 
 
 def unfinished(data: bytes) -> Unfinished:
-    """That step again; raises `UnfinishedError` for bytes that are none."""
+    """Decode an unfinished step; raise `UnfinishedError` for other bytes."""
     try:
         return _unfinished.decode(data)
     except msgspec.MsgspecError as error:
@@ -130,7 +133,7 @@ def unfinished(data: bytes) -> Unfinished:
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Goes on from `before`, over all that odometry says, to the last bit."""
+    """Continue the CRC-32 `before` over every bit of the poses, speeds and wheel angles."""
     for e in estimates:
         pose, twist = e.pose, e.twist
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
@@ -139,16 +142,16 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:
-    """The poses of all of them."""
+    """Return the rounded poses of all estimates."""
     return tuple([micropose(estimate) for estimate in estimates])
 
 
 def status_of(outputs: Outputs) -> Status:
-    """What `state` says first."""
+    """Return the mode, reason, link and source of a step."""
     return outputs.mode, outputs.reason, outputs.link, outputs.source
 
 
 def micropose(estimate: Estimate) -> Micropose:
-    """Its pose as a recording tells it."""
+    """Return the pose of an estimate, rounded to um and urad."""
     pose = estimate.pose
     return round(pose.x * MICRO), round(pose.y * MICRO), round(pose.yaw * MICRO)

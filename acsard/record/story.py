@@ -1,7 +1,7 @@
-"""Steps -> sentences: what a person asks a recording for.
+"""Describes a recording as a timeline of sentences.
 
-Every event of the log is one, and so is each drive: from the first line that moves a wheel in mode
-driving to the end of it, with its way and its time.
+Each event of the log is a sentence, and so is each drive: the time in mode `driving`, with its
+distance and its duration.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ from acsard.record.steps import MICRO, Step
 from acsard.values import Event
 
 FURTHEST_S = 2**63 / 1e9
-"""s from 1970, three hundred years: what is further is no time of a recording's."""
+"""Bound of a sentence's time, s from 1970: 292 years. No recording has a time beyond it."""
 
 
 class Told(Struct, frozen=True, omit_defaults=True):
-    """A sentence; `seconds` are wall-clock time since 1970."""
+    """Sentence of the timeline; `seconds` is wall-clock time since 1970."""
 
     seconds: Annotated[float, Meta(ge=-FURTHEST_S, le=FURTHEST_S)]
     name: str
-    """The event's, `link_late` of a `link_stale` that this computer was to blame for, `link_heard`
-    where more is told of a link that is gone already, or `start`, `drive`, `gap` and `end`."""
+    """Name of the event, or a name that only the timeline uses.
+
+    These are `link_late` for a `link_stale` that this computer caused, `link_heard` for a further
+    event about a link that is already lost, and `start`, `drive`, `gap` and `end`.
+    """
     text: str
     level: str = "info"
     by: str = ""
@@ -36,21 +39,21 @@ class Told(Struct, frozen=True, omit_defaults=True):
 
 
 def told(event: Event, wall_ns: int) -> Told:
-    """The sentence of an event at that time."""
+    """Return the sentence of an event at a wall-clock time in ns."""
     late = event.name == "link_stale" and is_ours(event.text)
     name = "link_late" if late else event.name
     return Told(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
 
 
 class Losses:
-    """Of what is told of the link: whether it went, or is gone already."""
+    """Memory of the link's loss, to tell the first event about a loss from further ones."""
 
     def __init__(self) -> None:
         self._told: set[str] = set()
-        """Since it was up."""
+        """Names of the events since the link was last up."""
 
     def again(self, name: str) -> bool:
-        """This has been told since the link was up."""
+        """Return whether an event of this name has come since the link was last up."""
         if name == "link_up":
             self._told.clear()
         if name not in ("link_down", "link_booting", "link_stale", "link_late"):
@@ -61,20 +64,20 @@ class Losses:
 
 
 class Story:
-    """Takes one step after the other."""
+    """Timeline of a recording. It takes the steps in order."""
 
     def __init__(self) -> None:
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
         self._began_ns: int | None = None
-        """When the drive began that is under way, monotonic."""
+        """Monotonic time at which the present drive began, ns; None between drives."""
         self._way = 0.0
         self._source = ""
         self._leaving = False
         self._losses = Losses()
 
     def step(self, step: Step) -> Iterator[Told]:
-        """What there is to say of it."""
+        """Yield the sentences of a step."""
         wall_s = step.inputs.now.wall_ns / 1e9
         if self._number is None and step.number == 0:
             yield Told(wall_s, "start", "the daemon starts")
@@ -119,7 +122,7 @@ NEWS = {
     "wheels_doubted": "doubted wheel",
     "link_up": "",
 }
-"""What a list says of a recording, and how; nothing of what only ends something else."""
+"""Words for the events in a summary; "" for an event that only ends another one."""
 
 
 def _several(word: str) -> str:
@@ -128,8 +131,11 @@ def _several(word: str) -> str:
 
 
 def summary(events: Iterable[Told], starts: bool = False) -> str:
-    """What happened, in a few words: that the daemon `starts`, who stopped it, and how often the
-    rest was."""
+    """Summarize the events in a few words.
+
+    The summary says whether the daemon starts, counts each kind of incident, and names the clients
+    that stopped the robot.
+    """
     counts: Counter[str] = Counter()
     stopped: list[str] = []
     losses = Losses()

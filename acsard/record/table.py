@@ -1,8 +1,8 @@
-"""What a robot that lives again did, as lines of CSV: what `acsard calibrate` reads comes first.
+"""Writes the motion of a replayed robot as CSV; the columns for `acsard calibrate` come first.
 
-A line for each feedback, with what was wished and what went at that time, and one for each report
-of a gyro. Where the robot was by its own odometry is no column that calibration takes for a
-measurement: wheels cannot be compared with themselves.
+Each feedback line and each gyro sample has a line of its own. The position by the robot's own
+odometry has column names that calibration does not take for a measurement, because wheels cannot be
+compared with themselves.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from acsard.record.steps import Step
 from acsard.values import NS_PER_S, Estimate, GyroSample, Instant, Outputs
 
 MEASURED = ("t [s]", "fr [rad/s]", "fl [rad/s]", "rl [rad/s]", "rr [rad/s]", "yaw_rate [rad/s]")
-"""`t` is since 1970; `yaw_rate` a gyro's."""
+"""Columns that calibration reads: `t` is in s since 1970, `yaw_rate` comes from a gyro."""
 
 TOLD = (
     "odom_x [m]", "odom_y [m]", "odom_yaw [rad]", "linear [m/s]", "angular [rad/s]",
@@ -28,7 +28,7 @@ _NOTHING_TOLD = "," * len(TOLD)
 
 
 def rows(step: Step, outputs: Outputs) -> Iterator[str]:
-    """The lines of one step, without line ends."""
+    """Yield the CSV lines of a step, without line ends."""
     now = step.inputs.now
     for sample in step.inputs.gyro:
         yield turned(sample, now) + _NOTHING_TOLD
@@ -44,7 +44,7 @@ def rows(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def measured(step: Step, outputs: Outputs) -> Iterator[str]:
-    """Only what calibration reads."""
+    """Yield the CSV lines of a step with only the columns that calibration reads."""
     for sample in step.inputs.gyro:
         yield turned(sample, step.inputs.now)
     for estimate in outputs.estimates:
@@ -52,13 +52,13 @@ def measured(step: Step, outputs: Outputs) -> Iterator[str]:
 
 
 def rolled(estimate: Estimate) -> str:
-    """The measured columns of a feedback line."""
+    """Return the measured columns of a feedback line."""
     wheels = ",".join(f"{speed:.6g}" for speed in estimate.speeds.as_tuple())
     return f"{_seconds(estimate.at.wall_ns)},{wheels},"
 
 
 def turned(sample: GyroSample, now: Instant) -> str:
-    """The measured columns of a gyro's report: when it was measured, or else when it arrived."""
+    """Return the measured columns of a gyro sample, at its stamp or else at its arrival."""
     arrived_ns = sample.at_ns + now.wall_ns - now.mono_ns
     at_ns = arrived_ns if sample.stamp_ns is None else sample.stamp_ns
     return f"{_seconds(at_ns)},{_NO_WHEELS}{sample.rate:.6g}"

@@ -1,16 +1,18 @@
-"""What pickle wrote of a robot -> the same again, and nothing else, whoever wrote it.
+"""Rebuilds a pickled robot, and nothing else, even if a stranger wrote the bytes.
 
-A recording comes from strangers too, and pickle's own reader does what its bytes say: it calls,
-imports, changes classes, nests without end. This one knows the few opcodes that a robot is written
-with. It calls nothing but what makes plain data, and each part is checked as it is made:
+A recording may come from a stranger, and Python's own unpickler obeys its bytes: it calls
+functions, imports modules, changes classes and nests without bound. This reader knows only the
+opcodes that a pickled robot consists of. It calls only constructors of plain data, and checks each
+part when it is made:
 
     a number, text, bytes    a number has at most 128 bits
-    a list, a tuple ...      at most so deep, and so large with all that is in it as often as it is
-    a Struct                 each field is what the Struct says it is
-    another part             made without being run, then given attributes; none hides what its
-                             class has
+    a list, a tuple ...      depth and size are bounded; a part that occurs twice counts twice
+    a Struct                 each field has the type that the Struct declares
+    another part             made without a call of its code, then given attributes; none of them
+                             hides an attribute of its class
 
-What has been referred to grows no more: so nothing has itself in it, and depth and size are exact.
+A part that has been referred to cannot grow any more. Therefore, no part contains itself, and the
+depth and the size are exact.
 """
 
 from __future__ import annotations
@@ -25,35 +27,43 @@ import msgspec
 from msgspec import Struct
 
 MOST_BYTES = 1 << 20
-"""A robot takes 12 000 to 40 000; with many senders of commands, a few times as much."""
+"""Largest size of a pickled robot. One takes 12 000 to 40 000 bytes, and a few times as much
+with many command senders.
+"""
 
 MOST_OPCODES = 1 << 17
 
 MOST_PARTS = 1 << 19
-"""All that is in it, what is there several times as often as that."""
+"""Largest number of values in a robot. A value that occurs several times counts each time."""
 
 MOST_COPIED = 4 * MOST_PARTS
-"""All that is copied to make its parts: few bytes can ask for the same one again and again."""
+"""Largest number of values copied while parts are made. A few bytes can ask for copies of the
+same part again and again.
+"""
 
 HASHED = 2**61 - 1
-"""Whole numbers below it have a hash each of their own, in Python."""
+"""Bound of the integers used as keys. Below it, Python gives each integer a hash of its own, so
+forged keys cannot collide.
+"""
 
 DEEPEST = 50
-"""Of parts within parts."""
+"""Largest nesting depth."""
 
 LONGEST = 128
-"""Bits of a number: sums over times in ns have more than 64."""
+"""Largest number of bits of an integer. Sums over times in ns have more than 64."""
 
 MOST_IN_KEY = 4
 
 Find = Callable[[str, str], type]
-"""The class of this module and name; raises `ValueError` where there is none that may be read."""
+"""Function that returns the class of a module and a name. It raises `ValueError` for a class
+that a robot does not consist of.
+"""
 
 ARGUMENTS = {
     "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE",
     "SHORT_BINBYTES", "BINBYTES",
 }  # fmt: skip
-"""Opcodes that are followed by a value."""
+"""Opcodes that push their argument."""
 
 VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 
@@ -65,7 +75,10 @@ SIMPLE = (str, int, float, bool, bytes, type(None))
 
 
 def unpickled(data: bytes, find: Find) -> object:
-    """What these bytes say; raises `ValueError`, in words, for all that is no robot's."""
+    """Return the object that the bytes describe.
+
+    Raises `ValueError` with a reason if it is not a robot's.
+    """
     if len(data) > MOST_BYTES:
         raise ValueError(f"it has {len(data)} bytes, more than any robot")
     machine = _Machine(find)
@@ -84,7 +97,7 @@ def unpickled(data: bytes, find: Find) -> object:
 
 
 class _Entry:
-    """A value on the stack, how deep and how large it is."""
+    """A value on the stack, with its depth and its size."""
 
     __slots__ = ("closed", "depth", "size", "value")
 
@@ -93,10 +106,13 @@ class _Entry:
         self.depth = 0
         self.size = 1
         self.closed = False
-        """It has been referred to, and grows no more."""
+        """True once the value has been referred to. It cannot grow any more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """These are in it from now on."""
+        """Add the depth and size of new parts to the container.
+
+        Raises `ValueError` if a bound is exceeded.
+        """
         if self.closed:
             raise ValueError("a part of it has itself in it, or grows when it is made")
         for part in parts:
@@ -111,7 +127,7 @@ class _Entry:
 
 
 class _Machine:
-    """Pickle's stack, its marks, and what is referred to by number."""
+    """Pickle's virtual machine: the stack, its marks, and the memo."""
 
     def __init__(self, find: Find) -> None:
         self._find = find
@@ -121,13 +137,13 @@ class _Machine:
         self._copied = 0
 
     def result(self) -> object:
-        """What is left in the end."""
+        """Return the only value that is left on the stack."""
         if len(self._stack) != 1 or self._marks:
             raise ValueError("it is damaged: it ends in the middle")
         return self._stack[0].value
 
     def do(self, name: str, argument: Any) -> None:
-        """One opcode; raises `ValueError`, or what its values lead to."""
+        """Execute one opcode; raise `ValueError`, or an exception that its operands cause."""
         if name in ARGUMENTS:
             if type(argument) is int and argument.bit_length() > LONGEST:
                 raise ValueError(f"it has a number of {argument.bit_length()} bits")
@@ -153,14 +169,14 @@ class _Machine:
         return entry
 
     def _push_of(self, kind: type, parts: list[_Entry]) -> None:
-        """A container that is made at once."""
+        """Push a container that is made at once."""
         entry = _Entry(None)
         entry.holds(parts)
         entry.value = kind([part.value for part in parts])
         self._stack.append(entry)
 
     def _top(self, count: int) -> list[_Entry]:
-        """The last ones, taken away."""
+        """Pop the last `count` values."""
         if len(self._stack) < count:
             raise IndexError("its stack is empty")
         taken = self._stack[-count:]
@@ -168,22 +184,22 @@ class _Machine:
         return taken
 
     def _marked(self) -> list[_Entry]:
-        """All behind the last mark, taken away."""
+        """Pop all values behind the last mark."""
         mark = self._marks.pop()
         taken = self._stack[mark:]
         del self._stack[mark:]
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """A part is made of it."""
+        """Count the values that are copied to make a part."""
         self._copied += entry.size
         if self._copied > MOST_COPIED:
             raise ValueError("it has more parts than any robot")
 
-    # what they do
+    # The opcodes
 
     def proceed(self) -> None:
-        """Says nothing about values."""
+        """Ignore an opcode that does not touch values."""
 
     def mark(self) -> None:
         self._marks.append(len(self._stack))
@@ -242,7 +258,7 @@ class _Machine:
         self._push(self._find(module, name))
 
     def reduced(self) -> None:
-        """A value of a class, of what it is given."""
+        """Make a value of a class from constructor arguments."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
             raise TypeError("what is no class is called")
@@ -253,7 +269,7 @@ class _Machine:
         self._stack.append(entry)
 
     def bare(self) -> None:
-        """A part without its attributes."""
+        """Make a part without attributes, and without a call of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
             raise TypeError("what is no class, or needs values, is made of none")
@@ -262,7 +278,7 @@ class _Machine:
         self._push(object.__new__(kind.value))
 
     def built(self) -> None:
-        """Its attributes."""
+        """Set the attributes of a part."""
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
@@ -296,7 +312,7 @@ DOES: dict[str, Callable[[_Machine], None]] = {
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Raises `ValueError` for what takes long to look up, or cannot be."""
+    """Refuse keys that are slow to hash, or cannot be hashed."""
     for entry in entries:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MOST_IN_KEY else (value,)
@@ -307,13 +323,16 @@ def _keys(entries: Sequence[_Entry]) -> None:
 
 
 def _is_part(kind: Any) -> bool:
-    """Its instances are their attributes, and nothing is run when they are made."""
+    """Return whether an instance is its attributes alone, and is made without code of its class."""
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
 def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """A value of this class; raises `ValueError` or `TypeError`."""
+    """Make a value of this class.
+
+    Raises `ValueError` or `TypeError` if the arguments do not suit it.
+    """
     match given:
         case (dict(),) if kind is Counter:
             return Counter(*given)

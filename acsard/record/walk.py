@@ -1,8 +1,8 @@
-"""The records of an MCAP file one after the other, over whatever is damaged in it.
+"""Yields the records of an MCAP file one after the other, and skips damaged places.
 
-What a chunk is and where it ends is told twice, by the head of its record and by itself: a damaged
-head costs nothing. Where a chunk itself is damaged, or a record leads nowhere, the next sound chunk
-is looked for, wherever it lies.
+A chunk's length and end are known twice: from the head of its record and from its own content. A
+damaged head therefore costs nothing. If a chunk is damaged, or a record's length leads nowhere, the
+reader searches for the next sound chunk.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from mcap.stream_reader import breakup_chunk
 from acsard.record.closing import DAMAGE
 
 MAGIC = b"\x89MCAP0\r\n"
-"""Begins every file of this kind, whatever it is called."""
+"""Magic bytes at the start of every MCAP file."""
 
 HEAD = struct.Struct("<BQ")
-"""Of a record: what it is, and its bytes after this."""
+"""Head of a record: its opcode and the number of bytes after the head."""
 
 BEFORE = HEAD.size + 28
-"""bytes of a chunk's record, head and all, before the name of its compression."""
+"""Number of bytes in a chunk's record, with its head, before the name of its compression."""
 
 COMPRESSED = re.compile(rb"\x04\0\0\0zstd")
-"""That name, as every recording has it."""
+"""The name of the compression in every recording, with its length."""
 
 READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
@@ -39,20 +39,20 @@ READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
 }
-"""What is of use here, beside chunks; all others are passed over."""
+"""Readers of the records that are used here, besides chunks. All other records are skipped."""
 
 OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
 
 
 class Found(NamedTuple):
-    """A record that is of use, or a place where one is damaged."""
+    """A record that is used, or a damaged place."""
 
     record: McapRecord | None
-    """None of a chunk, and of damage."""
+    """The record; None for a chunk and for damage."""
     inside: list[McapRecord]
-    """Of a chunk; empty of all others."""
+    """Records in a chunk; empty otherwise."""
     end: int
-    """Where it ends, bytes from the beginning of the file; of damage where the next one begins."""
+    """Offset of the record's end in the file, bytes. After damage, reading goes on there."""
 
     @property
     def damaged(self) -> bool:
@@ -60,7 +60,7 @@ class Found(NamedTuple):
 
 
 def walk(data: bytes) -> Iterator[Found]:
-    """Up to the footer, or as far as there is anything."""
+    """Yield the records up to the footer, or to the end of the data."""
     at, stream = len(MAGIC), io.BytesIO(data)
     if not data.startswith(MAGIC):
         return
@@ -83,10 +83,11 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _chunk(data: bytes, stream: io.BytesIO, at: int, claimed: int) -> Found | None:
-    """The sound chunk whose record begins there, whatever its head says; None where none is.
+    """Return the sound chunk whose record begins at `at`, even if its head is damaged, or None.
 
-    Where head and chunk differ about its end, the next one tells: a length that is too great would
-    swallow all behind it, for what is compressed knows itself where it ends.
+    If the head and the content disagree about the chunk's end, the next sound chunk decides.
+    Compressed data decodes even if its recorded length is too great, and such a length would
+    otherwise swallow the records after it.
     """
     found = _sound(data, stream, at)
     if found is None or found.end == claimed:
@@ -109,7 +110,7 @@ def _sound(data: bytes, stream: io.BytesIO, at: int) -> Found | None:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """The record of use that begins there; None where none is, or it is cut by the end."""
+    """Return the record that begins at `at`; None if it is not one of `READ`, or is cut off."""
     read = READ.get(opcode)
     if read is None:
         return None
@@ -123,7 +124,7 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 def _next(data: bytes, stream: io.BytesIO, begin: int) -> int | None:
-    """Where the next sound chunk begins."""
+    """Return the offset of the next sound chunk, or None."""
     for match in COMPRESSED.finditer(data, begin + BEFORE):
         if _sound(data, stream, match.start() - BEFORE):
             return match.start() - BEFORE

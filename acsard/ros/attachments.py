@@ -1,6 +1,6 @@
-"""The 33 bytes that go with every sample of rmw_zenoh_cpp: sequence, time and GID.
+"""The 33-byte attachment of every rmw_zenoh_cpp sample: sequence number, time and GID.
 
-A sample or request without them is dropped by its receiver, there and here.
+Both rmw_zenoh_cpp and acsard drop a sample or a request without it.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ _LAYOUT = Layout(f"<qqB{GID_BYTES}s")
 
 
 class Attachment(Struct, frozen=True):
-    """`sequence` counts from 1 per publisher or client; `stamp_ns` is its wall clock."""
+    """Attachment of a sample or a request.
+
+    `sequence` counts from 1 for each publisher or client, and `stamp_ns` is its wall-clock time.
+    """
 
     sequence: int
     stamp_ns: int
     gid: bytes
 
     def pack(self) -> bytes:
-        """As it goes over the wire."""
+        """Encode the attachment."""
         return _LAYOUT.pack(self.sequence, self.stamp_ns, GID_BYTES, self.gid)
 
 
 def unpack(data: bytes) -> Attachment:
-    """The attachment in `data`; raises `DecodeError`."""
+    """Decode an attachment; raise `DecodeError` if it is not valid."""
     if not data:
         raise DecodeError("no_attachment", "has no attachment, as rmw_zenoh gives every sample one")
     if len(data) != _LAYOUT.size:

@@ -1,10 +1,10 @@
-"""**The** table of what a file or a live viewer is given: topic, ROS type, which struct of ours.
+"""The table of topics for a file or a live viewer: name, ROS type, and the struct that is encoded.
 
-All of it is CDR with its definition beside it (MCAP's `ros2msg`): Foxglove, Lichtblick and
-PlotJuggler read any such type, and `ros2 bag play` opens no file in which one topic is anything
-else. So `state`, which ROS has no message for, is of a type of ours: `ros2 bag play` leaves out
-that one topic and says so, the others show it as any other. Names and types that the ROS tree has
-too are those of `transports.py`.
+Every topic is CDR with its message definition (MCAP's `ros2msg`). Foxglove, Lichtblick and
+PlotJuggler read any such type. `ros2 bag play` refuses a file in which any topic has another
+encoding. ROS has no message for `state`, so it has a type of its own package. `ros2 bag play`
+reports that it leaves out this topic, and the other programs show it. Names and types that exist in
+the ROS tree come from `transports.py`.
 """
 
 from __future__ import annotations
@@ -24,35 +24,35 @@ from acsard.ros.tokens import Qos
 from acsard.ros.transports import PUBLISHED
 
 ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"
-"""Of messages and of their definitions, as MCAP and the live protocol call them."""
+"""Names of the message encoding and the schema encoding in MCAP and in Foxglove's live protocol."""
 
 SOURCE = "<source>"
 
 
 class Channel(Struct, frozen=True):
-    """One topic; those of the commanders are one for each source."""
+    """A topic, or one topic for each source of commands."""
 
     name: str
-    """Relative to the namespace; may hold `<source>`."""
+    """Topic name relative to the namespace; it may contain `<source>`."""
     native: str
-    """The key in the native tree that says the same."""
+    """Key in the native tree with the same content."""
     schema_name: str
-    """`pkg/msg/Name`."""
+    """ROS type as `pkg/msg/Name`."""
     message: type[Struct]
-    """What is encoded; of `state` made by `shapes.state`."""
+    """Struct that is encoded; for `state`, the result of `shapes.state`."""
     qos: Qos = Qos()
 
     def topic(self, namespace: str, source: str = "") -> str:
-        """The fully qualified name, with its leading slash."""
+        """Return the fully qualified name, with its leading slash."""
         return full_name(namespace, self.name.replace(SOURCE, source))
 
     @property
     def schema(self) -> str:
-        """The text of the definition with all nested types."""
+        """The text of the message definition with all nested types."""
         return schema_text(self.schema_name)
 
     def encode(self, message: Any) -> bytes:
-        """The CDR of a message, of `state` also of a `RobotState`."""
+        """Encode a message as CDR. A `RobotState` is first converted to the shape of `state`."""
         return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
 
 
@@ -70,14 +70,16 @@ TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 STATE = Channel("state", "state", OURS + "RobotState", State)
 LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
 CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
-"""What each source asks for; the stamp is when it arrived. A log line is one event."""
+"""The command of each source, stamped with its arrival. `LOG` has one log line for each event."""
 
 BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
-"""What the report builds, by its key."""
+"""The channels of the messages that `Report` builds, by native key."""
 
 CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
 
 
 def said(silent: Container[str]) -> tuple[Channel, ...]:
-    """The channels that a robot has something to say on; `silent` as `transports.left_out`."""
+    """Return the channels on which a robot publishes; `silent` is the result of
+    `transports.left_out`.
+    """
     return tuple(channel for channel in CHANNELS if channel.native not in silent)

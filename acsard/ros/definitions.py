@@ -1,7 +1,8 @@
-"""The message definitions of ROS 2 (Jazzy and later) that a file or a viewer is told.
+"""The message definitions of ROS 2 (Jazzy and later) that a file or a viewer receives.
 
-One line a type: its name, a colon, its fields as `type name` with commas between; `[]` is a
-sequence, `[n]` an array. What has no message in ROS is in the package `acsard` (`shapes.py`).
+Each type has one line: its name, a colon, and its fields as `type name`, separated by commas. `[]`
+marks a sequence and `[n]` an array. Types without a ROS message are in the package `acsard`
+(`shapes.py`).
 """
 
 from __future__ import annotations
@@ -10,10 +11,10 @@ import re
 from collections.abc import Iterator
 
 OURS = "acsard/msg/"
-"""Begins the types that ROS does not know; a file tells them like any other."""
+"""Prefix of the types that ROS does not know. A file defines them like any other type."""
 
 Field = tuple[str, str]
-"""Type and name."""
+"""Type and name of a field."""
 
 _TEXT = """
 builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
@@ -68,20 +69,20 @@ def _parsed(text: str) -> dict[str, tuple[Field, ...]]:
 
 
 DEFINITIONS = _parsed(_TEXT)
-"""The fields of each type in order."""
+"""The fields of each type, in order."""
 
 RULE = "=" * 80
 
 
 def schema_text(name: str) -> str:
-    """The definition with all that it is made of, as MCAP's `ros2msg` has it: each type once."""
+    """Return the definition of a type and of all nested types in MCAP's `ros2msg` format."""
     parts = [_fields(name)]
     parts += [f"{RULE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
     return "".join(parts)
 
 
 def nested(name: str) -> tuple[str, ...]:
-    """The types that a type is made of, however deep, in the order in which they are met."""
+    """Return the types that a type contains at any depth, in the order of their first use."""
     return tuple(dict.fromkeys(_nested(name)))
 
 
@@ -98,5 +99,5 @@ def _fields(name: str) -> str:
 
 
 def _short(kind: str) -> str:
-    """`pkg/msg/Type` as definitions write it: `pkg/Type`."""
+    """Shorten `pkg/msg/Type` to `pkg/Type`, as message definitions write it."""
     return re.sub("/msg/", "/", kind)

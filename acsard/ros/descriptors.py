@@ -1,6 +1,6 @@
-"""What `describe_parameters` says of each key: what it is, its range and unit, when it can be set.
+"""The descriptors for `describe_parameters`: description, range, and when a key may be set.
 
-Taken from where the configuration is checked, so that both say the same.
+They are derived from the declarations that the configuration is checked with, so both agree.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Unsigned64 = Annotated[int, Meta(extra={"cdr": "Q"})]
 
 
 class FloatingPointRange(Struct, frozen=True):
-    """Bounds of a float."""
+    """Bounds of a float parameter."""
 
     from_value: float
     to_value: float
@@ -29,7 +29,7 @@ class FloatingPointRange(Struct, frozen=True):
 
 
 class IntegerRange(Struct, frozen=True):
-    """Bounds of an integer."""
+    """Bounds of an integer parameter."""
 
     from_value: Signed64
     to_value: Signed64
@@ -37,7 +37,7 @@ class IntegerRange(Struct, frozen=True):
 
 
 class ParameterDescriptor(Struct, frozen=True):
-    """What a parameter is."""
+    """Descriptor of a parameter."""
 
     name: str
     type: Unsigned8
@@ -50,13 +50,14 @@ class ParameterDescriptor(Struct, frozen=True):
 
 
 def described(name: str, type_of: int) -> ParameterDescriptor:
-    """The descriptor of a parameter whose value has this type; 0 is one that is not there."""
+    """Return a parameter's descriptor; `type_of` is its ROS type, 0 for an unknown parameter."""
     if not type_of:
         return ParameterDescriptor(name, type_of)
     return _described(name, type_of)
 
 
-@cache  # names that are there: some hundred
+# The cache stays small: there are about a hundred known names.
+@cache
 def _described(name: str, type_of: int) -> ParameterDescriptor:
     kind, row = kind_of(name), live(name)
     words = expected(kind)
@@ -79,7 +80,10 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
 
 
 def kind_of(name: str) -> inspect.Type:
-    """The type of a key of `acsard.toml`, as it is checked by; a source counts by its name."""
+    """Return the declared type of a key of `acsard.toml`.
+
+    A source is named in place of its index. Raises `KeyError` if the key is a table.
+    """
     cls: type[Struct] = Config
     parts = iter(name.split("."))
     for part in parts:

@@ -1,7 +1,7 @@
-"""ROS 2 names: types and their hashes, and how a topic or service is called on either transport.
+"""ROS 2 names: types with their hashes, and the keys of topics and services on either transport.
 
-zenoh-bridge-ros2dds uses the bare name as key; rmw_zenoh_cpp adds domain, type and hash, so a
-wrong hash is silence. What must not live here: which topics the robot has (`ros/transports.py`).
+zenoh-bridge-ros2dds uses the bare name as the key. rmw_zenoh_cpp adds domain, type and type hash,
+so with a wrong hash no message arrives. The list of the robot's topics is in `ros/transports.py`.
 """
 
 from __future__ import annotations
@@ -40,26 +40,27 @@ TYPE_HASHES: dict[str, str] = {
         "RIHS01_0e192ef259c07fc3c07a13191d27002222e65e00ccec653ca05e856f79285fcd",
 }
 # fmt: on
-"""RIHS01 type hashes of Jazzy, Kilted and Lyrical, of every ROS type we speak. Literals, because
-they are part of the wire format; a test computes them anew from the message definitions."""
+"""RIHS01 type hashes of every ROS type in use, for Jazzy, Kilted and Lyrical. They are literals
+because they are part of the wire format; a test computes them from the message definitions.
+"""
 
 
 def full_name(namespace: str, name: str) -> str:
-    """The fully qualified name of a topic or service, with its leading slash."""
+    """Return the fully qualified name of a topic or service, with its leading slash."""
     return f"/{namespace}/{name}" if namespace else f"/{name}"
 
 
 def bridge_key(name: str) -> str:
-    """The key zenoh-bridge-ros2dds gives a fully qualified name."""
+    """Return the key that zenoh-bridge-ros2dds uses for a fully qualified name."""
     return name.removeprefix("/")
 
 
 def rmw_key(domain: int, name: str, type_name: str) -> str:
-    """The key rmw_zenoh_cpp gives a fully qualified name of this type."""
+    """Return the key that rmw_zenoh_cpp uses for a fully qualified name with this type."""
     return f"{domain}/{name.removeprefix('/')}/{dds_type(type_name)}/{TYPE_HASHES[type_name]}"
 
 
 def dds_type(type_name: str) -> str:
-    """`pkg/msg/Name` as DDS writes it."""
+    """Return `pkg/msg/Name` in the spelling of DDS."""
     package, kind, name = type_name.split("/")
     return f"{package}::{kind}::dds_::{name}_"

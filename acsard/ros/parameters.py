@@ -1,9 +1,8 @@
-"""The configuration as ROS parameters: what `ros2 param` and `rqt_reconfigure` ask of a node.
+"""The configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
 
-Those of `config/live.py` can be set; setting is the robot's to do, and here only its language.
-
-The rcl_interfaces structs live here, since nothing else speaks them; names are those of
-`acsard.toml`, joined by dots.
+A parameter is named as in `acsard.toml`, with dots between table and key. Those in `config/live.py`
+can be set. This module only translates a request to set; the robot decides and applies it. The
+rcl_interfaces structs are here because no other module uses them.
 """
 
 from __future__ import annotations
@@ -27,12 +26,14 @@ from acsard.values import Plain
 
 T = TypeVar("T")
 Some = Annotated[list[T], Meta(max_length=128)]
-"""All parameters at once are fewer; a request of more takes too long to answer in one step."""
+"""List of requested parameters. All parameters together are fewer; a longer request would take
+too long to answer in one step.
+"""
 Many = Annotated[list[T], Meta(max_length=256)]
-"""Of what is quicker to read: names alone."""
+"""List of names, which is quicker to read and may be longer."""
 
 MAX_REQUEST_BYTES = 16384
-"""As many of the longest names."""
+"""Largest size of a request: as many of the longest names as a list may hold."""
 
 NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
 INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
@@ -43,7 +44,7 @@ Q = TypeVar("Q")
 
 
 class ParameterValue(Struct, frozen=True):
-    """One value; `type` says which field holds it."""
+    """Value of a parameter; `type` says which field holds it."""
 
     type: Unsigned8 = NOT_SET
     bool_value: bool = False
@@ -58,83 +59,87 @@ class ParameterValue(Struct, frozen=True):
 
 
 class Parameter(Struct, frozen=True):
-    """A named value."""
+    """A parameter with its value."""
 
     name: str
     value: ParameterValue
 
 
 class SetParametersResult(Struct, frozen=True):
-    """Was it set, and if not, why."""
+    """Result of setting a parameter, with the reason if it failed."""
 
     successful: bool
     reason: str
 
 
 class ListRequest(Struct, frozen=True):
-    """`depth` 0 is any depth; no prefixes are all."""
+    """Request to list parameters.
+
+    `depth` 0 means any depth; without prefixes all parameters are listed.
+    """
 
     prefixes: Many[str]
     depth: Unsigned64
 
 
 class ListReply(Struct, frozen=True):
-    """Names, and the prefixes they have."""
+    """Reply with parameter names and their prefixes."""
 
     names: list[str]
     prefixes: list[str]
 
 
 class Names(Struct, frozen=True):
-    """The request of get, types and describe."""
+    """Request of the services that get values, types and descriptors."""
 
     names: Many[str]
 
 
 class Values(Struct, frozen=True):
-    """The reply of get."""
+    """Reply with values."""
 
     values: list[ParameterValue]
 
 
 class Types(Struct, frozen=True):
-    """The reply of types."""
+    """Reply with types."""
 
     types: list[Unsigned8]
 
 
 class Descriptors(Struct, frozen=True):
-    """The reply of describe."""
+    """Reply with descriptors."""
 
     descriptors: list[ParameterDescriptor]
 
 
 class SetRequest(Struct, frozen=True):
-    """The request of both ways to set."""
+    """Request of both services that set parameters."""
 
     parameters: Some[Parameter]
 
 
 class SetReply(Struct, frozen=True):
-    """A result for each."""
+    """Reply with one result for each parameter."""
 
     results: list[SetParametersResult]
 
 
 class SetAtomicallyReply(Struct, frozen=True):
-    """One result for all."""
+    """Reply with one result for all parameters."""
 
     result: SetParametersResult
 
 
 SETTING = ("set_parameters", "set_parameters_atomically")
-"""The services that are asked of the robot."""
+"""The services that the robot must carry out."""
 
 
 def failure(service: str, why: str, request: bytes = b"") -> bytes:
-    """The reply to a request that is not served: as rclcpp, nothing where there is no room for why.
+    """Return the reply to a request that is not served.
 
-    A client without any reply would wait for ever; one that sets expects a result for each.
+    A client without a reply would wait for ever, and a client that sets parameters expects a result
+    for each. As in rclcpp, a reply without a field for `why` is empty.
     """
     refused = SetParametersResult(False, why)
     if service in SETTING:
@@ -153,7 +158,7 @@ def failure(service: str, why: str, request: bytes = b"") -> bytes:
 
 
 class Parameters:
-    """Answers the parameter services that ask, from the tables of a configuration."""
+    """Answers the parameter services that only read, from the tables of a configuration."""
 
     def __init__(self, tables: Mapping[str, object]) -> None:
         self._values = {name: _value(value) for name, value in flat(tables)}
@@ -165,7 +170,7 @@ class Parameters:
         }
 
     def answer(self, service: str, payload: bytes) -> bytes:
-        """The reply to a request, both in CDR; raises `CdrError`."""
+        """Answer a CDR request with a CDR reply; raise `CdrError` if the request is not valid."""
         return self._services[service](payload)
 
     def _list(self, asked: ListRequest) -> ListReply:
@@ -193,7 +198,10 @@ class Parameters:
 
 
 def wished(payload: bytes) -> dict[str, Plain]:
-    """What a request to set asks for, by name; raises `CdrError`."""
+    """Return the wished values by name from a request to set.
+
+    Raises `CdrError` if it is not valid.
+    """
     asked = Cdr(SetRequest).decode(payload)
     wishes: dict[str, Plain] = {}
     for one in asked.parameters:
@@ -204,7 +212,7 @@ def wished(payload: bytes) -> dict[str, Plain]:
 
 
 def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
-    """The reply to a request to set, which the robot does whole or not at all."""
+    """Return the reply to a request to set. The robot applies all parameters or none."""
     result = SetParametersResult(successful, reason)
     if service == "set_parameters_atomically":
         return Cdr(SetAtomicallyReply).encode(SetAtomicallyReply(result))

@@ -1,6 +1,6 @@
-"""What our structs are not yet in the shape of: the log, and `state` as CDR can tell it.
+"""The structs whose ROS shape differs from the native one: the log, and `state`.
 
-CDR has no maps and no "none", so counters are a list and an age that there is not is NaN.
+CDR has neither maps nor null. The counters are therefore a list, and NaN stands for null.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Natural = Annotated[int, Meta(extra={"cdr": "I"})]
 
 
 class Log(Struct, frozen=True):
-    """rcl_interfaces/msg/Log: `name` is the event's."""
+    """The message rcl_interfaces/msg/Log; `name` is the name of the event."""
 
     stamp: Time
     level: Byte
@@ -41,40 +41,43 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""So begins what `drive/tally.py` has put together of several."""
+"""Start of a text that `drive/tally.py` has combined from several events."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
-"""As ROS numbers them."""
+"""The numbers of the log levels in ROS."""
 
 
 def log(event: Event | Happening, stamp: Time) -> Log:
-    """An event of a step, or of `events`, told in one line."""
+    """Return an event of a step or of `events` as one log line."""
     by = f" (by {event.by})" if event.by else ""
     text = f"{event.text}{by}{how_often(event.text, event.count)}"
     return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
 
 
 def how_often(text: str, count: int) -> str:
-    """What to put behind a text that does not begin with its numbers itself; "" for nothing."""
+    """Return the suffix that says how often an event happened.
+
+    It is "" for a single event, and for a text that begins with its own number.
+    """
     return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
 
 
 def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
-    """What a source asks for, on `cmd_vel_in/<source>`: stamped when it arrived."""
+    """Return a source's command as a message of `cmd_vel_in/<source>`, stamped with its arrival."""
     return TwistStamped(
         Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
     )
 
 
 class Counter(Struct, frozen=True):
-    """One of the totals since the start."""
+    """A counter, counted since the start."""
 
     name: str
     count: Whole
 
 
 class Source(Struct, frozen=True):
-    """A commander; `age` in s, NaN where it was never heard."""
+    """A source of commands; `age` is in s, NaN if it has never sent a command."""
 
     name: str
     priority: Whole
@@ -83,7 +86,7 @@ class Source(Struct, frozen=True):
 
 
 class State(Struct, frozen=True):
-    """`RobotState` without the daemon's own figures, which are in `diagnostics`.
+    """`RobotState` without the figures of the control loop, which `diagnostics` holds.
 
     NaN stands for null.
     """
@@ -112,7 +115,7 @@ class State(Struct, frozen=True):
 
 
 def state(message: RobotState) -> State:
-    """The same in the shape of `acsard/msg/RobotState`."""
+    """Convert a `RobotState` to the shape of `acsard/msg/RobotState`."""
     return State(
         header=Header(message.stamp),
         mode=message.mode,

@@ -1,7 +1,7 @@
-"""The ROS names of this robot and what each stands for in the native tree.
+"""The robot's ROS names, and the native key that each of them stands for.
 
-One list for both transports; the bus declares from it. What comes in on a ROS key is the same
-command, and what goes out the same message, as on the native key beside it.
+One list serves both transports, and the bus declares its endpoints from it. A message on a ROS key
+means the same as on its native key, in both directions.
 """
 
 from __future__ import annotations
@@ -23,33 +23,35 @@ Transport = Literal["bridge", "rmw"]
 
 
 class RosName(Struct, frozen=True):
-    """A topic or service: its relative `name`, and the native key it stands for."""
+    """A topic or service with its relative `name`, and the native key that it stands for."""
 
     name: str
     native: str
     direction: Direction
-    """That of the native key; to ROS a query is a service too."""
+    """Direction of the native key. In ROS a query is a service too."""
     type: str
     qos: Qos = Qos()
 
 
 class Endpoint(Struct, frozen=True):
-    """One key to declare on the bus."""
+    """A key to declare on the bus."""
 
     transport: Transport
     native: str
     direction: Direction
     key: str
     token: str
-    """Its liveliness token, "" for none; over rmw also what its GID is made of."""
+    """Liveliness token, or "" if it has none. On rmw, the GID is derived from it."""
     latched: bool
     type: str
-    """The ROS type its key names; by a bridge, where a name may take two, the first."""
+    """ROS type that the key names. A bridge's key that accepts two types has the first of them."""
 
     @property
     def encoding(self) -> str:
-        """Of what comes in on it, which names none: a bridge's Twist or TwistStamped is told by
-        its length only."""
+        """Encoding to assume for an incoming sample, because the samples themselves name none.
+
+        On a bridge's key only the length tells a Twist from a TwistStamped.
+        """
         cdr = encoding_name("cdr")
         return f"{cdr};{self.type}" if self.transport == "rmw" else cdr
 
@@ -70,7 +72,7 @@ PARAMETER_SERVICES = {
 }
 
 PARAMETERS = "parameters/"
-"""Where the parameter services would be in the native tree, which has `config` instead."""
+"""Prefix of the parameter services in place of a native key; the native tree has `config`."""
 
 PUBLISHED = (
     RosName("odom", "odom", "out", "nav_msgs/msg/Odometry"),
@@ -84,16 +86,17 @@ PUBLISHED = (
 TWISTS = {"twist": "geometry_msgs/msg/Twist", "twist_stamped": "geometry_msgs/msg/TwistStamped"}
 
 SOURCES = {"cmd_vel": "nav", "cmd_vel_teleop": "teleop", "joint_commands": "ros2_control"}
-"""The command source each commanding topic counts as."""
+"""The command source of each topic that commands the robot."""
 
 GYRO = RosName("imu/data", IMU, "in", "sensor_msgs/msg/Imu", Qos(best_effort=True))
-"""As drivers of sensors publish it (SensorDataQoS) or better."""
+"""Subscription to a gyro; its QoS accepts drivers that publish with SensorDataQoS or better."""
 
 
 def left_out(config: Config) -> frozenset[str]:
-    """The native keys that have nothing to say or to hear: ROS tools would take them for more."""
+    """Return the native keys without content, so that ROS tools do not show them as topics."""
     silent = set() if config.odometry.publish_tf else {"tf"}
-    if not config.odometry.gyro or config.mcu.simulated:  # the simulated robot has a gyro itself
+    # The simulated robot has a gyro of its own.
+    if not config.odometry.gyro or config.mcu.simulated:
         silent.add(IMU)
     if not (config.lidar.publish_tf or config.footprint.publish_tf):
         silent.add("tf_static")
@@ -101,7 +104,10 @@ def left_out(config: Config) -> frozenset[str]:
 
 
 def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...]:
-    """All topics and services; a twist topic that takes both types is there once for each."""
+    """Return all topics and services.
+
+    A twist topic that accepts both types appears once for each type.
+    """
     kinds = [kind for kind in TWISTS if ros.cmd_vel_type in ("auto", kind)]
     return (
         *(row for row in PUBLISHED if row.native not in silent),
@@ -129,12 +135,12 @@ def ros_names(ros: RosConfig, silent: Container[str] = ()) -> tuple[RosName, ...
 
 
 def in_ros_words(text: str, ros: RosConfig) -> str:
-    """The text with the services called as ROS calls them: /acsard/clear, not srv/clear."""
+    """Replace the services in a text by their ROS names: srv/clear by /acsard/clear."""
     return _NAMED.sub(lambda found: full_name(ros.namespace, f"{ros.node}/{found[1]}"), text)
 
 
 def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[Endpoint, ...]:
-    """The keys of every tree that is switched on, for a session with this Zenoh id."""
+    """Return the keys of every enabled transport, for a session with this Zenoh id."""
     names = ros_names(ros, silent)
     found: list[Endpoint] = []
     if ros.bridge:
@@ -145,7 +151,7 @@ def endpoints(ros: RosConfig, zid: str, silent: Container[str] = ()) -> tuple[En
 
 
 def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
-    """The tokens beside those of the endpoints: that there is a node, or a bridge."""
+    """Return the tokens besides those of the endpoints, which announce the node or the bridge."""
     tokens = []
     if ros.bridge and ros.announce:
         tokens.append(bridge_presence(zid))
@@ -155,14 +161,17 @@ def node_tokens(ros: RosConfig, zid: str) -> tuple[str, ...]:
 
 
 def command_keys(ros: RosConfig) -> tuple[str, ...]:
-    """The keys commands come in on."""
+    """Return the ROS keys on which commands arrive."""
     return tuple({e.key: None for e in endpoints(ros, "0") if e.direction == "in"})
 
 
 def claims(ros: RosConfig) -> tuple[str, ...]:
-    """Tokens that say which ROS names a daemon obeys: two that have one of them are both driven by
-    one `cmd_vel`. In a tree of our own, since other nodes may be called as ours, and not every
-    daemon has tokens for ROS."""
+    """Return tokens that say which ROS names a daemon obeys.
+
+    Two daemons with a common token would both be driven by one `cmd_vel`. The tokens are in
+    acsard's own tree, because other nodes may have the same names, and not every daemon announces
+    itself to ROS.
+    """
     name = full_name(ros.namespace, "cmd_vel")
     ways = (("bridge", ros.bridge), (f"rmw/{ros.domain}", ros.rmw))
     return tuple(f"{ROOT}/@ros/{way}{name}" for way, on in ways if on)
@@ -173,7 +182,10 @@ def _node(ros: RosConfig, zid: str) -> Node:
 
 
 def _bridge(ros: RosConfig, zid: str, names: tuple[RosName, ...]) -> Iterator[Endpoint]:
-    """One key a name; a topic of two types cannot be announced, as a DDS reader has one."""
+    """Yield one endpoint per name.
+
+    A topic with two types is not announced, as a DDS reader has one type.
+    """
     for row in names:
         twins = [other for other in names if other.name == row.name]
         if row is not twins[0]:

@@ -145,7 +145,8 @@ class Run:
             queue.reverse()
             if queue:
                 self._next(sender, queue)
-        self.witness.shared_clocks = {name for name, count in seen.items() if count > 1}
+        several = (name for name, count in seen.items() if count > 1)
+        self.witness.shared_clocks = frozenset(several)
         for event in plan["events"]:
             self.counts[f"event {event['do']} {event.get('verb', '')}".strip()] += 1
             self._at(int(event["at"] * NS), lambda event=event: self._do(event))  # type: ignore[misc]
@@ -246,7 +247,7 @@ class Run:
     # the board and the host
 
     def _do(self, event: dict[str, Any]) -> None:
-        product, witness = self.product, self.witness
+        product = self.product
         lasts_ns = min(
             int(event.get("for", 0.0) * NS),
             max(0, int(self.plan["seconds"] * NS) - self.true_ns),
@@ -275,8 +276,8 @@ class Run:
                 self.pose.doubt()
                 self._at(after_ns, lambda: self._plug(event["new"]))
             case "block":
-                product.block(True)
-                self._at(after_ns, lambda: product.block(False))
+                self._block(True)
+                self._at(after_ns, lambda: self._block(False))
             case "tear":
                 product.tear(event["taken"])
             case "stall" | "stall in step":
@@ -296,6 +297,10 @@ class Run:
                 if product.alive:
                     self._restart(event, after_ns)
 
+    def _block(self, blocked: bool) -> None:
+        self.product.block(blocked)
+        self.witness.blocked_ns = self.true_ns if blocked else None
+
     def _troubled(self, name: str) -> None:
         self.witness.troubles[name] = self.true_ns
         if name in LIARS:
@@ -305,6 +310,10 @@ class Run:
         self._active.remove(fault)
         self._troubled(fault[0])
         self.product.board(list(self._active))
+        if fault[0] == "echo" and self.product.plugged:
+            # The daemon asks for this, and drives no more until it was done.
+            self.product.unplug()
+            self._at(self.true_ns + NS // 10, lambda: self._plug(False))
 
     def _plug(self, new: bool) -> None:
         if not self.product.plugged:
@@ -381,14 +390,15 @@ class Run:
             self.pose.placed()
         for name, _ in self._active:
             witness.troubles[name] = true_ns
-        witness.step(true_ns, seen.mode, seen.reason)
+        witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         for at_ns, line in seen.lines:
-            witness.line(at_ns + offset, line, self._fed_ns)
+            witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             if any(witness.last):
                 self._moved_ns = at_ns + offset
         if seen.estimates:
-            lies = {name for name, _ in self._active}
-            self.pose.see(true_ns, seen.estimates, self.product.truth(), offset, lies)
+            lies, truth = {name for name, _ in self._active}, self.product.truth()
+            self.pose.see(true_ns, seen.estimates, truth, offset, lies)
+            witness.wheels(true_ns, truth[4])
         self.pose.end_step()
         if self.log is not None:
             self.log(
@@ -474,8 +484,20 @@ class Run:
         moving = self.true_ns - self._moved_ns < NS // 5
         if mode != "driving" or not moving:
             raise BrokenError("a lawful sender drives", self.true_ns, f"{mode}: {reason}")
+        self._check_course(speed, turn)
         self.counts["lawful drives"] += 1
         self._run_to(self.true_ns + NS)
+
+    def _check_course(self, speed: float, turn: float) -> None:
+        """The robot drives as it was told, or slower on the same curve."""
+        witness, limits = self.witness, self.witness.limits
+        takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
+        if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
+            return
+        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
+        room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
+        if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
+            raise BrokenError("the robot drives as told", self.true_ns, f"{got} for {told}")
 
 
 def _read_reply(reply: bytes, via: str) -> tuple[bool, str]:

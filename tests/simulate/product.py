@@ -47,6 +47,8 @@ class Seen(NamedTuple):
     """What one control step showed to the outside."""
 
     at_ns: int
+    decided_ns: int
+    """When the step began: a stall may lie between this and `at_ns`."""
     mode: str
     reason: str
     link: str
@@ -169,7 +171,17 @@ class Product:
             )
             for found in outputs.estimates
         ]
-        self._see(Seen(world.now_ns, outputs.mode, outputs.reason, outputs.link, lines, estimates))
+        self._see(
+            Seen(
+                world.now_ns,
+                outputs.now.mono_ns,
+                outputs.mode,
+                outputs.reason,
+                outputs.link,
+                lines,
+                estimates,
+            )
+        )
 
     # time
 

@@ -15,20 +15,21 @@ from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any
 
-from tests.simulate.roads import FOREIGN, NS, Message, Sample
+from tests.simulate.ages import MARGIN_NS, Ages
+from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 ZERO = (0.0, 0.0, 0.0, 0.0)
 MODES = {"leaving", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
 
-MARGIN_NS = 30_000_000
-"""Allowed beside a time limit: two periods at the lowest rate of the plans and a line's way."""
-
 RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
 
-EARLY_NS = 60_000_000
-"""A delay that falls by more than this is a backlog that pours in."""
+BLOCKED_NS = 500_000_000
+"""After so long without a line that left, the daemon knows it. The board stops itself earlier."""
+
+STAND_NS = 2 * NS
+"""After a ramp to rest: time for motors with a lag of 0.12 s to stand."""
 
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
@@ -56,17 +57,6 @@ class Wish:
         self.identity = ""
         self.armed_ns = -1
         """Arrival of the zero by which this sender is armed, -1 for none."""
-
-
-class Clock:
-    """The true delays of one sender's messages, as far as the robot can have learned them."""
-
-    def __init__(self) -> None:
-        self.least_ns: int | None = None
-        self.recent: deque[tuple[int, int]] = deque()
-        self.stamp_ns = 0
-        self.loose = False
-        """It was adjusted or its sender paused: the pages promise nothing about its age."""
 
 
 class Sender:
@@ -105,7 +95,7 @@ class Witness:
         quiet = max(0.1, 4 / rate, 3 * config["mcu"].get("reply_period", 0.0))
         self.quiet_ns = int(quiet * NS)
         self.counts: Counter[str] = Counter()
-        self.shared_clocks: set[str] = set()
+        self.shared_clocks: frozenset[str] = frozenset()
         """Clocks that several senders of the plan stamp by."""
         self.churns = False
         self.stops: list[int] = []
@@ -117,6 +107,10 @@ class Witness:
         self.fault_ns: int | None = None
         self.troubles: dict[str, int] = {}
         """Board faults and when each was last active."""
+        self.blocked_ns: int | None = None
+        """Since when the kernel takes no line."""
+        self.braking: tuple[int, float] | None = None
+        """When a robot that must not move was first seen to move, and how fast."""
         self.pending = False
         """An answer waits for the disk, so it is not known yet what is in force."""
         self.mode = self.reason = ""
@@ -135,9 +129,8 @@ class Witness:
         self.before = dict(self.limits)
         self.changed_ns = at_ns
         self.softest = dict(self.limits)
-        self.born_ns = self.learned_ns = at_ns
         self.armed_since_ns = at_ns
-        self.clocks: dict[str, Clock] = {}
+        self.ages = Ages(at_ns)
         self.senders: dict[tuple[str, str], Sender] = {}
         self.wishes: deque[tuple[str, Wish]] = deque()
         self.last: tuple[float, ...] = ZERO
@@ -170,7 +163,9 @@ class Witness:
         zero = v == w == 0.0 and message.junk == ""
         wish = Wish(arrived_ns, v, w)
         wish.identity, wish.shared = sample.identity, sample.shared
-        wish.fresh = self._fresh(sender, message, sample, arrived_ns)
+        loose = sample.clock in self.shared_clocks
+        timeout_ns = self.timeout[source]
+        wish.fresh = self.ages.fresh(sender, message, sample, arrived_ns, timeout_ns, loose)
         wish.certain = (
             not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
         )
@@ -192,60 +187,13 @@ class Witness:
         if place:
             known.armed_ns = max(known.armed_ns, known.zeros[place - 1])
 
-    def _fresh(
-        self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int
-    ) -> bool:
-        """Return whether the pages allow the robot to obey this command, by its true age."""
-        if not sample.clock:
-            return True
-        age = arrived_ns - message.sent_ns
-        timeout_ns: int = self.timeout[sender["source"]]
-        clock = self.clocks.setdefault(sample.clock, Clock())
-        if sample.clock in self.shared_clocks:
-            clock.loose = True
-        foreign = sender["way"] in FOREIGN
-        if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
-            clock.loose = True
-        if foreign and sender["clock"]:
-            clock.loose = True
-        clock.stamp_ns = message.stamp_ns
-        least, recent = clock.least_ns, clock.recent
-        clock.least_ns = age if least is None else min(least, age)
-        while recent and recent[0][0] < arrived_ns - 3 * NS:
-            recent.popleft()
-        prompt: int = int(sender["delay"] * NS)
-        allowed = max(timeout_ns, 0) + EARLY_NS + MARGIN_NS
-        if foreign:
-            minutes = (arrived_ns - self.learned_ns) / NS / 60
-            allowed += int((1.0 + minutes) * NS)
-        if clock.loose or age <= prompt + allowed:
-            fresh = True
-        elif least is None or self._falls(recent, age, arrived_ns, min(timeout_ns, 2 * NS)):
-            fresh = False
-        else:
-            fresh = age <= least + allowed
-        recent.append((arrived_ns, age))
-        return fresh
-
-    def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
-        """Return whether the delays cannot have looked constant for the time of a proof."""
-        window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]
-        if not window or window[0][0] > now_ns - proof_ns + MARGIN_NS:
-            return recent[0][0] > now_ns - proof_ns if recent else True
-        middle = now_ns - proof_ns // 2
-        first = [d for at, d in window if at < middle]
-        second = [d for at, d in window if at >= middle] + [age]
-        return bool(first) and min(first) - min(second) > EARLY_NS
-
     def arming(self, at_ns: int) -> None:
         """Note an event after which every sender must send a zero."""
         self.armed_since_ns = max(self.armed_since_ns, at_ns)
 
     def suspended(self, at_ns: int) -> None:
-        """The robot's clock stood: it cannot know the delays that it knew before."""
-        self.learned_ns = at_ns
-        for clock in self.clocks.values():
-            clock.least_ns = None
+        """Note that the robot's clock stood, so that it cannot know the delays it knew before."""
+        self.ages.forget_least(at_ns)
 
     def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
         """Note a clear that worked, as the daemon says. Its sender saw the latch at `read_ns`."""
@@ -288,17 +236,26 @@ class Witness:
                 self.softest[parts[1]] = (
                     min(low, value) if "deceleration" in key else max(low, value)
                 )
+                continue
+            before_ns = self.pause_ns, dict(self.timeout)
+            if parts[1] == "pause":
+                self.pause_ns = int(value * NS)
             else:
-                if parts[1] == "pause":
-                    self.pause_ns = int(value * NS)
-                else:
-                    self.timeout[parts[2]] = int(value * NS)
+                self.timeout[parts[2]] = int(value * NS)
+            if before_ns != (self.pause_ns, self.timeout):
                 self.arming(at_ns)
 
     # what the daemon showed
 
-    def step(self, at_ns: int, mode: str, reason: str) -> None:
-        """Judge the mode and the words for it."""
+    def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
+        """Judge the mode and the words for it; `fed_ns` is when the board was last heard."""
+        if mode == "driving" and fed_ns >= 0:
+            if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
+                text = f"last heard {fed_ns / NS:.3f} s"
+                raise BrokenError("a silent board is not driven", at_ns, text)
+            if self.blocked_ns is not None and at_ns - self.blocked_ns > BLOCKED_NS:
+                text = f"no line left since {self.blocked_ns / NS:.3f} s"
+                raise BrokenError("a blocked board is not driven", at_ns, text)
         if mode == self.mode and reason == self.reason:
             return
         if mode not in MODES or len(reason) < 6:
@@ -332,13 +289,17 @@ class Witness:
             found.append((self.dormant_ns, "being switched off"))
         return min(found, default=None)
 
-    def line(self, at_ns: int, line: bytes, fed_ns: int) -> None:
-        """Judge a line on the wire; `fed_ns` is when the board was last heard."""
+    def line(self, at_ns: int, line: bytes, fed_ns: int, made_ns: int) -> None:
+        """Judge a line on the wire.
+
+        `fed_ns` is when the board was last heard. Speeds grow by the time between the steps that
+        made two lines, at `made_ns`; a stalled step hands its line over later.
+        """
         wheels = self._decoded.get(line) or self._read(at_ns, line)
         if wheels is None:
             return
         if wheels == ZERO:
-            self.last, self.last_ns, self.coasting = ZERO, at_ns, None
+            self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
             self.softest = dict(self.limits)
             return
         self.counts["moving lines"] += 1
@@ -352,12 +313,14 @@ class Witness:
             for new, old in zip(wheels, before, strict=True)
         )
         if not self.pending:
-            self._limits(at_ns, wheels, before, at_ns - last_ns, grows)
+            self._limits(at_ns, wheels, before, made_ns - last_ns, grows)
         held = None if self.pending else self.held
-        if held is not None:
-            self._held(at_ns, held, grows, line)
+        if held is None:
+            self.braking = None
+        else:
+            self._held(at_ns, held, grows, line, max(map(abs, wheels)))
         self._wished(at_ns, wheels, before, grows, line)
-        self.last, self.last_ns = wheels, at_ns
+        self.last, self.last_ns = wheels, made_ns
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
         """Return the wheel speeds of a line, None for a question to the board or a torn line."""
@@ -428,14 +391,31 @@ class Witness:
         angular = min(low["angular_speed"], rim / self.half) / low[f"angular_{word}"]
         return int(max(linear, angular) * NS)
 
-    def _held(self, at_ns: int, held: tuple[int, str], grows: bool, line: bytes) -> None:
+    def _held(
+        self, at_ns: int, held: tuple[int, str], grows: bool, line: bytes, fastest: float
+    ) -> None:
         since_ns, why = held
         name = f"nothing moves after {why}"
         if grows and at_ns > since_ns + self.period_ns:
             raise BrokenError(name, at_ns, f"{line!r} grows, held since {since_ns / NS:.3f} s")
+        first_ns, then = self.braking = self.braking or (at_ns, fastest)
+        if at_ns - first_ns > 300_000_000 and fastest > then - 0.02:
+            raise BrokenError(name, at_ns, f"{line!r} as fast as at {first_ns / NS:.3f} s")
         ramp_ns = self.ramp_ns(stop=why != "being switched off")
         if at_ns > since_ns + ramp_ns + RAMP_NS + self.period_ns:
             raise BrokenError(name, at_ns, f"{line!r} still, held since {since_ns / NS:.3f} s")
+
+    def wheels(self, at_ns: int, fastest: float) -> None:
+        """Judge the true wheels: those of a robot that is held must stand in the end."""
+        held = self.held
+        if held is None or fastest < 0.5 or self.pending:
+            return
+        since_ns, why = held
+        if at_ns < since_ns + self.ramp_ns(stop=False) + STAND_NS:
+            return
+        if all(at_ns - last_ns > 6 * NS for last_ns in self.troubles.values()):
+            text = f"a wheel turns at {fastest:.2f} rad/s, held since {since_ns / NS:.3f} s"
+            raise BrokenError(f"the wheels stand after {why}", at_ns, text)
 
     def _wished(
         self,

@@ -74,7 +74,9 @@ def test_a_quiet_plan_breaks_no_promise() -> None:
 
 def moves(witness: Witness, at_s: float) -> None:
     """Put a first slow line on the wire."""
-    witness.line(int(at_s * NS), b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", int(at_s * NS))
+    witness.line(
+        int(at_s * NS), b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", int(at_s * NS), int(at_s * NS)
+    )
 
 
 def witnessed() -> Witness:
@@ -93,18 +95,18 @@ def witnessed() -> Witness:
         (lambda w: w.step(NS, "fault", "it is broken somehow"), "no fault without a cause"),
         (lambda w: w.step(NS, "ready", ""), "every state has a reason"),
         (
-            lambda w: w.line(NS, b"ap99.00,bp99.00,cp99.00,dp99.00\r\n", NS),
+            lambda w: w.line(NS, b"ap99.00,bp99.00,cp99.00,dp99.00\r\n", NS, NS),
             "no wheel is over its limit",
         ),
         (
-            lambda w: w.line(NS, b"ap05.00,bp05.00,cp05.00,dp05.00\r\n", NS),
+            lambda w: w.line(NS, b"ap05.00,bp05.00,cp05.00,dp05.00\r\n", NS, NS),
             "no acceleration is over its limit",
         ),
         (
-            lambda w: w.line(NS, b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", 0),
+            lambda w: w.line(NS, b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", 0, NS),
             "a silent board gets zeros",
         ),
-        (lambda w: w.line(NS, b"ap00.02,bp00.02\r\n", NS), "every line is whole"),
+        (lambda w: w.line(NS, b"ap00.02,bp00.02\r\n", NS, NS), "every line is whole"),
     ],
 )
 def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], promise: str) -> None:

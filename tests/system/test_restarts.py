@@ -113,6 +113,13 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
             robot.peer.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
             until(lambda: bus.state()["mode"] == "fault", 5.0, "a fault")
             robot.peer.reply = PLAIN
+            # Nobody asked for a fault, so no answer waits for the file.
+            until(lambda: kept(robot, kind), 1.0, "the fault is in the file")
+
+
+def kept(robot: Robot, kind: Kind) -> bool:
+    """Return whether the file has this latch."""
+    return json.loads(robot.file.read_bytes())["latches"].get(kind) is not None
 
 
 def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
@@ -144,6 +151,7 @@ def restarted(robot: Robot, kind: Kind, way: Way, spoil: Callable[[Path], None])
         latch(robot, bus, kind)
         daemon.signal(SIGNALS[way])
         assert (daemon.ended(5.0) == 0) is (way == "term")
+    assert kept(robot, kind), (kind, way)
     spoil(robot.file)
     started = time.monotonic()
     with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
