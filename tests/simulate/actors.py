@@ -21,6 +21,7 @@ from tests.simulate.plan import Plan
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.reports import Echo, Reports, judge_state
 from tests.simulate.roads import NS, Message, messages, sample
 
 MOST_HELD = 2000
@@ -64,6 +65,7 @@ class Run:
         """Monotonic time of the last resume: before it nothing can have arrived."""
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
+        self.reports, self.echo = Reports(), Echo()
         self.counts: Counter[str] = self.witness.counts
         self.failure: BrokenError | None = None
         self._todo: list[tuple[int, int, Callable[[], None]]] = []
@@ -168,6 +170,8 @@ class Run:
         one = sample(sender, message, self.plan["config"], self.product.wall_ns)
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.command(sender, message, one, true_ns)
+        shared = one.clock in self.witness.shared_clocks
+        self.reports.command(sender, message, one, at_ns, shared)
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
 
     # operators
@@ -263,6 +267,10 @@ class Run:
                 self._active.append(fault)
                 self._troubled(name)
                 product.board(list(self._active))
+                if name == "echo":
+                    self.echo.begin()
+                elif name == "mute":
+                    self._at(self.true_ns + NS // 2, self._look)
                 self._at(after_ns, lambda: self._mended(fault))
             case "reset":
                 product.reset(int(event["deaf"] * NS))
@@ -274,6 +282,7 @@ class Run:
             case "unplug":
                 product.unplug()
                 self.pose.doubt()
+                self._at(self.true_ns + NS // 2, self._look)
                 self._at(after_ns, lambda: self._plug(event["new"]))
             case "block":
                 self._block(True)
@@ -297,6 +306,12 @@ class Run:
                 if product.alive:
                     self._restart(event, after_ns)
 
+    def _look(self) -> None:
+        """Judge what `state` says, unless the daemon has just slept or stood still."""
+        product, since_ns = self.product, self.true_ns - NS // 10
+        if product.alive and self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
+            judge_state(self.true_ns, product.state(), self._fed_ns, self.witness.quiet_ns)
+
     def _block(self, blocked: bool) -> None:
         self.product.block(blocked)
         self.witness.blocked_ns = self.true_ns if blocked else None
@@ -310,6 +325,7 @@ class Run:
         self._active.remove(fault)
         self._troubled(fault[0])
         self.product.board(list(self._active))
+        self.echo.on = any(name == "echo" for name, _ in self._active)
         if fault[0] == "echo" and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
             self.product.unplug()
@@ -353,6 +369,7 @@ class Run:
             product.start()
             self._linked = False
             witness.new_life(self.true_ns)
+            self.reports = Reports()
             self.pose.doubt()
 
         self._at(after_ns + 1000, start)
@@ -390,9 +407,11 @@ class Run:
             self.pose.placed()
         for name, _ in self._active:
             witness.troubles[name] = true_ns
+        self.reports.follows(true_ns, seen.followed_ns)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
+            self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self._moved_ns = at_ns + offset
         if seen.estimates:
