@@ -21,8 +21,8 @@ from tests.simulate.plan import Plan
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.reports import Echo, Reports, judge_state
-from tests.simulate.roads import NS, Message, messages, sample
+from tests.simulate.reports import Echo, Reports, judge_counts, judge_state
+from tests.simulate.roads import NS, Message, messages, read_reply, sample
 
 MOST_HELD = 2000
 """Entries of the largest container of a daemon: a thousand clocks and as many numbers."""
@@ -228,7 +228,7 @@ class Run:
         ticket = self._ticket
 
         def answered(reply: bytes) -> None:
-            success, text = _read_reply(reply, via)
+            success, text = read_reply(reply, via)
             self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
             if not success:
                 return
@@ -409,6 +409,7 @@ class Run:
             witness.troubles[name] = true_ns
         self.reports.follows(true_ns, seen.followed_ns)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
+        witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
             self.echo.line(at_ns + offset, witness.last)
@@ -439,7 +440,7 @@ class Run:
         if not product.plugged:
             self._plug(False)
         product.disk.fill(False)
-        self._check_counts()
+        judge_counts(self.true_ns, product.state(), self.witness.delivered - product.dropped)
         size, kind = product.largest()
         self.counts["largest container"] = max(self.counts["largest container"], size)
         if size > MOST_HELD:
@@ -455,16 +456,6 @@ class Run:
                             "late": 0.0, "lost": False, "twice": False})  # fmt: skip
             self._run_to(self.true_ns + NS // 10)
         self._drive_lawfully()
-
-    def _check_counts(self) -> None:
-        """Every command that arrived was accepted or refused, and is counted."""
-        counters = self.product.state()["counters"]
-        counted = counters.get("commands", 0) + counters.get("commands_first_contact", 0)
-        counted += sum(n for name, n in counters.items() if name.startswith("command_"))
-        expected = self.witness.delivered - self.product.dropped
-        if counted != expected:
-            text = f"{expected} arrived, {counted} are counted: {counters}"
-            raise BrokenError("every command is counted", self.true_ns, text)
 
     def _drive_lawfully(self) -> None:
         plan, begin_ns = self.plan, self.true_ns
@@ -503,26 +494,6 @@ class Run:
         moving = self.true_ns - self._moved_ns < NS // 5
         if mode != "driving" or not moving:
             raise BrokenError("a lawful sender drives", self.true_ns, f"{mode}: {reason}")
-        self._check_course(speed, turn)
+        self.witness.course(self.true_ns, speed, turn)
         self.counts["lawful drives"] += 1
         self._run_to(self.true_ns + NS)
-
-    def _check_course(self, speed: float, turn: float) -> None:
-        """The robot drives as it was told, or slower on the same curve."""
-        witness, limits = self.witness, self.witness.limits
-        takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
-        if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
-            return
-        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
-        room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
-        if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
-            raise BrokenError("the robot drives as told", self.true_ns, f"{got} for {told}")
-
-
-def _read_reply(reply: bytes, via: str) -> tuple[bool, str]:
-    if via == "native":
-        found = msgspec.json.decode(reply)
-        return found["success"], found["message"]
-    # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
-    length = struct.unpack_from("<I", reply, 8)[0]
-    return bool(reply[4]), reply[12 : 12 + length - 1].decode()

@@ -1,4 +1,4 @@
-"""How old a command may be when the robot obeys it, by the true clock.
+"""What is known of each sender: its zeros, and how old a command may be by the true clock.
 
 The robot cannot see a true age: it compares delays by two clocks. `deploy/clients/README.md` says
 what it promises all the same, and this module allows exactly that: the timeout beyond the lowest
@@ -18,6 +18,28 @@ MARGIN_NS = 30_000_000
 
 EARLY_NS = 60_000_000
 """A delay that falls by more than this is a backlog that pours in."""
+
+
+class Wish:
+    """A command that arrived, and what the omniscient view thinks of it."""
+
+    __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
+
+    def __init__(self, arrived_ns: int, v: float, w: float) -> None:
+        self.arrived_ns, self.v, self.w = arrived_ns, v, w
+        self.fresh = self.certain = self.shared = False
+        self.identity = ""
+        self.armed_ns = -1
+        """Arrival of the zero by which this sender is armed, -1 for none."""
+
+
+class Sender:
+    """Zeros and speeds of one identity on one source."""
+
+    def __init__(self) -> None:
+        self.zeros: list[int] = []
+        """Arrivals of the zeros that no speed has followed."""
+        self.armed_ns = -1
 
 
 class Clock:

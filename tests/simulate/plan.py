@@ -23,7 +23,18 @@ KINDS = (
 )  # fmt: skip
 """The kinds of trouble that a run may have."""
 
-WAYS = ("client", "page", "signed", "rmw", "header", "zenoh", "plain", "bridge", "bridged")
+WAYS = (
+    "client",
+    "client",
+    "page",
+    "signed",
+    "rmw",
+    "header",
+    "zenoh",
+    "plain",
+    "bridge",
+    "bridged",
+)
 SOURCES = ("teleop", "app", "ros2_control", "nav")
 
 LIES = (
@@ -47,7 +58,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
         "kinds": kinds,
         "config": config,
         "senders": [
-            _sender(dice, n, kinds, length) for n in range(dice.choice((1, 1, 2, 3, 4, 6)))
+            _sender(dice, n, kinds, length) for n in range(dice.choice((1, 1, 1, 2, 3, 6)))
         ],
         "events": [],
         "lawful": dice.choice(("a new client", "a sender of the plan")),
@@ -147,7 +158,7 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
 
 def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:
     """A sender's habit: from each time on a speed and a turn rate, or None for silence."""
-    habit = dice.choice(("stop and go", "stop and go", "never neutral", "pauses", "wild"))
+    habit = dice.choice(("stop and go",) * 4 + ("never neutral", "pauses", "pauses", "wild"))
     phases: list[list[Any]] = []
     t = 0.0 if habit == "never neutral" else dice.uniform(0.0, 3.0)
     while t < seconds:
@@ -183,7 +194,7 @@ def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:
 
 def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> dict[str, Any]:
     way = dice.choice(WAYS)
-    begin = round(dice.choice((0.0, dice.uniform(0.0, seconds / 2))), 3)
+    begin = round(dice.choice((0.0, 0.0, dice.uniform(0.0, seconds / 2))), 3)
     sender: dict[str, Any] = {
         "name": f"s{n}",
         "id": f"s{n}/{dice.getrandbits(64):016x}",
@@ -193,7 +204,7 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
         "form": dice.choice(("json", "msgpack", "cdr")),
         "hz": dice.choice((5.0, 10.0, 20.0, 20.0, 50.0)),
         "from": begin,
-        "to": round(dice.choice((seconds, dice.uniform(begin, seconds))), 3),
+        "to": round(dice.choice((seconds, seconds, dice.uniform(begin, seconds))), 3),
         "ahead": round(dice.choice((0.0, dice.uniform(-0.4, 0.4), dice.uniform(-1e5, 1e5))), 3),
         "drift": dice.choice((0.0, 1e-5, -1e-4)),
         "delay": dice.choice((0.001, 0.005, 0.03)),
@@ -219,7 +230,7 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
     if "congestion" in kinds:
         t = dice.uniform(0.0, 20.0)
         while t < seconds:
-            length = dice.uniform(0.5, 25.0)
+            length = dice.choice((dice.uniform(0.5, 5.0), dice.uniform(5.0, 25.0)))
             shape = dice.choice(("grow", "jump", "hole", "drain", "burst"))
             size = {
                 "grow": dice.choice((0.01, 0.03, 0.08, 0.5)),
@@ -229,7 +240,7 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
                 "burst": dice.choice((0.1, 0.3, 1.0)),
             }[shape]
             sender["congestion"].append([round(t, 3), round(t + length, 3), shape, round(size, 3)])
-            t += length + dice.uniform(1.0, 40.0)
+            t += length + dice.uniform(1.0, 15.0)
     if "sender clocks" in kinds and way not in ("client", "page"):
         t = dice.uniform(2.0, 30.0)
         while t < seconds:

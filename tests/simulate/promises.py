@@ -15,7 +15,7 @@ from bisect import bisect_right
 from collections import Counter, deque
 from typing import Any
 
-from tests.simulate.ages import MARGIN_NS, Ages
+from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
 from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
@@ -44,28 +44,6 @@ class BrokenError(AssertionError):
     def __init__(self, promise: str, at_ns: int, text: str) -> None:
         super().__init__(f"{promise} at {at_ns / NS:.3f} s: {text}")
         self.promise, self.at_ns, self.text = promise, at_ns, text
-
-
-class Wish:
-    """A command that arrived, and what the omniscient view thinks of it."""
-
-    __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
-
-    def __init__(self, arrived_ns: int, v: float, w: float) -> None:
-        self.arrived_ns, self.v, self.w = arrived_ns, v, w
-        self.fresh = self.certain = self.shared = False
-        self.identity = ""
-        self.armed_ns = -1
-        """Arrival of the zero by which this sender is armed, -1 for none."""
-
-
-class Sender:
-    """Zeros and speeds of one identity on one source."""
-
-    def __init__(self) -> None:
-        self.zeros: list[int] = []
-        """Arrivals of the zeros that no speed has followed."""
-        self.armed_ns = -1
 
 
 class Witness:
@@ -111,6 +89,8 @@ class Witness:
         """Since when the kernel takes no line."""
         self.braking: tuple[int, float] | None = None
         """When a robot that must not move was first seen to move, and how fast."""
+        self.cut = False
+        """The link was lost since the last line, so the speed starts over from zero."""
         self.pending = False
         """An answer waits for the disk, so it is not known yet what is in force."""
         self.mode = self.reason = ""
@@ -148,14 +128,8 @@ class Witness:
         """Take note of a command that reached the daemon."""
         self.delivered += 1
         source = sender["source"]
-        if message.junk in ("stranger", "wildcard"):
-            return  # it names another source
         if message.junk not in ("", "cancels"):
-            known = self.senders.get((source, sample.identity))
-            if known is not None:
-                self._arm(known, arrived_ns)
-                known.zeros.clear()
-            return
+            return  # it is neither a speed nor a zero
         if message.junk == "cancels":
             v, w = 0.0, 0.0
         else:
@@ -320,7 +294,7 @@ class Witness:
         else:
             self._held(at_ns, held, grows, line, max(map(abs, wheels)))
         self._wished(at_ns, wheels, before, grows, line)
-        self.last, self.last_ns = wheels, made_ns
+        self.last, self.last_ns, self.cut = wheels, made_ns, False
 
     def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
         """Return the wheel speeds of a line, None for a question to the board or a torn line."""
@@ -376,7 +350,7 @@ class Witness:
                     f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
                 )  # fmt: skip
             lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
-            if lost > down * (dt / NS + 0.002) + 2 * room and not saturated:
+            if lost > down * (dt / NS + 0.002) + 2 * room and not (saturated or self.cut):
                 raise BrokenError(
                     "no deceleration is over its limit", at_ns,
                     f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
@@ -512,3 +486,14 @@ class Witness:
         if rim:
             scale = min(scale, limits["wheel_speed"] / rim)
         return v * scale, w * scale
+
+    def course(self, at_ns: int, speed: float, turn: float) -> None:
+        """Judge a long lawful drive: as it was told, or slower on the same curve."""
+        limits = self.limits
+        takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
+        if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
+            return
+        got, told = self.twist(self.last), self.clamped(speed, turn)
+        room = self.radius * 0.02, self.radius * 0.02 / self.half
+        if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
+            raise BrokenError("the robot drives as told", at_ns, f"{got} for {told}")

@@ -1,7 +1,7 @@
 """What the robot says of itself, held against what really happened.
 
-`Reports` judges two things that the lines on the wire do not show: which of several commands the
-robot follows, and what `state` says of its speed while the board says nothing.
+The lines on the wire do not show which of several commands the robot follows, or what `state` says
+of its speed while the board says nothing.
 """
 
 from __future__ import annotations
@@ -72,6 +72,16 @@ def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -
             "state has no speed of a silent board", at_ns,
             f"last heard {fed_ns / NS:.3f} s, and state says {said}",
         )  # fmt: skip
+
+
+def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
+    """Hold the counters against the number of commands that arrived: each is in one of them."""
+    counters = state["counters"]
+    counted = counters.get("commands", 0) + counters.get("commands_first_contact", 0)
+    counted += sum(n for name, n in counters.items() if name.startswith("command_"))
+    if counted != expected:
+        text = f"{expected} arrived, {counted} are counted: {counters}"
+        raise BrokenError("every command is counted", at_ns, text)
 
 
 class Echo:

@@ -231,3 +231,13 @@ def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
     names = [f"{side}_wheel_joint" for side in sides]
     # msgpack says NaN, JSON does not.
     return msgspec.msgpack.encode({"name": names, "velocity": speeds})
+
+
+def read_reply(reply: bytes, via: str) -> tuple[bool, str]:
+    """Return whether a call worked, and the answer in words."""
+    if via == "native":
+        found = msgspec.json.decode(reply)
+        return found["success"], found["message"]
+    # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
+    length = struct.unpack_from("<I", reply, 8)[0]
+    return bool(reply[4]), reply[12 : 12 + length - 1].decode()

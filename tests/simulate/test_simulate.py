@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, played
 from tests.simulate.pairs import OURS, Pair, Trace
@@ -67,6 +69,28 @@ def test_a_sender_sends_the_same_without_the_other_senders() -> None:
 
 def test_a_quiet_plan_breaks_no_promise() -> None:
     assert played(quiet()).finding == ""
+
+
+def test_a_seed_of_a_replay_is_played_and_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(main, "made", lambda seed: made(seed, 3.0))
+    assert main.replay("17") == 0
+    assert " s simulated in " in capsys.readouterr().out
+    broken = Result(17, "a promise at 2.000 s: so", "a promise", 2 * NS, 2.0, 0.1, Counter())
+    monkeypatch.setattr(main, "played", lambda plan: broken)
+    assert main.replay("17") == 1
+    assert " seed 17: a promise at 2.000 s: so\n" in capsys.readouterr().out
+
+
+def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(main, "made", lambda seed: made(seed, 3.0))
+    assert main.explore(1, 0.012, 2) == 0
+    out = capsys.readouterr().out
+    assert re.search(r": \d runs from seed 1, 0\.0\d h simulated in .* 0 findings\n", out)
+    assert re.search(r"^  way +\w+ \d", out, re.MULTILINE)
 
 
 # the witness
@@ -178,6 +202,14 @@ def test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_o
     pair.close()
     assert "reason: here 'waiting for a command" in difference
     assert "there 'no command" in difference
+
+
+def test_an_event_that_is_left_out_of_pairs_is_in_no_plan_of_theirs() -> None:
+    one = next(p for p in map(made, range(99)) if any(e["do"] == "restart" for e in p["events"]))
+    less = pairs.comparable(one, (("do", "restart", "it restarts in another way"),))
+    assert {event["do"] for event in one["events"]} - {event["do"] for event in less["events"]} == {
+        "restart"
+    }
 
 
 def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
