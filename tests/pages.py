@@ -229,6 +229,7 @@ COMMANDS: dict[str, How] = {
         "tests/simulate/test_simulate.py",
         "test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else",
     ),
+    ".venv/bin/python -m tests.simulate.planted": Shown("takes hours"),
     ".venv/bin/python -m tests.mutation": Shown("takes hours, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety --fast": Shown("takes an hour, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(
