@@ -48,6 +48,9 @@ class FrameError(AcsardError):
 class Codec:
     """An encoder and decoder of lines for one wiring and one dialect."""
 
+    _last_read: tuple[bytes | None, WheelSpeeds] = (None, STILL)
+    """The last line that was decoded, and its speeds."""
+
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
         place = {motor[1]: index for index, motor in enumerate(motors)}
@@ -94,6 +97,9 @@ class Codec:
 
         Raise `FrameError` unless all of it is valid.
         """
+        last, speeds = self._last_read
+        if line == last:  # A robot at rest reports the same in each period.
+            return speeds
         match = _LINE.fullmatch(line)
         if match is None:
             raise FrameError("malformed", line)
@@ -109,7 +115,9 @@ class Codec:
         front_right, front_left, rear_left, rear_right = wheel
         if front_right is None or front_left is None or rear_left is None or rear_right is None:
             raise FrameError("wheel_twice", line)
-        return WheelSpeeds(front_right, front_left, rear_left, rear_right)
+        speeds = WheelSpeeds(front_right, front_left, rear_left, rear_right)
+        self._last_read = line, speeds
+        return speeds
 
 
 def _token(letter: str, speed: float) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 
 from msgspec import Struct
 
@@ -77,6 +78,7 @@ def latched(line: bytes) -> Command:
     return Command(values)
 
 
+@lru_cache(4)  # a steady host says the same in each period
 def _plain(text: bytes) -> Command | None:
     match = _LINE.fullmatch(text)
     if match is None:

@@ -22,6 +22,7 @@ from tests.simulate.plan import Plan
 from tests.simulate.pose import LIARS, PoseWitness
 from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
 from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.reports import Echo, Reports, judge_state
 from tests.simulate.roads import NS, Message, messages, read_reply, sample
 
 
@@ -62,6 +63,7 @@ class Run:
         """Monotonic time of the last resume: before it nothing can have arrived."""
         self.witness = Witness(plan["config"])
         self.pose = PoseWitness(plan["config"])
+        self.reports, self.echo = Reports(), Echo()
         self.counts: Counter[str] = self.witness.counts
         self.liveness = Liveness(self)
         self.failure: BrokenError | None = None
@@ -171,6 +173,8 @@ class Run:
         true_ns = at_ns - START_NS + self.slept_ns
         self.witness.command(sender, message, one, true_ns)
         self.liveness.command(sender, one)
+        shared = one.clock in self.witness.shared_clocks
+        self.reports.command(sender, message, one, at_ns, shared)
         self.product.deliver(at_ns, one.key, one.payload, **one.options)
 
     # operators
@@ -271,6 +275,10 @@ class Run:
                 self.active.append(fault)
                 self._troubled(name)
                 product.board(list(self.active))
+                if name == "echo":
+                    self.echo.begin()
+                elif name == "mute":
+                    self.at(self.true_ns + NS // 2, self._look)
                 self.at(after_ns, lambda: self._mended(fault))
             case "reset":
                 product.reset(int(event["deaf"] * NS))
@@ -282,6 +290,7 @@ class Run:
             case "unplug":
                 product.unplug()
                 self.pose.doubt()
+                self.at(self.true_ns + NS // 2, self._look)
                 self.at(after_ns, lambda: self.plug(event["new"]))
             case "block":
                 self._block(True)
@@ -305,6 +314,12 @@ class Run:
                 if product.alive:
                     self._restart(event, after_ns)
 
+    def _look(self) -> None:
+        """Judge what `state` says, unless the daemon has just slept or stood still."""
+        product, since_ns = self.product, self.true_ns - NS // 10
+        if product.alive and self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
+            judge_state(self.true_ns, product.state(), self._fed_ns, self.witness.quiet_ns)
+
     def _block(self, blocked: bool) -> None:
         self.liveness.event()
         self.product.block(blocked)
@@ -320,6 +335,7 @@ class Run:
         self.liveness.event()
         self._troubled(fault[0])
         self.product.board(list(self.active))
+        self.echo.on = any(name == "echo" for name, _ in self.active)
         if fault[0] == "echo" and self.product.plugged:
             # The daemon asks for this, and drives no more until it was done.
             self.product.unplug()
@@ -366,6 +382,7 @@ class Run:
             self.liveness.event()
             self._linked = False
             witness.new_life(self.true_ns)
+            self.reports = Reports()
             self.pose.doubt()
 
         self.at(after_ns + 1000, start)
@@ -404,10 +421,12 @@ class Run:
             self.pose.placed()
         for name, _ in self.active:
             witness.troubles[name] = true_ns
+        self.reports.follows(true_ns, seen.followed_ns)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
             witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
+            self.echo.line(at_ns + offset, witness.last)
             if any(witness.last):
                 self.moved_ns = at_ns + offset
         self.liveness.look(true_ns)

@@ -153,6 +153,8 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     if dice.random() < 0.3:
         config["odometry"] = {"gyro": True}
         sim.update(gyro_bias=0.01, gyro_noise=0.005, gyro_delay=0.01)
+    elif dice.random() < 0.4:
+        sim["motor_time_constant"] = round(dice.uniform(0.2, 0.4), 3)
 
 
 def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:

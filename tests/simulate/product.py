@@ -51,6 +51,8 @@ class Seen(NamedTuple):
     """When the step began: a stall may lie between this and `at_ns`."""
     mode: str
     reason: str
+    followed_ns: int | None
+    """Arrival of the command that is followed, None if none is."""
     link: str
     lines: list[tuple[int, bytes]]
     """Lines that went to the board since the step before, each with its time."""
@@ -177,6 +179,7 @@ class Product:
                 outputs.now.mono_ns,
                 outputs.mode,
                 outputs.reason,
+                outputs.command_ns,
                 outputs.link,
                 lines,
                 estimates,
@@ -271,9 +274,9 @@ class Product:
         self._lasting.close()
         self._faults = faults
         for name, values in faults:
-            if name == "echo":
-                continue
-            self._lasting.enter_context(getattr(self._world.mcu, name)(*values))
+            # The daemon's TX is joined to its RX, so nothing of the board arrives.
+            fault = "mute" if name == "echo" else name
+            self._lasting.enter_context(getattr(self._world.mcu, fault)(*values))
         self.echo = any(name == "echo" for name, _ in faults)
 
     def reset(self, deaf_ns: int) -> None:

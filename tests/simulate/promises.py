@@ -29,7 +29,7 @@ BLOCKED_NS = 500_000_000
 """After so long without a line that left, the daemon knows it. The board stops itself earlier."""
 
 STAND_NS = 2 * NS
-"""After a ramp to rest: time for motors with a lag of 0.12 s to stand."""
+"""After a ramp to rest: time for motors with a lag of 0.4 s to stand."""
 
 HARMLESS = {
     "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
