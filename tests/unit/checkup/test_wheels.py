@@ -1,4 +1,4 @@
-"""Judging channels: plain functions of what was seen."""
+"""Tests of channel judgement: pure functions of the observations."""
 
 from __future__ import annotations
 

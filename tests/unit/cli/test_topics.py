@@ -1,4 +1,6 @@
-"""`acsard topics --ros` lists what a ROS machine will see; none when both trees are off."""
+"""`acsard topics --ros` lists the topics a ROS machine will see, or nothing when both trees are
+off.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Every mistake in a configuration is told at once, a line each, with key, value and mend."""
+"""All mistakes in a configuration are reported at once, one line each, with key, value and
+correction.
+"""
 
 from __future__ import annotations
 
@@ -246,7 +248,7 @@ PLANTED = [
         '"x"',
         "write another",
     ),
-    # what would not stop, or fault while it drives as it is told
+    # robots that would not stop in time, or would fault in normal driving
     (
         "[limits]\nlinear_deceleration = 0.19",
         "limits.linear_deceleration",
@@ -362,7 +364,9 @@ def test_rules_between_keys_are_told_with_the_mistakes_of_other_keys() -> None:
 
 
 def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
-    """Of 100 Hz at the baud rate by default, of endpoints whose insecure was mistyped."""
+    """The rules would otherwise complain about 100 Hz at the default baud rate, and about endpoints
+    whose `insecure` was misspelt.
+    """
     text = """
         [mcu]
         baudrate = 9600
@@ -488,7 +492,7 @@ def test_an_automatic_rate_is_always_comfortable(baud: int, comma: bool) -> None
     assert config.rate_hz * (34 if comma else 33) * 10 <= 0.8 * baud
 
 
-# who can reach the bus (SAFETY section 3)
+# clients that can reach the bus (SAFETY section 3)
 
 
 @pytest.mark.parametrize("key", ["listen", "connect"])
@@ -590,7 +594,7 @@ LINES = st.one_of(
 
 
 def outcome(data: bytes) -> Config | list[str]:
-    """The configuration or its problems; anything else that `parse` raises fails the test."""
+    """Return the configuration or its problems. Any other error from `parse` fails the test."""
     try:
         return parse(data)
     except ConfigError as error:

@@ -1,4 +1,6 @@
-"""What `acsard router` takes for a router's configuration, and what it says of anything else."""
+"""Tests of the router configurations that `acsard router` accepts, and of its errors for all
+others.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ def test_it_takes_the_fleets_file_as_it_is() -> None:
     [
         ('{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }', "not a router's"),
         ('{ mode: "router", listen: { endpoints: [] } }', "not a router's"),
-        ('{ mode: "router" }', "needs mode"),  # Zenoh would listen everywhere, in clear
+        # Zenoh would listen on every address without encryption
+        ('{ mode: "router" }', "needs mode"),
         ('{ mode: "ruter" }', "; correct it"),
         ("", "router.json5"),
     ],

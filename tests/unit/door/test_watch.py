@@ -1,4 +1,6 @@
-"""What the door sees of itself: what it tells, and when it has to be opened anew."""
+"""Tests of the TLS gateway's watch over itself: its events, and the reasons to reopen the
+gateway.
+"""
 
 from __future__ import annotations
 
