@@ -1,4 +1,6 @@
-"""msgpack, JSON and CDR by name and by first bytes; whatever comes, only `DecodeError` goes up."""
+"""msgpack, JSON and CDR are recognized by name and by first bytes; bad input only raises
+`DecodeError`.
+"""
 
 from __future__ import annotations
 

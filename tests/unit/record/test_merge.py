@@ -1,4 +1,6 @@
-"""Another configuration under a robot in the midst of its life: what follows from it changes."""
+"""A robot gets another configuration in the middle of a replay, and the state derived from it
+changes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures: the library takes them, and their numbers are those of the course."""
+"""The plotting library accepts the plots, and their numbers are those of the path."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def figures() -> dict[str, Figure]:
 
 
 def known(values: Iterable[float]) -> list[float | None]:
-    """With what compares as equal in place of NaN."""
+    """Return the values with None in place of NaN, so that they compare as equal."""
     return [None if math.isnan(value) else value for value in values]
 
 
@@ -88,7 +88,7 @@ def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
-    """Colour and pattern of each who drove."""
+    """Return the colour and pattern of each commander that drove."""
     drives = [one for one in figure.data if one["name"].endswith(" drives")]
     looks = {one["name"].split()[0]: one["marker"] for one in drives}
     return {
