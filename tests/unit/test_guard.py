@@ -1,5 +1,6 @@
-"""Tests of the last check of every line: the lines it passes, the lines it replaces, and the
-reasons.
+"""Tests of the guard, which checks every line last.
+
+They cover the lines it passes, the lines it replaces, and its reasons.
 """
 
 from __future__ import annotations
@@ -72,8 +73,9 @@ def outputs(
     age_ms: float | None = 0.0,
     at_ns: int = NOW_NS,
 ) -> Outputs:
-    """Return a step's outputs with this line; by default a fresh command is followed on a live
-    link.
+    """Return a step's outputs with this line.
+
+    By default a fresh command is followed on a live link.
     """
     return Outputs(
         now=Instant(at_ns, at_ns),
@@ -412,8 +414,9 @@ class Clocked:
         assert self.trip(ms, "driving", speed) == ""
 
     def trip(self, ms: float, mode: str, speed: float = 10.0, line_due: bool = True) -> str:
-        """Return the guard's objection to a line at this time; a command is fresh only in mode
-        driving.
+        """Return the guard's objection to a line at this time.
+
+        A command is fresh only in mode driving.
         """
         fresh = mode == "driving"
         found = outputs(

@@ -138,8 +138,9 @@ def numbers(value: object) -> Iterator[float]:
 
 
 class Books:
-    """The record of one source, kept by the text of SAFETY section 1 and independent of the
-    robot.
+    """The test's own record of one source.
+
+    It follows the text of SAFETY section 1 and is independent of the robot.
     """
 
     def __init__(self, source: Source, neutral_first: bool) -> None:

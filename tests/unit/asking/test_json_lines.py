@@ -28,8 +28,9 @@ Talking = TypeVar("Talking", bound=JsonLines)
 
 
 class Program:
-    """A parent program that answers each question with its next answer and keeps every line in
-    `said`.
+    """A parent program that answers the prompt's questions.
+
+    It gives its next answer to each question and keeps every line in `said`.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
-"""Tests of the access rules, read as Zenoh reads them: which role may send which message on which
-key.
+"""Tests of the access rules: which role may send which message on which key.
+
+The tests read the rules as Zenoh reads them.
 """
 
 from __future__ import annotations
@@ -301,8 +302,9 @@ def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
 def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> None:
-    """A wildcard that matches a service is denied, so a wildcard that includes it is denied as
-    well.
+    """A wildcard that matches a service is denied.
+
+    A wildcard that includes such a wildcard is therefore denied as well.
     """
     services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
     services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]

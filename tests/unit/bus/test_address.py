@@ -1,5 +1,6 @@
-"""A program's own arguments decide which robot it uses, and then the file that
-ACSARD_CONFIG names.
+"""Tests of the choice of the robot that a program uses.
+
+The program's own arguments decide first, then the file that ACSARD_CONFIG names.
 """
 
 from __future__ import annotations

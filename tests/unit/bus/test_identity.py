@@ -1,5 +1,6 @@
-"""The role is the highest one whose key answers, in any order; without an answer there is
-no role.
+"""The role of a client is the highest role whose key answers, in any order of answers.
+
+Without an answer there is no role.
 """
 
 from __future__ import annotations

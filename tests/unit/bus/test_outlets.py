@@ -1,5 +1,6 @@
-"""Tests of the outlets between the loop and the bus: the loop never waits, and the newest value is
-sent.
+"""Tests of the outlets between the control loop and the bus.
+
+The loop never waits, and the newest value is sent.
 """
 
 from __future__ import annotations

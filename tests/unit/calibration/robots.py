@@ -56,8 +56,9 @@ class Robot:
     outliers: float = 0.02
     lever: complex = 0.05 + 0.02j
     slip: float = 0.01
-    """Standard deviation of the share of motion that each side's wheels lose to slip, for about a
-    second.
+    """Standard deviation of the share of motion that each side loses to slip.
+
+    The share varies over about a second.
     """
     decimals: int = 2
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))

@@ -13,8 +13,9 @@ TRUTH = np.array([0.99, 1.01, 0.7])
 
 
 def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20) -> Fit:
-    """Fit blocks of 30 rows, linear in left, right and turn; the `shared` noise is equal within a
-    block.
+    """Fit blocks of 30 rows, linear in left, right and turn.
+
+    The `shared` noise is equal within a block.
     """
     block = np.repeat(np.arange(blocks), 30)
     columns = rng.normal(size=(len(block), 3))

@@ -164,8 +164,9 @@ def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() 
 
 
 def test_a_position_of_the_way_is_none_of_the_rest_after_it() -> None:
-    """The logger repeats positions of 1 Hz in every row, so the rows after the stop still hold the
-    last position of the drive.
+    """The logger repeats positions of 1 Hz in every row.
+
+    The rows after the stop therefore still hold the last position of the drive.
     """
     way = [0.04 * min(i, 550) for i in range(1000)]
     rows = [f"{i / 100},{4 * (i < 550)},{4 * (i < 550)},{way[i // 100 * 100]:.3f},0"

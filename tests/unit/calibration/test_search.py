@@ -46,8 +46,9 @@ def test_late_positions_are_found() -> None:
 
 
 def squares(chi: float) -> Plan:
-    """Return a plan of squares to both sides whose turns in place are 90 deg for this track
-    ratio.
+    """Return a plan of squares to both sides.
+
+    The turns in place are 90 deg for a robot with this track ratio.
     """
     side = [(5, 0.4, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * chi / 4), (0.5, 0, 0)]
     return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]

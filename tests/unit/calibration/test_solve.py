@@ -1,5 +1,6 @@
-"""Tests with simulated robots: the heading improves, and the standard deviations cover the
-truth.
+"""Tests with simulated robots of each kind.
+
+The heading improves, and the standard deviations cover the truth.
 """
 
 from __future__ import annotations
@@ -37,8 +38,9 @@ so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest
 
 @cache
 def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
-    """Return each robot's calibration and a random five-minute drive that the calibration did not
-    use.
+    """Return each robot's calibration and a random drive of five minutes.
+
+    The calibration did not use the random drive.
     """
     gyro, places = WAYS[way]
     made = []
@@ -113,8 +115,9 @@ def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
 
 
 def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
-    """At 1 kHz, 20 counts per turn read as 0 or 314 rad/s, so the mean of their squares says
-    nothing.
+    """At 1 kHz, 20 counts per turn read as 0 or 314 rad/s.
+
+    The mean of their squares therefore says nothing.
     """
     seen = usual(plan=wander(np.random.default_rng(2), 100.0))
     t = np.arange(seen.t[0], seen.t[-1], 0.001)

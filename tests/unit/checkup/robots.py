@@ -1,5 +1,6 @@
-"""Simulated robots on blocks for the tests of the checkup: a fake MCU, a wire in virtual time, a
-person.
+"""Simulated robots on blocks for the tests of the checkup.
+
+They consist of a fake MCU, a wire in virtual time, and a person.
 """
 
 from __future__ import annotations
@@ -28,9 +29,7 @@ class Robot(VirtualWire):
     """A robot with these faults that records every line it receives."""
 
     def __init__(self, *faults: str, config: Config | None = None, **mcu: Any) -> None:
-        """`config` describes the hardware; `mcu` gives the keys in which the host's configuration
-        differs.
-        """
+        """`config` describes the hardware, and `mcu` the keys of the host that differ from it."""
         self.built = config or Config()
         self.config = configured(self.built, **mcu)
         super().__init__(FakeMcu(self.built))
@@ -60,8 +59,9 @@ class Robot(VirtualWire):
 
     @contextmanager
     def board(self, rest: bool = True) -> Iterator[Board]:
-        """Yield the board alone, with the line open and, by default, the motors proven to stand
-        still.
+        """Yield the board alone, with the line open.
+
+        By default the motors are proven to stand still.
         """
         with self.faulty(), Board(self, self.config.mcu, self.config.rate_hz) as board:
             if rest:

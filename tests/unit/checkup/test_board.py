@@ -1,6 +1,4 @@
-"""Tests of the board: the lines it sends, the lines it accepts as answers, and when it ends a
-check.
-"""
+"""Tests of the board: lines it sends, lines it accepts as answers, and reasons to end a check."""
 
 from __future__ import annotations
 

@@ -753,9 +753,7 @@ def test_a_fault_beyond_what_the_lateness_explains_is_told(
 
 def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not() -> None:
     class Refuses(Busy):
-        """A robot that runs late, and ignores lines without a comma, during the line format
-        step.
-        """
+        """A robot that is late and ignores lines without a comma in the line format step."""
 
         looked = False
 

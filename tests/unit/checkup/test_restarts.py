@@ -1,5 +1,6 @@
-"""A restart of the board during the check is a finding of its own, and the interrupted step is
-repeated.
+"""A restart of the board during the check is a finding of its own.
+
+The interrupted step is repeated.
 """
 
 from __future__ import annotations

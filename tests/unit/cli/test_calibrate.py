@@ -161,9 +161,7 @@ def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
 
 
 def driving(*words: str) -> int:
-    """Return the exit code of `acsard calibrate` with these arguments when no terminal is
-    attached.
-    """
+    """Return the exit code of `acsard calibrate` with these arguments and no terminal."""
     parser = argparse.ArgumentParser()
     calibrate.add(parser.add_subparsers())
     args = parser.parse_args(["calibrate", *words])

@@ -39,8 +39,9 @@ class Places:
 
 @pytest.fixture(name="places")
 def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
-    """Set up a machine without any configuration: none named, none in this directory, none
-    in /etc.
+    """Set up a machine without any configuration.
+
+    No file is named, and there is none in this directory or in /etc.
     """
     places = Places(tmp_path)
     places.here.parent.mkdir()

@@ -163,8 +163,9 @@ def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
 
 
 class Robot:
-    """A client whose robot has published these states; a storage in the router keeps the
-    last one.
+    """A client whose robot has published these states.
+
+    A storage in the router keeps the last one.
     """
 
     source, sender = "teleop", "joe/1/aa"

@@ -1,5 +1,6 @@
-"""Tests of the errors that `acsard foxglove` reports about its library and its address before it
-connects.
+"""Tests of the errors that `acsard foxglove` reports before it connects.
+
+They concern its library and its address.
 """
 
 from __future__ import annotations

@@ -392,8 +392,9 @@ sys.exit(main(["lan", *sys.argv[1:]]))
 
 @pytest.fixture
 def locked() -> Iterator[Path]:
-    """Yield a directory that everyone may enter but nobody may write to, below no private
-    directory.
+    """Yield a directory that everyone may enter but nobody may write to.
+
+    It is not inside a directory that only root may enter.
     """
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)

@@ -138,8 +138,9 @@ def starts_at(world: World, hours: int, minutes: int, seconds: float, days: int 
 
 
 def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
-    """Record from two seconds before midnight to three seconds after it, or set the clock at
-    midnight instead.
+    """Record from two seconds before midnight to three seconds after it.
+
+    With `set_to`, the clock is set at midnight instead.
 
     A stop happens in the first second of the new day.
     """
@@ -359,8 +360,9 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
 
 
 def harmed(data: bytes, dice: random.Random) -> bytes:
-    """Return the data truncated before or after its first chunk, or damaged in one or many
-    places.
+    """Return the data with one kind of damage.
+
+    They are truncated before or after the first chunk, or damaged in one or many places.
     """
     begin = chunks(data)[0][0]
     kind = dice.randrange(4)
@@ -376,8 +378,8 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One recording begins at the start, one begins with a saved state, and an internal error ended
-    one.
+    """One recording begins at a start, one with a saved state, and one ends by an internal
+    error.
     """
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)

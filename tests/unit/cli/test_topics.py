@@ -1,5 +1,6 @@
-"""`acsard topics --ros` lists the topics a ROS machine will see, or nothing when both trees are
-off.
+"""`acsard topics --ros` lists the topics that a ROS machine will see.
+
+It lists none when both trees are off.
 """
 
 from __future__ import annotations

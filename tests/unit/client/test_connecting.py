@@ -1,5 +1,6 @@
-"""Tests of the errors that prevent a connection, and of the names that the client exports
-for them.
+"""Tests of the errors that prevent a connection.
+
+The client exports every one of these errors.
 """
 
 from __future__ import annotations

@@ -152,8 +152,9 @@ def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.Monke
 def test_an_answer_that_comes_on_another_thread_is_read_on_the_one_that_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Otherwise, the received state, its time and its objection could belong to two different
-    states.
+    """The received state, its time and its objection must belong to one state.
+
+    With two threads they could belong to two.
     """
     world, readers = World(followed), set()
     world.published = False
@@ -295,8 +296,9 @@ def test_the_state_that_a_storage_has_of_a_robot_that_is_long_dead_begins_no_dri
 
 
 def test_a_robot_whose_clock_was_set_back_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A state that the robot publishes itself never comes from a storage, whatever its
-    stamp says.
+    """A state that the robot publishes itself never comes from a storage.
+
+    This holds for any stamp.
     """
     world, made = World(followed), sample_of(FOLLOWED)
     monkeypatch.setattr(world, "_sample", lambda: made)

@@ -1,5 +1,6 @@
-"""Tests of the settings that can change while the daemon runs; a change is checked like the
-file.
+"""Tests of the settings that can change while the daemon runs.
+
+A change is checked by the same rules as the file.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""A configuration that could not stop in time, or would fault in normal driving, is refused with a
-correction.
+"""A configuration with dangerous limits is refused with a correction.
+
+The robot could not stop in time, or would fault in normal driving.
 """
 
 from __future__ import annotations

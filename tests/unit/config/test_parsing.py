@@ -1,5 +1,6 @@
-"""All mistakes in a configuration are reported at once, one line each, with key, value and
-correction.
+"""All mistakes in a configuration are reported at once.
+
+Each has a line with key, value and correction.
 """
 
 from __future__ import annotations
@@ -364,8 +365,9 @@ def test_rules_between_keys_are_told_with_the_mistakes_of_other_keys() -> None:
 
 
 def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
-    """The rules would otherwise complain about 100 Hz at the default baud rate, and about endpoints
-    whose `insecure` was misspelt.
+    """The rules must not complain about keys whose values are unknown.
+
+    These are 100 Hz at the default baud rate, and endpoints whose `insecure` was misspelt.
     """
     text = """
         [mcu]

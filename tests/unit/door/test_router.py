@@ -1,5 +1,6 @@
-"""Tests of the router configurations that `acsard router` accepts, and of its errors for all
-others.
+"""Tests of the router configurations that `acsard router` accepts.
+
+All others get an error.
 """
 
 from __future__ import annotations

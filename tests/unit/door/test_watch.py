@@ -1,5 +1,6 @@
-"""Tests of the TLS gateway's watch over itself: its events, and the reasons to reopen the
-gateway.
+"""Tests of the TLS gateway's watch over itself.
+
+It reports events and finds reasons to reopen the gateway.
 """
 
 from __future__ import annotations

@@ -46,8 +46,9 @@ class Robot(Struct, frozen=True):
 
 
 def commands(rng: np.random.Generator, seconds: float, stops: float = 0.15) -> Array:
-    """Return commanded wheel speeds in rad/s, shape (lines, 4), of a random drive within the
-    limits.
+    """Return commanded wheel speeds of a random drive, rad/s, shape (lines, 4).
+
+    The drive stays within the limits.
     """
     v = w = 0.0
     rows: list[list[float]] = []

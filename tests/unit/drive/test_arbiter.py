@@ -1,6 +1,4 @@
-"""Tests of the arbiter: priority, timeouts, order of arrival, and the condition each source waits
-for.
-"""
+"""Tests of the arbiter: priority, timeouts, order of arrival, and waiting sources."""
 
 from __future__ import annotations
 

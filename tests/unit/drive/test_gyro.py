@@ -402,9 +402,7 @@ def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
 
 @pytest.mark.slow
 def test_its_variance_is_that_of_its_errors() -> None:
-    """The ratio of heading errors after a straight drive to their claimed deviations is about
-    normal.
-    """
+    """Heading errors divided by their claimed deviations are about normal."""
     squares = []
     for seed in range(60):
         bench = Bench(noise=0.02, bias=0.01, first=10_000 * seed)

@@ -12,8 +12,9 @@ DT = 0.01
 
 
 def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: float = 0.0) -> Verdict:
-    """Return the verdict after a turn at `rate` rad/s by the wheels and `share` of that by the
-    gyro.
+    """Return the verdict after a turn.
+
+    The wheels report `rate` in rad/s, and the gyro reports `share` of that.
     """
     for line in range(round(seconds / DT)):
         told = rate * share if line * DT >= late_s else 0.0
@@ -75,8 +76,9 @@ def test_slow_turns_and_the_end_of_the_one_before_tell_nothing() -> None:
     [(0.08, 0.6, "good"), (0.08, -0.6, "reversed"), (0.12, 0.0, "dead"), (0.08, 0.0, "none yet")],
 )
 def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verdict) -> None:
-    """A silent gyro at 0.08 rad/s gives no verdict: wheels with unequal tyres report that on a
-    straight.
+    """A silent gyro at 0.08 rad/s gives no verdict.
+
+    Wheels with unequal tyres report that rate on a straight, where a good gyro reports nothing.
     """
     assert turned(Trial(), rate, share, 6.0) == verdict
 

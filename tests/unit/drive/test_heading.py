@@ -1,5 +1,6 @@
-"""Odometry and a gyro together: each part of the wheels' turn is compared and corrected exactly
-once.
+"""Tests of odometry with a gyro.
+
+Each part of the wheels' turn is compared and corrected exactly once.
 """
 
 from __future__ import annotations

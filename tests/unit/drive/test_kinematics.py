@@ -1,5 +1,6 @@
-"""Tests of twist and wheel speeds: equations (1) to (3), and saturation that keeps the
-curvature.
+"""Tests of the conversion between twist and wheel speeds.
+
+They cover equations (1) to (3), and saturation that keeps the curvature.
 """
 
 from __future__ import annotations

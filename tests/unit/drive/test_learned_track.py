@@ -1,5 +1,6 @@
-"""Tests of the track in use: the configured one until another is learned, and only within
-bounds.
+"""Tests of the effective track in use.
+
+It is the configured one until another is learned, and it stays within bounds.
 """
 
 from __future__ import annotations

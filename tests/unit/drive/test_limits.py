@@ -1,5 +1,6 @@
-"""Tests that limit a requested twist: speed, acceleration, deceleration, jerk, coasting and the
-cut.
+"""Tests of the limits that turn a requested twist into a safe one.
+
+They are speed, acceleration, deceleration, jerk, coasting and the cut.
 """
 
 from __future__ import annotations

@@ -306,8 +306,9 @@ def test_standing_adds_no_uncertainty() -> None:
 
 
 def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
-    """Return the covariance after a gap that began at 0.3 m/s and 0.5 rad/s and ended at this
-    twist.
+    """Return the covariance after a gap that ended at this twist.
+
+    The gap began at 0.3 m/s and 0.5 rad/s.
     """
     robot = odometry()
     robot.fold(feedback(4.5, 7.5, 0.0))
@@ -784,8 +785,9 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
 
 @pytest.mark.parametrize("share", [0.5, 1.6])
 def test_by_a_learned_track_it_is_as_uncertain_as_if_that_were_configured(share: float) -> None:
-    """The learned track affects more than its own error: wheel noise, counts and their play depend
-    on it.
+    """A learned track affects more than its own error.
+
+    Wheel noise, counts and their play depend on it as well.
     """
     asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
     asked.turn_by(Track(share, 0.02))

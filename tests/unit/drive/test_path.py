@@ -26,8 +26,9 @@ def test_a_sum_and_what_it_leaves_out_are_the_whole(a: float, b: float) -> None:
 
 
 def long_double_end(distances: list[float], turns: list[float]) -> tuple[float, float, float]:
-    """Return the end in arithmetic with 64 bits of mantissa, also for 2 pi; yaw is within half a
-    turn.
+    """Return the end of the path with 64 bits of mantissa, and 2 pi to as many.
+
+    The yaw is within half a turn.
     """
     two = np.longdouble
     tau = two(math.tau) + two("2.44929359829470635445e-16")

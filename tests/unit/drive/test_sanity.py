@@ -41,9 +41,7 @@ def watched(
 
 
 def watched_after_driving(wheel: int, sent: float, seen: float, jitter: float = 0.0) -> str:
-    """Return the fault within two seconds of this feedback, after three seconds of correct
-    driving.
-    """
+    """Return the fault within two seconds, after three seconds of correct driving."""
     sanity = Sanity(FeedbackConfig())
     told = only(wheel, sent)
     assert not any(sanity.watch(told, only(wheel, sent + step % 2 / 10), DT) for step in range(300))
@@ -282,9 +280,7 @@ def test_a_robot_pushed_gently_by_hand_is_no_fault() -> None:
 
 
 def pushed(sanity: Sanity, speed: float, seconds: float) -> tuple[list[str], list[float]]:
-    """Return the faults while a person pushes the robot, and the times at which the push is
-    reported, s.
-    """
+    """Return the faults while a person pushes the robot, and the times of reported pushes, s."""
     seen = WheelSpeeds(speed, speed, speed, speed)
     faults, told = [], []
     for step in range(round(seconds / DT)):

@@ -17,8 +17,9 @@ def heading(variance: float) -> PoseCovariance:
 
 
 def straight(metres: int, yaw: float, column: float) -> tuple[SecondOrder, PoseCovariance]:
-    """Return the covariance after stretches of 0.1 m, each with this yaw variance and parameter
-    column.
+    """Return the covariance after stretches of 0.1 m.
+
+    Each stretch has this yaw variance and parameter column.
     """
     second, p = SecondOrder(1), NONE
     j = (0.0, 0.0, 0.0)

@@ -153,8 +153,9 @@ def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
 
 
 def counting(counts: int) -> Heard:
-    """Return a function that makes lines from wheel counters, each starting anywhere within a
-    count.
+    """Return a function that makes lines from wheel counters.
+
+    Each counter starts anywhere within a count.
     """
 
     def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:

@@ -19,8 +19,9 @@ Array = npt.NDArray[np.floating[Any]]
 GRID, PERIOD = 0.001, 0.01
 RADIUS, TRACK = 0.05, 0.30
 RIPPLE = 0.03
-"""Variation of each side's speed from report to report, rad/s; real wheels do not turn more
-evenly.
+"""Variation of each side's speed from report to report, rad/s.
+
+Real wheels do not turn more evenly.
 """
 
 
@@ -58,8 +59,9 @@ class Drive:
         dt: Array,
         kept: npt.NDArray[np.bool_] | None = None,
     ) -> Told:
-        """Sum speeds x dt of the lines with these stamps, as odometry does; `kept` marks the lines
-        that arrive.
+        """Sum speeds x dt of the lines with these stamps, as odometry does.
+
+        `kept` marks the lines that arrive.
         """
         x, y, _ = _path(np.diff(self.left), np.diff(self.right))
         moved = left * dt, right * dt
@@ -81,8 +83,9 @@ class Drive:
 
 
 def late(seed: int, seconds: float, how: str) -> Told:
-    """Return a drive whose stamps are the read times behind a batching adapter or on a busy
-    host.
+    """Return a drive whose stamps are the times at which the host read the lines.
+
+    The lines pass a batching adapter, or the host is busy.
     """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
@@ -147,8 +150,9 @@ def _path(left: Array, right: Array) -> tuple[Array, Array, Array]:
 
 
 def _ramped(rng: np.random.Generator, count: int, lowest: float, most: float, rate: float) -> Array:
-    """Return a speed that moves at `rate` from one random target to the next; a sixth of them are
-    zero.
+    """Return a speed that moves at `rate` between random targets.
+
+    A sixth of the targets are zero.
     """
     targets: list[float] = []
     while len(targets) < count:

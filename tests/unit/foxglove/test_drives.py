@@ -30,8 +30,9 @@ HOLD_S = 5.0
 
 
 class Session:
-    """A session that records puts as the daemon would receive them, or blocks or fails like a
-    broken bus.
+    """A session that records puts as the daemon would receive them.
+
+    It can also block or fail like a broken bus.
     """
 
     def __init__(self) -> None:

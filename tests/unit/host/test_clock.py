@@ -12,8 +12,9 @@ WALL_NS = 1_800_000_000_000_000_000
 
 
 class Machine:
-    """A machine that takes the core away for 0.2 s right before the wall clock is read, `takes`
-    times.
+    """A machine that takes the core away for 0.2 s, `takes` times.
+
+    It does so right before the wall clock is read.
     """
 
     def __init__(self, takes: int) -> None:

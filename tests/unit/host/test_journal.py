@@ -37,8 +37,9 @@ class Journal:
 
 
 def fields(text: str) -> dict[str, str]:
-    """Parse a datagram in which each line must be NAME=value with a name that the journal
-    accepts.
+    """Parse a datagram in which each line must be NAME=value.
+
+    The journal must accept the name.
     """
     found: dict[str, str] = {}
     for line in text.removesuffix("\n").split("\n"):

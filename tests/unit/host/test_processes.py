@@ -27,8 +27,9 @@ sys.stdin.read()
 
 @contextmanager
 def another(path: str, *words: str) -> Iterator[int]:
-    """Yield the pid of a process that has the device open, and locked if a further word is
-    given.
+    """Yield the pid of a process that has the device open.
+
+    A further word makes it lock the device.
     """
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, path, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE

@@ -624,8 +624,9 @@ NASTY = [
 
 
 def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
-    """Return a valid payload with one or two random changes: bits, cuts, copies, splices or
-    numbers.
+    """Return a valid payload with one or two random changes.
+
+    They are bit flips, cuts, copies, splices and other numbers.
     """
     for _ in range(rnd.randint(1, 2)):
         a = rnd.randrange(len(payload) + 1)

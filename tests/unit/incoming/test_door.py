@@ -1,5 +1,6 @@
-"""Counters of the TLS gateway in `state` are right whatever the gateway, or an impostor,
-publishes.
+"""Counters of the TLS gateway in `state` are right for any input.
+
+The gateway, or an impostor, may publish anything.
 """
 
 from __future__ import annotations

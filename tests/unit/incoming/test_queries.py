@@ -36,8 +36,9 @@ NO = rcl.SetParametersResult(False, "needs the header of plain CDR, has 00")
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
-"""Key expressions for more than one key; the prefix is removed only from those that start
-with it.
+"""Key expressions with which a client may query more than one key.
+
+The prefix is removed only from those that contain it.
 """
 
 

@@ -1,5 +1,6 @@
-"""The router's file for any robots and people gives each its rights only in the tree of its own
-robot.
+"""Tests of the router's file for any number of robots and people.
+
+Each may do in its own tree what one robot may do.
 """
 
 from __future__ import annotations

@@ -30,8 +30,9 @@ SIGNS = np.array([1, -1, -1, 1])
 
 
 def speeds(rng: np.random.Generator, seconds: float) -> Array:
-    """Return the mean speeds of the right and left sides in each period, rad/s, shape
-    (periods, 2).
+    """Return the mean speeds of both sides in each period, rad/s, shape (periods, 2).
+
+    The right side comes first.
     """
     v = w = 0.0
     rows, goal, left = [], (0.0, 0.0), 100

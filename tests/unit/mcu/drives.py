@@ -87,8 +87,9 @@ class Path:
 def _ramped(
     rng: np.random.Generator, count: int, most: float, rate: float, lowest: float | None = None
 ) -> np.ndarray:
-    """Return a speed that moves at `rate` from one random target to the next; a sixth of them are
-    zero.
+    """Return a speed that moves at `rate` between random targets.
+
+    A sixth of the targets are zero.
     """
     lowest = -most if lowest is None else lowest
     targets = np.empty(0)
@@ -107,8 +108,9 @@ class Case(Struct, frozen=True):
 
     adapter: Adapter = "acm"
     prompted: bool = False
-    """Whether the MCU answers the host's lines for the time since the last one, or reports by its
-    own clock.
+    """Whether the MCU answers the host's lines.
+
+    Each answer covers the time since the last one. Otherwise the MCU reports by its own clock.
     """
     thinking: float = 0.0002
     """Largest difference between the times of two answers, s."""
@@ -158,9 +160,7 @@ class Host:
     # the microcontroller
 
     def report(self, at: float, nominal: float | None) -> Line:
-        """Return the line that the MCU makes at `at` about the wheels' motion since the
-        last one.
-        """
+        """Return the line about the wheels' motion since the last one, made at time `at`."""
         now, then = self.path.angles(at), self.path.angles(self._reported)
         dt = at - self._reported if nominal is None else nominal
         left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
@@ -292,8 +292,9 @@ def drive(case: Case, seed: int, seconds: float) -> Host:
 
 
 def reporting(host: Host) -> None:
-    """Simulate an MCU that makes a line in every period of its own clock and divides by the nominal
-    one.
+    """Simulate an MCU that makes a line in every period of its own clock.
+
+    It divides by the nominal period.
     """
     arrivals: deque[tuple[float, bytes]] = deque()
     period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))

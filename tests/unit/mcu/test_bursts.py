@@ -1,5 +1,4 @@
-"""Bursts of 0.1 to 0.5 s of lost plain lines pass through the session, and the covariance covers
-them.
+"""The covariance covers bursts of 0.1 to 0.5 s of lost plain lines.
 
 Run it with `pytest -s -m soak mcu/test_bursts.py`. The pose error after 450 m is in
 `test_line_time.py`; the case with counts is in `scenarios/test_bursts.py`.
@@ -43,8 +42,9 @@ def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
     ("model", "least"), [(WHEELS, 2.7), (DEFAULT, 2.85)], ids=["wheels", "default"]
 )
 def test_after_bursts_the_covariance_tells_the_truth(model: Model, least: float) -> None:
-    """With wheels that err by 3 mm per metre, the bursts cause most of the error and are overrated
-    a little.
+    """The bursts cause most of the error and are overrated a little.
+
+    This is for wheels that err by 3 mm per metre.
     """
     values = np.concatenate([drive(seed, 90.0, model, 10) for seed in range(100)])
     inside = float((values < REGION).mean())

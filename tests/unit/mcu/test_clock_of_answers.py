@@ -182,8 +182,9 @@ def test_a_new_session_begins_without_a_past() -> None:
 def batched(
     bench: Bench, seed: int, lines: int, lost: tuple[int, ...] = (), offs: list[int] | None = None
 ) -> float:
-    """Answer lines sent every 10 ms in batches of 16 ms, and return the time covered after the
-    first second, ms.
+    """Return the time that batched answers cover after the first second, ms.
+
+    Lines are sent every 10 ms, and their answers arrive every 16 ms.
 
     `offs` collects the distance from each reply's own line to the line it was matched to, up to a
     constant.

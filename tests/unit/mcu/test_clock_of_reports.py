@@ -20,8 +20,9 @@ PERIOD = 0.01
 
 
 class Bench:
-    """Lines at a fixed period, read at once or late, and the slots that the clock counts
-    for them.
+    """Lines at a fixed period, and the slots that the clock counts for them.
+
+    Each line is read at once or late.
     """
 
     def __init__(self, period: float = PERIOD, known: tuple[float, ...] = (PERIOD,)) -> None:

@@ -1,5 +1,6 @@
-"""Lines and wheel speeds convert exactly when written; reading is strict in meaning and lenient in
-form.
+"""Tests of the conversion between lines and wheel speeds.
+
+Writing is exact. Reading is strict in meaning and lenient in form.
 """
 
 from __future__ import annotations
@@ -218,8 +219,9 @@ def test_what_was_read_back_is_written_as_it_was(wheels: WheelSpeeds, wiring: Wh
 
 
 def independent(line: bytes) -> Motors | None:
-    """Parse a line by code that shares nothing with the product; return None if it is not a
-    frame.
+    """Parse a line by code that shares nothing with the product.
+
+    Return None if the line is not a frame.
     """
     tokens = line.split(b",")
     if len(tokens) == 5 and not tokens[4].strip(b" "):

@@ -1,5 +1,4 @@
-"""Measures the wire damage that the plain line's parser accepts, and the part that the slew check
-accepts.
+"""Measures the wire damage that the plain line's parser and the slew check accept.
 
 `test_codec.py` proves that the parser accepts exactly the well-formed lines. This module counts the
 damage that turns one well-formed line into another. Run it with `pytest -m soak -s
@@ -24,8 +23,9 @@ from acsard.values import STILL, Instant, WheelSpeeds
 
 KINDS = ("bit flipped", "byte lost", "byte doubled", "lines merged", "noise")
 PLACES = (31, 33, 33, 33, 33)
-"""Number of possible start positions of an accident: within the line, or within the line and its
-end.
+"""Number of possible start positions of each accident.
+
+It starts within the line, or within the line and its end.
 """
 
 WRONG_BIT_SHARE = (0.17, 0.25)
@@ -121,11 +121,10 @@ def test_the_slew_check_itself_tells_a_leap_from_a_step() -> None:
 
 
 def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
-    """Flip one bit in one of `every` lines while the quantization steps are learned from all of
-    them.
+    """Count the wrong readings when one bit in one of `every` lines is flipped.
 
-    Return the number of wrong readings, of those accepted, and of those that would be accepted
-    without the learned steps.
+    The quantization steps are learned from all lines. Return the number of wrong readings, of those
+    accepted, and of those that would be accepted without the learned steps.
     """
     rng, codec, snapping = random.Random(5), Codec(WheelMap()), Snapping()
     sanity, wrong, believed, before = Sanity(FeedbackConfig()), 0, [0, 0], STILL

@@ -1,6 +1,4 @@
-"""Reports that equal the sent lines while the speeds change come from an echo and not from
-a board.
-"""
+"""Reports that equal the sent lines while the speeds change come from an echo."""
 
 from __future__ import annotations
 
@@ -26,8 +24,9 @@ class Bench:
         self.waiting: deque[float] = deque()
 
     def exchange(self, sent: float, back: float | None = None, lag: int = 0) -> bool:
-        """Send a line and process the report that is due, which by default repeats an
-        earlier line.
+        """Send a line and process the report that is due.
+
+        By default the report repeats an earlier line.
         """
         self.send(sent)
         self.waiting.append(sent if back is None else back)

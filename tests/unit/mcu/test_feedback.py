@@ -161,8 +161,9 @@ def reporting(bench: Bench, lines: int = 80) -> Bench:
 
 
 def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feedback]:
-    """Read this many lines `ms` after the last read; with `silent`, the first one ends a
-    silence.
+    """Read this many lines `ms` after the last read.
+
+    With `silent`, the first one ends a silence.
     """
     bench.now_ns += int(ms * MS)
     at = Instant(bench.now_ns, bench.now_ns + 7)
@@ -253,8 +254,9 @@ def test_another_rate_than_ours_has_its_own_period(period: int) -> None:
 
 
 def prompted(bench: Bench, lines: int = 60) -> Bench:
-    """Send a line every 10 ms and answer it 8 ms later; one stall of the host reveals the
-    answering.
+    """Send a line every 10 ms and answer it 8 ms later.
+
+    One stall of the host reveals that the board answers.
     """
     for number in range(lines):
         bench.timeline.left(bench.now_ns + 2 * MS)

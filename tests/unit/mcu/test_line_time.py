@@ -62,8 +62,9 @@ SLACK = np.array([0.02, 0.05])
 
 
 def slack(seeds: int) -> np.ndarray:
-    """Return the allowance; the mean of twenty drives needs none, because its floor is 0.05 to 0.13
-    m and 0.065 deg.
+    """Return the allowance for this number of drives.
+
+    The mean of twenty drives needs none, because its floor is 0.05 to 0.13 m and 0.065 deg.
     """
     return SLACK if seeds == 1 else 0.0 * SLACK
 
@@ -122,8 +123,9 @@ def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
 
 @pytest.mark.slow
 def test_a_lost_answer_in_a_hundred_leaves_a_batched_link_its_clock() -> None:
-    """Otherwise a stall is spread over lines that were made before it, which costs 0.44 m in this
-    drive.
+    """Without the clock, a stall is spread over earlier lines.
+
+    That costs 0.44 m in this drive.
     """
     host = drive(Case("ftdi", prompted=True, lost=0.01, stall=0.15), 0, 60.0)
     assert host.errors()[FOUND, 0] <= 0.25

@@ -1,5 +1,6 @@
-"""Any cut of the bytes gives the same lines, noise costs no other line, and a newline always
-recovers.
+"""Any cut of the bytes gives the same lines.
+
+Noise costs nothing else, and a newline always recovers.
 """
 
 from __future__ import annotations

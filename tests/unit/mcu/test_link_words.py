@@ -1,5 +1,6 @@
-"""Tests of the text about a link that is down: received bytes, rare lines, and delays of this
-computer.
+"""Tests of the text about a link that is down.
+
+The reasons are the received bytes, rare lines, and delays of this computer.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of lateness relative to the minimum delay so far, by two clocks that were never
-compared.
+"""Tests of lateness relative to the minimum delay so far.
+
+The two clocks were never compared.
 """
 
 from __future__ import annotations

@@ -15,8 +15,9 @@ PERIOD = 0.01
 
 
 def reports(counts: int, lines: int, seed: int = 1) -> list[tuple[int, float]]:
-    """Return whole counts and the speeds that firmware derives from them, for a wheel that turns
-    randomly.
+    """Return whole counts and the speeds that firmware derives from them.
+
+    The wheel turns randomly.
     """
     dice, quantum, rows, speed, phase = (
         random.Random(seed),

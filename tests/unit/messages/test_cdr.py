@@ -849,9 +849,7 @@ def test_a_payload_that_is_cut_anywhere_is_refused() -> None:
 
 
 def weight(value: object) -> int:
-    """Return the number of items and characters in all parts of a message without a fixed
-    length.
-    """
+    """Return the number of items and characters in the parts without a fixed length."""
     if isinstance(value, str):
         return len(value)
     if isinstance(value, list):

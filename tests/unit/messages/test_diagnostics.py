@@ -63,8 +63,9 @@ def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
 
 
 def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:
-    """The first look at the routers takes half a second, and the monitor would otherwise see a row
-    appear.
+    """The row must be there before the first look at the routers.
+
+    That look takes half a second, and the monitor would otherwise see a row appear.
     """
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
     one = row("router", config)

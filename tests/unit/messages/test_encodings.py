@@ -1,5 +1,6 @@
-"""msgpack, JSON and CDR are recognized by name and by first bytes; bad input only raises
-`DecodeError`.
+"""msgpack, JSON and CDR are recognized by name and by first bytes.
+
+Any bad input raises only `DecodeError`.
 """
 
 from __future__ import annotations

@@ -51,8 +51,9 @@ def counted_again(keys: int, times: int) -> bytes:
 
 
 def of_one_hash(keys: int) -> bytes:
-    """Return a dict whose keys all have one hash, so that Python must compare each with all
-    others.
+    """Return a dict whose keys all have one hash.
+
+    Python must compare each key with all others.
     """
     pairs = (pickle.LONG1 + b"\x0c" + (key * HASHED).to_bytes(12, "little") for key in range(keys))
     return pickle.EMPTY_DICT + pickle.MARK + ONE.join(pairs) + ONE + pickle.SETITEMS

@@ -1,5 +1,6 @@
-"""A recording of format 1 reads as the code that wrote it read it, and its old format is
-reported.
+"""A recording of format 1 is read as by the code that wrote it.
+
+Its old format is reported.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Exported files can be read by third-party programs, and files already at their place are
-handled.
+"""Exported files can be read by third-party programs.
+
+The tests also cover files that are already in their place.
 """
 
 from __future__ import annotations

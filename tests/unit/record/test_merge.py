@@ -1,5 +1,6 @@
-"""A robot gets another configuration in the middle of a replay, and the state derived from it
-changes.
+"""A robot gets another configuration in the middle of a replay.
+
+The state derived from the configuration changes.
 """
 
 from __future__ import annotations

@@ -422,8 +422,9 @@ def test_the_minute_before_a_fault_of_our_own_is_kept(
 def test_a_clock_that_is_set_costs_no_recording(
     jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A robot without a real-time clock was off for weeks and gets the time only while it
-    drives.
+    """A robot without a real-time clock was off for weeks.
+
+    It gets the time only while it drives.
     """
     monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
     monkeypatch.setattr(around, "AROUND_NS", 0)

@@ -1,5 +1,6 @@
-"""Tests of the deletion order: oldest first, protected files last, and a share of the disk for
-others.
+"""Tests of the order in which recordings are deleted.
+
+The oldest goes first and protected ones last, and other programs keep a share of the disk.
 """
 
 from __future__ import annotations

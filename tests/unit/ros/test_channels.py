@@ -1,5 +1,6 @@
-"""Each channel's payload matches its definition, as read by a program that knows only the
-definition.
+"""Each channel's payload matches its definition.
+
+A program that knows only the definition reads it.
 """
 
 from __future__ import annotations

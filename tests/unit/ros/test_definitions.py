@@ -1,5 +1,6 @@
-"""The text of a definition is complete and tells another program the type that the hash
-promises.
+"""The text of a definition is complete.
+
+It tells another program the type that the hash promises.
 """
 
 from __future__ import annotations

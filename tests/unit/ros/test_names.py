@@ -198,8 +198,9 @@ def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
     ],
 )  # fmt: skip
 def test_the_hash_written_here_is_the_one_ros_computes(type_name: str, published: str) -> None:
-    """The types come from ROS and not from this project, so that both sides cannot share an
-    error.
+    """The types come from ROS and not from this project.
+
+    Both sides therefore cannot share an error.
     """
     assert rihs01(type_name) == published
 

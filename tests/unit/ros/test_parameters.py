@@ -1,5 +1,6 @@
-"""Tests of the configuration as ROS parameters: list, read, describe, and the answer to a set
-request.
+"""Tests of the configuration as ROS parameters.
+
+They cover list, read, describe, and the answer to a set request.
 """
 
 from __future__ import annotations

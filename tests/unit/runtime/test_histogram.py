@@ -1,5 +1,6 @@
-"""Percentiles in fixed memory are exact to one bucket, never below the truth, never above the
-maximum.
+"""Percentiles in fixed memory are exact to one bucket.
+
+They are never below the truth and never above the maximum.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of the built-in simulator as a device, and of the effects of `[sim] faults` on its
-bytes.
+"""Tests of the built-in simulator as a device.
+
+They show the effects of `[sim] faults` on its bytes.
 """
 
 from __future__ import annotations

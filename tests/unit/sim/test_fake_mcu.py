@@ -1,5 +1,6 @@
-"""Tests of the fake microcontroller: its side of the protocol, exact to the byte and the
-nanosecond.
+"""Tests of the fake microcontroller's side of the protocol.
+
+They are exact to the byte and the nanosecond.
 
 `TRUE` has no motor lag and fine encoders, so that it reports exactly the commanded speeds.
 """

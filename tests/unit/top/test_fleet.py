@@ -138,8 +138,9 @@ def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
 
 
 class Remembers:
-    """A client of a router whose storage holds this robot's last state and may receive a
-    newer one.
+    """A client of a router whose storage holds this robot's last state.
+
+    The storage may receive a newer state.
     """
 
     def __init__(self, session: Session) -> None:

@@ -18,8 +18,9 @@ from acsard.top.view import MODES
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
 ENOUGH = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"
-"""Hostile text: it clears the screen, sets the title, is markup, reverses direction, colours and
-breaks the line.
+"""Hostile text with many kinds of control sequences.
+
+It clears the screen, sets the title, is markup, reverses direction, colours and breaks the line.
 """
 
 

@@ -1,5 +1,6 @@
-"""The page's files are served by plain names only, compressed where it helps, and reloaded on
-change.
+"""Tests of the page's files.
+
+They are served by plain names only, compressed where it helps, and reloaded on change.
 """
 
 from __future__ import annotations

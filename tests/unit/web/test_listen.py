@@ -1,5 +1,6 @@
-"""An invitation leads to the address on which the page listens, with a certificate or not
-at all.
+"""An invitation leads to the address on which the page listens.
+
+That address has a certificate, or there is no invitation.
 """
 
 from __future__ import annotations

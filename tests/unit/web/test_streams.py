@@ -1,5 +1,6 @@
-"""The newest sample of a key is kept, and an answer to a query never replaces a published
-sample.
+"""The newest sample of a key is kept.
+
+An answer to a query never replaces a published sample.
 """
 
 from __future__ import annotations

@@ -1,5 +1,6 @@
-"""Tests of the client's place: at the machine or by one of the robot's names, and of the asking
-page.
+"""Tests of the place of a client and of the page that asks.
+
+A client is on the machine, or uses one of the robot's names.
 """
 
 from __future__ import annotations

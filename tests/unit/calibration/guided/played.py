@@ -1,5 +1,6 @@
-"""Plays guided calibrations: a simulated robot drives the legs and a simulated person reads the
-tape.
+"""Plays guided calibrations with a simulated robot.
+
+The robot drives the legs, and a simulated person reads the tape.
 """
 
 from __future__ import annotations

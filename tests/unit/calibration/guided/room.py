@@ -20,8 +20,9 @@ ONCE_ROUND = 2 * math.pi + 0.2
 """Largest angle at which a person ends the first turn, rad."""
 
 Start = tuple[complex, float]
-"""Where the middle of the robot stands, m from the near right corner of the room, and its heading,
-rad.
+"""Position of the robot's middle and its heading, rad.
+
+The position is in m from the near right corner of the room.
 """
 
 Drive = tuple[Start, Sequence[Leg]]
@@ -29,8 +30,9 @@ Drive = tuple[Start, Sequence[Leg]]
 
 
 def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
-    """Yield every drive of a calibration when `track` is the estimated one; x is forward, y is
-    left.
+    """Yield every drive of a calibration if `track` is the estimated track.
+
+    In the poses x is forward and y is left.
     """
     edge = complex(setup.reach + 0.1, SIDE / 2), 0.0
     if way == "gyro":
@@ -77,8 +79,9 @@ def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[co
 
 
 def beyond(way: str, setup: Setup, track: float, taken: float, bend: float) -> float:
-    """Return how far some point of the robot leaves the room in the worst case, m; negative if none
-    does.
+    """Return how far some point of the robot leaves the room in the worst case, m.
+
+    The distance is negative if no point leaves it.
 
     The robot may touch a wall at the near edge, because the person pushes it there.
     """

@@ -35,8 +35,10 @@ def wheels(seconds: float, right: float, left: float) -> JointState:
 
 
 def recorded() -> Recorder:
-    """Record wheel messages with another clock's stamps that arrive at least 0.1 s late, and a gyro
-    without stamps.
+    """Record wheel messages and a gyro.
+
+    The wheel messages have another clock's stamps and arrive at least 0.1 s late. The gyro has no
+    stamps.
     """
     recorder = Recorder(JOINTS)
     for k in range(100):

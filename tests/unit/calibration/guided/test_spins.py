@@ -28,9 +28,7 @@ from tests.unit.calibration.robots import Robot
 
 @given(angle=st.floats(-1.3, 1.3), apart=st.floats(0.1, 1.0))
 def test_two_distances_from_a_line_are_an_angle(angle: float, apart: float) -> None:
-    """If the line is on the robot's left, a turn to the left brings its front closer to the
-    line.
-    """
+    """A turn to the left brings the front closer to a line on the robot's left."""
     half = apart / 2 * math.sin(angle)
     assert slant(1.0 - half, 1.0 + half, apart) == pytest.approx(angle, abs=1e-9)
 

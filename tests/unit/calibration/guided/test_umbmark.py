@@ -29,8 +29,9 @@ class Exact(Player):
 
 
 def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
-    """Compare with the equations for E_d and E_b of Borenstein and Feng, from the mean ends of left
-    and right squares.
+    """Compare with the equations for E_d and E_b of Borenstein and Feng.
+
+    They use the mean ends of left and right squares.
 
     Their nominal robot is one whose squares would close: it has equal wheels and the track that was
     used to command the turns.

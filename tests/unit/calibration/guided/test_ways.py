@@ -1,5 +1,6 @@
-"""Tests that play each guided calibration with simulated robots and a person who reads to a
-few mm.
+"""Tests that play each guided calibration with simulated robots.
+
+The simulated person reads to a few mm.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest
 
 @cache
 def robots(way: str, count: int) -> list[tuple[Robot, Calibration, Player, Drive]]:
-    """Return each robot, its calibration, its player, and a random drive that the calibration did
-    not use.
+    """Return each robot, its calibration, its player, and a random drive.
+
+    The calibration did not use the random drive.
     """
     made = []
     for seed in range(count):

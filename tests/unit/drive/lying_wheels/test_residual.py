@@ -1,5 +1,6 @@
-"""Tests of the front-rear difference of one side: slip, or the effect of a count, a tyre or a
-slower motor.
+"""Tests of the front-rear difference of one side.
+
+It comes from slip, or from a count, a tyre or a slower motor.
 """
 
 from __future__ import annotations

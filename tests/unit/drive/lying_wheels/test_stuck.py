@@ -1,5 +1,6 @@
-"""A stuck encoder differs from a steady wheel by the behaviour of its command and of the other
-wheel.
+"""A stuck encoder is distinguished from a steady wheel.
+
+The command and the other wheel of the side show the difference.
 """
 
 from __future__ import annotations
@@ -19,11 +20,10 @@ SLOW_S = 0.25
 
 
 def after(acceleration: float, other: float = 1.0, same: bool = True, count: float = FINE) -> float:
-    """Return the time until a wheel that still reports 10 rad/s is found stuck, s, or inf for
-    never.
+    """Return the time until a wheel that still reports 10 rad/s is found stuck, s.
 
     The time starts when the command leaves 10 rad/s. The other wheel follows the change by the
-    share `other`. The test ends after one second.
+    share `other`. The result is inf if one second is not enough.
     """
     stuck, slow, command, turned = Stuck(), 10.0, 10.0, 10.0
     for line in range(200):

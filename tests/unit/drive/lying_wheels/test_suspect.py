@@ -24,8 +24,9 @@ def felt(speed: float) -> Known:
 def lies(
     own: float, other: float, known: Known, lines: int = 4, same: bool = False
 ) -> tuple[bool, Lie | None]:
-    """Return whether the wheel is found faulty after these lines, and the kind of fault; speeds in
-    rad/s.
+    """Return whether the wheel is found faulty after these lines, and its kind of fault.
+
+    Speeds are in rad/s.
     """
     suspect = Suspect()
     for _ in range(lines):

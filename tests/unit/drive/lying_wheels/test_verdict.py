@@ -53,8 +53,9 @@ class Bench:
         seconds: float = 1.0,
         turn: float | None = None,
     ) -> float:
-        """Return the time until a wheel was found faulty, s, or inf; `turn` is the gyro's rate in
-        rad/s.
+        """Return the time until a wheel was found faulty, s, or inf.
+
+        `turn` is the gyro's rate in rad/s.
         """
         found = math.inf
         for line in range(round(seconds / PERIOD)):
@@ -314,9 +315,7 @@ def test_until_the_fault_a_lie_costs_less_than_a_twentieth(
 
 
 def steady(counts: int, speed: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return the commanded speeds of a straight drive, rad/s, and the angles of its four wheels,
-    rad.
-    """
+    """Return commanded speeds in rad/s and wheel angles in rad of a straight drive."""
     steps = np.concatenate([np.linspace(0.0, 1.0, 150), np.ones(450)])
     told = np.round(steps[:, None] * speed * np.ones(4), 2)
     return told, rolled(told, Robot(counts, tyres=0.005), rng)
@@ -362,8 +361,9 @@ def test_how_soon_a_lie_is_out_is_a_matter_of_counts_and_speed(
 def healthy(
     seed: int, seconds: float, counts: int, before: tuple[WheelSpeeds, ...] = ()
 ) -> tuple[int, bool]:
-    """Return how often slip is reported on a clean drive, and whether the pose equals the plain
-    mean's bit for bit.
+    """Return how often slip is reported on a clean drive, and whether the pose stays exact.
+
+    The pose must equal the plain mean's bit for bit.
 
     The lines of `before` precede the drive.
     """
