@@ -273,7 +273,7 @@ def test_without_a_link_no_wheel_moves_not_even_more_slowly(guard: Guarded) -> N
     assert objection(guard, outputs(line(0.0, 0.0, 0.0, 0.01), linked=False)) == NO_LINK
 
 
-# growing
+# growing speeds
 
 
 @pytest.mark.parametrize("wheel", range(4))

@@ -328,7 +328,7 @@ def test_the_speed_grows_by_the_acceleration_up_to_the_command() -> None:
 
 def test_the_line_says_what_is_applied() -> None:
     bench = Bench().driving(Twist(0.3, 1.0), steps=100)
-    # 3 and 9 rad/s
+    # The wheels turn at 3 and 9 rad/s.
     assert bench.out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
     assert bench.out.applied == Twist(0.3, 1.0)
     assert bench.out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
@@ -856,7 +856,7 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     impossible(bench, 1)
     assert bench.mode() == "fault"
     assert bench.out.reason.startswith("impossible feedback: front_right 99.00 rad/s")
-    # 3 m/s2 x 10 ms
+    # Each step removes 3 m/s2 x 10 ms.
     assert bench.out.applied.linear == pytest.approx(0.47)
     assert bench.step(GO).applied.linear == pytest.approx(0.44)
     assert bench.counters()["line_impossible"] == 3
@@ -913,7 +913,7 @@ def test_after_a_fault_each_source_must_be_neutral() -> None:
     assert bench.mode() == "ready"
 
 
-# leaving
+# shutdown
 
 
 def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
@@ -948,7 +948,7 @@ def test_a_leaving_robot_never_drives_again() -> None:
     assert (bench.mode(), bench.out.applied) == ("leaving", REST)
 
 
-# lines that did not go
+# lines that did not leave
 
 
 def test_a_superseded_line_never_happened() -> None:

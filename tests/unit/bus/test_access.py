@@ -345,7 +345,7 @@ def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> Non
     assert access.lets("viewer", "put", full_key(one, "stop"))
 
 
-# the configuration decides
+# rules that depend on the configuration
 
 
 @given(st.lists(IDS, min_size=1, max_size=5, unique=True))

@@ -378,9 +378,7 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One recording begins at a start, one with a saved state, and one ends by an internal
-    error.
-    """
+    """The recordings begin at a start, begin with a saved state, or end by an internal error."""
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)
     world.drive(0.5, seconds=2.0)

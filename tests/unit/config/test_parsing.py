@@ -220,7 +220,7 @@ PLANTED = [
         "1",
         "did you mean timeout?",
     ),
-    # keys that contradict each other
+    # contradictory keys
     ("[mcu]\nbaud_rate = 9600", "control.rate", "100", "mcu.baud_rate = 38400 or more"),
     ('[mcu.wheels]\nfront_right = "-b"', "mcu.wheels.front_left", '"b"', "write another"),
     ('[joints]\nfront_left = "x"\nrear_left = "x"', "joints.rear_left", '"x"', "write another"),
@@ -535,7 +535,7 @@ def test_one_bad_endpoint_among_good_ones_is_found() -> None:
     assert line.startswith('bus.listen = "tcp/10.0.0.1:2"')
 
 
-# contradictions at their edges
+# contradictions at their limits
 
 
 def test_a_stop_may_brake_exactly_as_hard_as_a_timeout() -> None:
@@ -572,7 +572,7 @@ def test_the_defaults_give_no_warning() -> None:
     assert warnings(Config()) == []
 
 
-# anything at all
+# random input
 
 NAMES = sorted({key.path.rpartition(".")[2] for key in KEYS} | {"id_", "x", "prot"})
 TABLES = sorted({key.path.rpartition(".")[0] for key in KEYS} - {"commands.sources[0]"})

@@ -138,7 +138,7 @@ def test_a_proof_takes_the_source_s_timeout_but_no_more_than_two_seconds() -> No
         assert answers.index("") == 10 * seconds
 
 
-# known
+# a known clock
 
 
 def test_a_command_later_than_the_promptest_by_more_than_the_timeout_is_stale() -> None:
@@ -269,7 +269,7 @@ def test_no_command_within_the_timeout_is_ever_stale(jitter: list[float], offset
         assert bench.wait(250).stamped(HIGH, late_ms=late) == ""
 
 
-# stepped
+# a clock that was set
 
 
 @pytest.mark.parametrize("step", [300.0, 10_000.0, -100.0, -10_000.0])
@@ -344,7 +344,7 @@ def test_a_clock_that_was_set_has_its_sender_let_go_first() -> None:
     assert bench.driver() == "high"
 
 
-# a clock is a sender's on every source
+# one clock per sender, on all its sources
 
 
 def driving(bench: Bench, source: Source, late_ms: float, ms: float) -> list[str]:

@@ -122,7 +122,7 @@ def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
     return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
 
 
-# used
+# a gyro in use
 
 
 @pytest.mark.parametrize("sample_ms", [2, 10, 50, 100])
@@ -222,7 +222,7 @@ def test_a_clock_that_is_set_costs_nothing() -> None:
     assert bench.told == pytest.approx(bench.true, rel=0.02)
 
 
-# silence, slip, disbelief
+# silence, slip, contradictions
 
 
 def test_a_gyro_that_falls_silent_leaves_the_wheels_alone_and_comes_back() -> None:
@@ -397,7 +397,7 @@ def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
     assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
 
 
-# how certain
+# uncertainty
 
 
 @pytest.mark.slow

@@ -511,7 +511,7 @@ def test_a_robot_that_starts_switched_off_can_be_switched_off_by_a_client_too() 
     assert (life.mode, life.latches) == (Mode.READY, Latches())
 
 
-# going down
+# shutdown
 
 
 def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start() -> None:

@@ -170,19 +170,19 @@ def test_no_wheel_is_ever_faster_than_its_limit(
 
 
 def test_speed_grows_by_the_acceleration_and_lands_on_the_goal() -> None:
-    # 1 m/s2 x 10 ms
+    # Each step adds 1 m/s2 x 10 ms.
     got = followed(limiter(), Twist(0.035, 0.0), 5)
     assert [t.linear for t in got] == pytest.approx([0.01, 0.02, 0.03, 0.035, 0.035])
     assert got[-1].linear == 0.035
 
 
 def test_the_two_axes_have_their_own_accelerations() -> None:
-    # 0.5 m/s2 and 1 rad/s2 x 0.1 s
+    # The step is 0.1 s at 0.5 m/s2 and 1 rad/s2.
     assert pair(limiter(UNEVEN).follow(Twist(2.0, 4.0), 0.1)) == approx(0.05, 0.1)
 
 
 def test_the_two_axes_have_their_own_decelerations() -> None:
-    # 2 m/s2 and 6 rad/s2 x 0.1 s
+    # The step is 0.1 s at 2 m/s2 and 6 rad/s2.
     assert pair(moving(2.0, 4.0, UNEVEN).follow(REST, 0.1)) == approx(1.8, 3.4)
 
 
@@ -239,7 +239,8 @@ def test_a_change_of_direction_passes_through_zero(limits: LimitsConfig, sign: f
 
 
 def test_a_change_of_direction_brakes_first_and_accelerates_after() -> None:
-    # 2 m/s2 down: 0.05 -> 0.03 -> 0.01 -> 0; then 0.5 m/s2 up: -0.005, -0.01
+    # It brakes at 2 m/s2, 0.05 -> 0.03 -> 0.01 -> 0, and then accelerates at 0.5 m/s2, -0.005,
+    # -0.01.
     path = followed(moving(0.05, 0.0, UNEVEN), Twist(-0.05, 0.0), 5)
     assert [t.linear for t in path] == pytest.approx([0.03, 0.01, 0.0, -0.005, -0.01])
 
@@ -248,7 +249,7 @@ def test_a_change_of_direction_brakes_first_and_accelerates_after() -> None:
 
 
 def test_jerk_lets_the_slope_grow_step_by_step() -> None:
-    # 5 m/s3 x 10 ms: the slope is 0.05, 0.1, 0.15 m/s2; each moves 10 ms
+    # At 5 m/s3 x 10 ms the slope is 0.05, 0.1, 0.15 m/s2. Each slope applies for 10 ms.
     path = followed(limiter(JERKY), Twist(1.0, 0.0), 3)
     assert [t.linear for t in path] == pytest.approx([0.0005, 0.0015, 0.003])
 
@@ -306,7 +307,7 @@ def rising(speeds: list[float]) -> list[tuple[float, float]]:
 def test_jerk_bounds_the_change_of_slope_on_the_way_to_a_goal(
     start: float, goal: float, way: float
 ) -> None:
-    # 5 m/s3 x 10 ms
+    # The slope may change by 5 m/s3 x 10 ms in a step.
     start, goal = (way * speed for speed in sorted((abs(start), abs(goal))))
     found = moving(start, 0.0, JERKY)
     path = [start, *(twist.linear for twist in followed(found, Twist(goal, 0.0), 400))]
@@ -410,7 +411,7 @@ def test_jerk_is_no_limit_when_it_is_zero() -> None:
 
 
 def test_coasting_falls_by_the_deceleration() -> None:
-    # 1 m/s2 x 10 ms
+    # Each step removes 1 m/s2 x 10 ms.
     found = moving(0.035)
     assert [found.coast(DT).linear for _ in range(5)] == pytest.approx([0.025, 0.015, 0.005, 0, 0])
     assert found.twist == REST
@@ -443,7 +444,7 @@ def test_no_time_coasts_nowhere() -> None:
 
 
 def test_a_stop_falls_by_its_own_higher_deceleration() -> None:
-    # 3 m/s2 x 10 ms; 12 rad/s2 x 10 ms
+    # A step removes 3 m/s2 x 10 ms, or 12 rad/s2 x 10 ms.
     assert moving(1.0).coast(DT, stop=True).linear == pytest.approx(0.97)
     assert moving(0.0, -4.0).coast(DT, stop=True).angular == pytest.approx(-3.88)
 
@@ -497,7 +498,7 @@ def test_jerk_never_delays_coasting() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_after_coasting_jerk_begins_from_a_level_slope(sign: float) -> None:
-    # 5 m/s3 and 20 rad/s3 x 10 ms x 10 ms
+    # The first step adds 5 m/s3 x 10 ms x 10 ms and 20 rad/s3 x 10 ms x 10 ms.
     found, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
     followed(found, wish, 20)
     left = found.coast(DT)

@@ -252,8 +252,8 @@ def test_a_straight_metre_adds_the_variance_worked_by_hand(sign: float) -> None:
 
 
 def test_two_straight_metres_shear_y_by_the_yaw_noise_of_the_first() -> None:
-    # After 1 m: yy 2e-6, yyaw 1e-6, yawyaw 1.01e-4. The second adds
-    # yy += 2 x 1e-6 + 1.01e-4 = 1.05e-4, yyaw += 1.01e-4, yawyaw += 1e-4, xx += 1e-4.
+    # After 1 m: yy 2e-6, yyaw 1e-6, yawyaw 1.01e-4. The second metre adds yy += 2 x 1e-6 + 1.01e-4
+    # = 1.03e-4, which makes 1.05e-4, and yyaw += 1.01e-4, yawyaw += 1e-4, xx += 1e-4.
     robot = odometry()
     robot.fold(feedback(10.0, 10.0, 2.0))
     covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
@@ -683,7 +683,7 @@ def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
     assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}
 
 
-# whole counts of this line alone
+# whole counts of a single line
 
 
 def snapped(turned: float, dt: float = 0.01, speed: float = 9.99, bridged: float = 0.0) -> Feedback:

@@ -207,13 +207,13 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
 @pytest.mark.parametrize(
     ("sent", "seen", "word"),
     [
-        # a tenth of 10 rad/s is not turning
+        # A tenth of 10 rad/s does not count as turning.
         (10.0, 0.9, "does not turn"),
         (10.0, 1.05, ""),
-        # three tenths of 10 rad/s backwards are a reversal
+        # Three tenths of 10 rad/s backward count as a reversal.
         (10.0, -3.1, "against its command"),
         (10.0, -2.9, ""),
-        # one and a half times 10 rad/s and 2 rad/s more are a runaway
+        # One and a half times 10 rad/s plus 2 rad/s counts as a runaway.
         (10.0, 17.1, "faster than commanded"),
         (10.0, 16.9, ""),
     ],
@@ -233,7 +233,7 @@ def test_what_is_too_far_from_the_command_is_worked_by_hand(
 def test_a_constant_speed_more_than_two_and_three_tenths_away_is_stuck(
     seen: float, stuck: bool, sign: float
 ) -> None:
-    # 10 rad/s -+ (2 + 0.3 x 10) rad/s
+    # The band is 10 rad/s -+ (2 + 0.3 x 10) rad/s.
     fault = watched_after_driving(2, sign * 10.0, sign * seen)
     assert ("one and the same speed" in fault) is stuck
 
@@ -425,7 +425,7 @@ def test_a_healthy_wheel_is_expected_to_follow_by_its_response_time() -> None:
 
 
 def test_a_model_that_has_just_reached_the_slack_is_not_yet_moving() -> None:
-    # A quarter of the way to 8 rad/s is 2 rad/s: step 2 is the first of nine that count.
+    # A quarter of the way to 8 rad/s is 2 rad/s, so step 2 is the first of nine that count.
     sanity = Sanity(FeedbackConfig(response_time=0.1875, fault_time=0.5))
     eight = WheelSpeeds(8.0, 8.0, 8.0, 8.0)
     found = [bool(sanity.watch(eight, STILL, 0.0625)) for _ in range(10)]

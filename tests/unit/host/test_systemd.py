@@ -272,7 +272,7 @@ def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> No
     assert len(statuses(manager)) == 5
 
 
-# a manager that does not listen
+# a manager that does not read
 
 
 def fill(there: Systemd) -> int:

@@ -176,7 +176,7 @@ def test_a_new_session_begins_without_a_past() -> None:
     assert bench.reply(500.0 + DELAY_MS) == [0.0, 0.0]
 
 
-# an adapter that holds answers back
+# an adapter that delivers answers in batches
 
 
 def batched(

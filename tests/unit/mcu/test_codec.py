@@ -93,7 +93,7 @@ def test_each_wheel_has_its_motor(codec: Codec, name: str, line: bytes) -> None:
 
 
 def test_a_left_turn_drives_a_and_d_forward_and_b_and_c_backward(codec: Codec) -> None:
-    # 2 rad/s x 0.15 m / 0.05 m = 6 rad/s
+    # 2 rad/s x 0.15 m / 0.05 m gives 6 rad/s.
     left_turn = Kinematics(DriveConfig()).wheel_speeds(Twist(0.0, 2.0))
     assert codec.encode(left_turn) == b"ap06.00,bn06.00,cn06.00,dp06.00\r\n"
 

@@ -725,7 +725,7 @@ def test_the_bad_lines_of_an_update_are_one_event_for_each_reason(reads: int) ->
     assert bench.session.rejects == {"malformed": 201 * reads, "too_long": reads}
 
 
-# an output that is blocked
+# a blocked output
 
 
 def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> None:

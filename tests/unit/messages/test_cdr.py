@@ -408,7 +408,7 @@ def test_no_other_header_is_read(head: bytes) -> None:
         Cdr(Twist).decode(head + bytes(48) if len(head) == 4 else head)
 
 
-# any struct
+# structs of any shape
 
 
 class Mixed(Struct, frozen=True):
@@ -715,7 +715,7 @@ def test_one_item_more_than_there_are_is_refused() -> None:
         Cdr(TFMessage).decode(payload[:4] + struct.pack("<I", 3) + payload[8:])
 
 
-# no more items than there may be
+# limits on the number of items
 
 
 class Node(Struct, frozen=True):

@@ -47,7 +47,7 @@ def as_json(message: Message) -> Any:
     return msgspec.json.decode(encode(message, "json"))
 
 
-# their form
+# the form of the schemas
 
 
 @pytest.mark.parametrize("name", SCHEMAS)

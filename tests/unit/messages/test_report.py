@@ -478,7 +478,7 @@ def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
     assert "cmd_vel_out" not in published(replace(OUTPUTS, due=False))
 
 
-# how often
+# publishing rates
 
 
 @pytest.mark.parametrize("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
@@ -661,7 +661,7 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
     assert with_gyro(GyroStatus("used"))[0].track == ""
 
 
-# wheels that are doubted
+# suspect wheels
 
 
 def test_what_front_and_rear_say_of_each_other_is_shown() -> None:

@@ -127,7 +127,7 @@ BODIES: dict[str, bytes] = {
     "colours": named("\x1b[31mred", "\x1b]0;title\x07"),
     "an error": named("acsard.values", "AcsardError") + NOTHING + pickle.NEWOBJ,
     "an error that is called": named("acsard.values", "AcsardError") + NOTHING + pickle.REDUCE,
-    # other parts
+    # other objects
     "a class that is changed": ROBOT + pickle.NONE
     + pickle.EMPTY_DICT + text("step") + ONE + pickle.SETITEM + pickle.TUPLE2 + pickle.BUILD,
     "a class that gets attributes": ROBOT + attributes((text("step"), ONE)),
@@ -153,7 +153,7 @@ BODIES: dict[str, bytes] = {
     "a robot as a key": pickle.EMPTY_DICT + BARE + ONE + pickle.SETITEM,
     "keys in a tuple": NOTHING + ONE + ONE + pickle.SETITEM,
     "a longer tuple": NOTHING + ONE + pickle.APPEND,
-    # no pickle
+    # bytes that are not a pickle
     "nothing on the stack": b"",
     "two on the stack": ONE + ONE,
     "a mark that stays": pickle.MARK + ONE,

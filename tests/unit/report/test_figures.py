@@ -81,7 +81,7 @@ def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
     waits = trace(figures["who"], "waits")
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
     assert "<b>waits</b> teleop has the higher priority: until it is silent" in words
-    assert max(column(waits["x"])) > 1500  # ms
+    assert max(column(waits["x"])) > 1500  # in ms
     rows = [note["text"] for note in figures["who"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
     assert "Silent all the time: app, ros2_control." in figures["who"].caption

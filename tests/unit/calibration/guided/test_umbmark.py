@@ -41,7 +41,8 @@ def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
     found = play(umbmark.way(usual_setup()), player).found
     side = umbmark.length(usual_setup())
     left, right = player.ends
-    # Left is counter-clockwise. In their frame the first side is along x, to the left is y.
+    # Left is counter-clockwise. In the frame of their paper the first side is along x, and y is to
+    # the left.
     beta = (right.real - left.real) / (-4 * side)
     ratio = math.tan(beta / 2) * SEPARATION * 1.3 / side
     assert found.values[2] / found.values[1] - 1 == pytest.approx(2 * ratio, abs=1.2e-3)

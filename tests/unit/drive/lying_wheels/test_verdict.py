@@ -77,7 +77,7 @@ def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
     return bench
 
 
-# lies
+# faulty wheels
 
 
 @pytest.mark.parametrize("wheel", range(4))
@@ -219,7 +219,7 @@ def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
     assert unsure.covariance.xx > 90 * sure.covariance.xx
 
 
-# thousands
+# thousands of random drives
 
 
 class Fall:
