@@ -1,4 +1,4 @@
-"""Tests of channel judgement: pure functions of the observations."""
+"""Tests of the findings about motor and encoder channels: pure functions of the observations."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def test_first_contact_through_jitter_of_60_ms_takes_2_s_in_the_median_and_mostl
 ) -> None:
     """The jitter is exponential and no command overtakes another, as on TCP.
 
-    First contact took 4 s, and 14 s at worst.
+    An earlier version took 4 s, and 14 s at worst.
     """
     took = []
     for seed in range(100):

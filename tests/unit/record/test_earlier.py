@@ -68,7 +68,7 @@ def test_bytes_that_are_none_of_it_are_refused_and_never_more() -> None:
         except BatchError:
             pass
     with pytest.raises(BatchError):
-        decode(batches[0])  # the current format is not valid here
+        decode(batches[0])  # it is not a batch of the current format
 
 
 @pytest.mark.parametrize("data", [b"", b"\0" * 16, b"\0" * 16 + b"\x09", b"\0" * 16 + b"\x01"])

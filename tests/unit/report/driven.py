@@ -42,7 +42,7 @@ def followed(
 
 
 def two_drivers(world: World) -> None:
-    """Drive by nav, let teleop take over, stop, then send an unknown source and an old command."""
+    """Drive by nav, let teleop take over, stop and clear, then send from an unknown source."""
     world.drive(0.5, 0.3, seconds=2.0, source="nav", hz=10.0)
     for n in range(40):
         world.send(0.5, 0.3, "nav")

@@ -192,7 +192,7 @@ def test_a_robot_whose_clock_was_set_back_is_heard_by_its_answers(
     fleet = Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448")
     session.comes("robot1")
     told(fleet, clock, 0.5)
-    for second in (2000, 1, 3, 5):  # a clock that runs on for an hour, and one that restarts
+    for second in (2000, 1, 3, 5):  # a clock that has run for long, and one that restarts
         robot.stored = replace(STATE, stamp=Time(second))
         told(fleet, clock, 2.5)
     assert "SILENT" not in told(fleet, clock, 0.0)
