@@ -63,7 +63,7 @@ def test_whole_turns_that_were_not_counted_do_not_matter() -> None:
 
 @pytest.mark.parametrize("what", ["turned", "distance", "ahead", "aside"])
 def test_slopes_are_those_of_small_steps(what: What) -> None:
-    """The test leaves out the rate parameter's own second-order change, because it is small."""
+    """The computed slopes ignore a small second-order effect of the rate parameter."""
     steps = joined([driven(CURVE)[0]])
     start = np.array([0.99, 1.01, 0.7, 0.03, 0.0, 0.0, 0.0])
     told = predicted(steps, what, BASE, start)
