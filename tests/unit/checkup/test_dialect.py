@@ -1,4 +1,4 @@
-"""The language of the MCU, step by step."""
+"""Tests that determine the MCU's line format step by step."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_the_form_of_its_replies_is_told(faults: tuple[str, ...], figure: str) -
 
 
 class Particular(Robot):
-    """Takes lines with a comma at their end only, or without only."""
+    """A robot that accepts lines only with a final comma, or only without one."""
 
     def __init__(self, comma: bool, **mcu: Any) -> None:
         super().__init__("plain_only", **mcu)

@@ -1,4 +1,4 @@
-"""What is too much is refused, and time or a leaving makes room again."""
+"""Requests beyond a limit are refused, until time passes or a client leaves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
     bucket = Bucket(10.0, 20.0, 0)
     assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
     taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
-    assert 99 <= taken <= 100  # ten seconds
+    assert 99 <= taken <= 100  # within ten seconds
 
 
 def test_a_bucket_holds_no_more_than_its_most_after_a_long_rest() -> None:

@@ -1,4 +1,4 @@
-"""The description has every key, and every reference in it leads somewhere."""
+"""The description has every key, and every reference in it leads to a definition."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WHOLE = document("1.2.3")
 
 
 def references(node: Any) -> list[str]:
-    """All there are."""
+    """Return all references in this node."""
     if isinstance(node, dict):
         own = [node["$ref"]] if "$ref" in node else []
         return own + [one for value in node.values() for one in references(value)]
