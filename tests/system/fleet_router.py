@@ -50,11 +50,12 @@ kept = [
 print("routing", flush=True)
 time.sleep(600)
 """
-"""A router with a configuration and changes to it; has no plugins, and acts like the storages."""
+"""A router with a configuration and changes to it. It loads no plugins, and acts like the storages.
+"""
 
 
 def certified(where: Path, *names: str) -> None:
-    """A fleet's authority below `where`, and a certificate for each name in a directory of it."""
+    """Make a fleet's authority below `where`, and a directory with a certificate for each name."""
     authority = Authority.make(where, "fleet", 1)
     for name in names:
         authority.issue(where / name, name, ["127.0.0.1"], 1.0)
@@ -78,7 +79,7 @@ def for_two(where: Path) -> Path:
 
 
 def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
-    """What differs from a router's file here: the address, the files, no plugins."""
+    """Return a router's settings that differ from its file here: address, files, no plugins."""
     config = zenoh.Config.from_file(str(file))
     tls = json.loads(config.get_json("transport/link/tls"))
     for key, value in tls.items():
@@ -102,18 +103,18 @@ def here(file: Path, where: Path, endpoint: str) -> Path:
 
 
 def router(where: Path, endpoint: str) -> Program:
-    """Python's Zenoh as the router; says "routing"."""
+    """Run Python's Zenoh as the router. It prints "routing" when it is ready."""
     file = for_two(where)
     return Program(words(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
 def watched_router(where: Path, endpoint: str) -> Program:
-    """`acsard router` with the file; its log says when it listens."""
+    """Run `acsard router` with the file. Its log says when it listens."""
     return Program(acsard("router", str(here(for_two(where), where, endpoint))), where)
 
 
 def zenohd(where: Path, endpoint: str) -> Program:
-    """The real one, where it is on the PATH, without its plugins."""
+    """Run the real zenohd, if it is on the PATH, without its plugins."""
     program = shutil.which("zenohd")
     if program is None:
         pytest.skip("needs zenohd")
