@@ -320,7 +320,7 @@ class Visitor:
         return ros.Attached(self._sequence, time.time_ns(), bytes(range(16))).pack()
 
     def _behind(self) -> None:
-        """Return the control periods to wait: a busy machine gets more for an expected effect."""
+        """Wait until all messages of this session have arrived: one link keeps them in order."""
         if self._who in ADMITTED:
             assert list(self._session.get(f"{ME}/info", timeout=5.0))
         else:
