@@ -582,7 +582,7 @@ BOXES = """['stick', 'stop', 'limit', 'hint', 'speed', 'mode', 'map'].map(name =
 })"""
 
 PIECE_PX = 90
-"""The colours of the path and of the stick."""
+"""The least width and height of the path and of the stick, px."""
 
 
 @pytest.mark.parametrize("size", SCREENS)
@@ -791,7 +791,7 @@ STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
 })"""
 
 FAILS = ["sent", "STOP: no answer; it is sent again"]
-"""The effects of a first attempt without an answer."""
+"""The expected trace of a first attempt that gets no answer."""
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ TYPED = [
 ]
 
 INSTALL_S = 300.0
-"""Options for a package index that is far away."""
+"""Time limit for an install from a distant package index."""
 
 
 def find(page: str, *words: str) -> str:

@@ -98,7 +98,7 @@ def step(robot, inputs):
     return whole(robot, inputs)
 Robot.step = step
 """
-"""Injected into the daemon: a stop overflows it."""
+"""Injected into the daemon: its step raises an exception for a stop."""
 
 
 @pytest.mark.slow

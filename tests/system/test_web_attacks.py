@@ -26,7 +26,7 @@ from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
 pytestmark = pytest.mark.network
 
 MOVED_M = 0.005
-"""m or rad."""
+"""Movement below which the robot counts as standing, m or rad."""
 
 
 class Table:
