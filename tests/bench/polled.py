@@ -2,11 +2,12 @@
 
     python -m tests.bench.polled --config FILE --port DEVICE [--drain]
 
-It is a ros2_control hardware interface in small, with a line each way per cycle. Every cycle
-takes at most one line from the port and leaves the rest in its buffer, publishes the odometry,
-and writes the newest command on the tick. With --drain every cycle takes all lines and keeps the newest: the obvious fix of the
-original. It has none of a robot's safety functions (no limits, no timeouts, no checks), only the
-parts that take time. The wire format and the keys are acsard's, so that the same rig measures both.
+It is a ros2_control hardware interface in small, with a line each way per cycle. Every cycle takes
+at most one line from the port and leaves the rest in its buffer, publishes the odometry, and writes
+the newest command on the tick. With --drain every cycle takes all lines and keeps the newest: the
+obvious fix of the original. It has none of a robot's safety functions (no limits, no timeouts, no
+checks), only the parts that take time. The wire format and the keys are acsard's, so that the same
+rig measures both.
 """
 
 from __future__ import annotations

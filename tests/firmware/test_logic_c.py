@@ -567,7 +567,8 @@ def test_a_healthy_wheel_is_never_switched_off(
 ) -> None:
     """The wheel may be light or heavy, strong or weak, and has much friction.
 
-    A heavy one carries the whole robot; strong and weak compare with the specification. It is driven, reversed, pushed with half of its stall force, and knocked if light.
+    A heavy one carries the whole robot; strong and weak compare with the specification. It is
+    driven, reversed, pushed with half of its stall force, and knocked if light.
     """
     library, counts = (coarse, 96) if is_coarse else (logic, COUNTS_PER_TURN)
     wheel = Wheel(library, lag=lag, free_speed=free_speed, counts=counts)

@@ -366,8 +366,8 @@ while True:
 class Board(Program):
     """A serial board in the container, in a process ahead of all others.
 
-    Its times are therefore reliable. Unless it lies, it answers each command with the speeds requested two lines before. The speed of
-    wheel a is 0.01 to 0.09 off.
+    Its times are therefore reliable. Unless it lies, it answers each command with the speeds
+    requested two lines before. The speed of wheel a is 0.01 to 0.09 off.
     """
 
     def __init__(self, container: Container) -> None:
