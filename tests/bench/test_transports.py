@@ -38,7 +38,7 @@ from tests.unit.messages.test_cdr import odometry
 
 FEEDBACK = ("odom", "tf", "wheel_states")
 ON_THE_BRIDGE = ("odom", "tf", "joint_states")
-"""The same three, under their ROS names."""
+"""The ROS names of the same three messages."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Programs that send commands over a network that may hold them back, by clocks that may be set."""
+"""Programs that send commands over a network with delays, stamped by clocks that may be set."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHARED: tuple[Way, ...] = ("header", "plain", "bridge")
 """Routes on which all programs on a key share one identity."""
 
 AHEAD_NS = NS_PER_S // 2
-"""Zenoh replaces a timestamp that is further ahead of the receiver's clock by its own."""
+"""Zenoh replaces a timestamp that is further ahead of the receiver's clock than this."""
 
 
 class Speaker:

@@ -91,7 +91,7 @@ def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
 def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(
     every: float, stall: float
 ) -> None:
-    """Each stall also loses the link, and the answers come before they are due."""
+    """This holds although each stall loses the link, and answers come before they are due."""
     drive = Drive(World(Config(sim=FINE)), reports=False, batched=True)
     drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
     assert drive.error() < 0.010

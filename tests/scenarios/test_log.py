@@ -227,7 +227,7 @@ def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: 
         world.send(0.0, source=("teleop", "app")[turn % 2])
         world.run(0.3)
     assert told(world, "commander")
-    # A turn every 0.3 s for 60 s.
+    # The commanders take turns every 0.3 s for 60 s.
     assert len(told(world, "commander")) <= 60 + LINES_A_SECOND
     assert counted(told(world, "commander")) == 200
 

@@ -290,7 +290,7 @@ def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World
 
 @by_each_road
 def test_drive_py_drives_at_once_after_a_clear(world: World, road: Road) -> None:
-    """Its zeros are as long as its file says."""
+    """It sends its opening zeros for the time that its file sets."""
     text = (ROS2 / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
     for number in range(2):

@@ -220,8 +220,8 @@ NORMAL_NS = 3_000_000
 def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int, int]:
     """Run a network that holds everything back and then delivers it.
 
-    Returns the numbers of stale, obeyed and accepted commands. A command that would be stale on
-    arrival requests backward motion, every other one forward motion.
+    Returns the numbers of stale, of backward (stale but obeyed), and of accepted commands. A
+    command that would be stale on arrival requests backward motion, every other one forward motion.
     """
     timeout_ns, pause_ns = NS_PER_S // 4, int(NS_PER_S / dice.choice((20, 30, 50)))
     world = quiet_bus(World())

@@ -253,7 +253,7 @@ class Browser:
             raise AssertionError(f"{error}; it said {told}") from None
 
     def key(self, kind: str, code: str, key: str) -> None:
-        """`kind` is Down or Up."""
+        """Send a keyboard event. `kind` is Down or Up."""
         kind = "rawKeyDown" if kind == "Down" else "keyUp"
         self.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key)
 

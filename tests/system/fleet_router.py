@@ -62,7 +62,7 @@ def certified(where: Path, *names: str) -> None:
 
 
 def tls_settings(own: Path) -> dict[str, object]:
-    """Zenoh's `transport/link/tls` of a client with the certificate in this directory."""
+    """Return Zenoh's `transport/link/tls` of a client with the certificate in this directory."""
     return {
         "root_ca_certificate": str(own / "ca.pem"),
         "connect_certificate": str(own / "certificate.pem"),
@@ -72,7 +72,7 @@ def tls_settings(own: Path) -> dict[str, object]:
 
 
 def for_two(where: Path) -> Path:
-    """The file that `acsard lan router` makes of router.json5 for both robots."""
+    """Write the file that `acsard lan router` makes of router.json5 for both robots."""
     file = where / "router.json5"
     file.write_text(router_file(ROUTER_FILE.read_text(), ROBOTS, {}))
     return file
@@ -93,7 +93,7 @@ def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
 
 
 def here(file: Path, where: Path, endpoint: str) -> Path:
-    """A router's file with this address and the certificates below `where`, without plugins."""
+    """Change a router's file to this address, the certificates below `where`, and no plugins."""
     config = zenoh.Config.from_file(str(file))
     for key, value in _changes(file, where, endpoint).items():
         config.insert_json5(key, json.dumps(value))

@@ -350,7 +350,7 @@ def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str,
     assert "acsard fleet" in ended.err
 
 
-# words that nothing is called
+# names that do not exist
 
 
 @pytest.mark.variations(3)

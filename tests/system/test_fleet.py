@@ -174,7 +174,7 @@ ROWS: dict[Verb, tuple[Try, ...]] = {
 
 
 class Member(Bus):
-    """A plain Zenoh client of the router that shows a certificate."""
+    """A plain Zenoh client that shows the router a certificate."""
 
     def __init__(self, config: zenoh.Config, robot_id: str) -> None:
         self.session = zenoh.open(config)

@@ -1,4 +1,4 @@
-"""`acsard foxglove` as a viewer has it: a client of its protocol that knows nothing of acsard."""
+"""`acsard foxglove` serves a viewer: a client of its protocol that knows nothing of acsard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A report in a browser: it draws under its page's own policy; a stranger's words stay words."""
+"""A report in a browser draws under its page's own policy, and a stranger's text stays text."""
 
 from __future__ import annotations
 

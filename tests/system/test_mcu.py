@@ -1,4 +1,4 @@
-"""`acsard mcu check` as a person uses it: at a terminal, and on ptys with faults planted."""
+"""`acsard mcu check` works at a terminal, and finds the planted faults of boards on ptys."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
 def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: Path) -> None:
     """The check finds the fault, or does not judge it because this machine was late.
 
-    Another test has only then the same check in virtual time.
+    A test in virtual time shows that this is the only reason for not judging it.
     """
     with ThreadPoolExecutor(BESIDE) as pool:
         results = dict(zip(FAULTS, pool.map(lambda n: checked(tmp_path, n), FAULTS), strict=True))
@@ -228,7 +228,7 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
         words = acsard("mcu", "check", "--port", port, "--yes")
         with Program(words, tmp_path) as check:
             check.says("checked link")
-            # The port is silent from now on while motor a turns.
+            # The check prints nothing from now on while motor a turns.
             with pytest.raises(subprocess.TimeoutExpired):
                 check.process.wait(0.5)
             check.signal(number)

@@ -59,7 +59,7 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
 
 
 def test_behind_a_suspend_the_port_is_opened_anew() -> None:
-    """The clock only shows the suspend: this machine cannot be suspended."""
+    """The clock simulates the suspend, because this machine cannot be suspended."""
     slept, told = [0], list[Event]()
 
     async def opened() -> tuple[int, bool, int]:

@@ -1,6 +1,6 @@
-"""The black box of the real process: killed, ended, on a full disk, on none at all.
+"""The real process keeps its recording when killed or ended, and drives on without a disk.
 
-Real disks that refuse are in `test_record_disks.py`.
+Real disks that fail are in `test_record_disks.py`.
 """
 
 from __future__ import annotations

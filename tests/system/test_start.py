@@ -1,4 +1,4 @@
-"""From the shell to a robot that drives, and every way a start can fail."""
+"""A start from the shell leads to a robot that drives, or fails with a clear message."""
 
 from __future__ import annotations
 

@@ -86,7 +86,7 @@ def table(page: Page, daemon: Daemon) -> Iterator[Table]:
 
 @pytest.fixture(scope="module")
 def tokens(page: Page) -> dict[str, str]:
-    """Return the tokens, by their validity."""
+    """Return one token of each kind: none, wrong, expired, revoked, and a viewer's."""
     revoked = page.invite("maintainer", "revoked")
     page.tokens("--revoke", "revoked")
     vault = Vault(page.state / "acsard-web")

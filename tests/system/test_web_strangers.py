@@ -203,7 +203,7 @@ def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(page: Page, b
     counted = page.refused().get("too_many", 0)
 
     async def taken(stack: AsyncExitStack, token: str) -> int:
-        """Return how many of too many connections this client gets."""
+        """Open more connections than one client may have; return how many succeed."""
         session = await stack.enter_async_context(page.client(token))
         got = 0
         for _ in range(CONNECTIONS_OF_ONE):

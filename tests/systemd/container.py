@@ -1,4 +1,4 @@
-"""A real systemd in a container: how it is made, booted, looked into and ended.
+"""Make, boot, inspect and end a real systemd in a container.
 
 The container has its own processes, network, mounts and cgroup, so nothing of the host's services
 is touched. Clocks are shared: a monotonic time read on either side means the same.

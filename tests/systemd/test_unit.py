@@ -31,7 +31,7 @@ If it waited this long for a processor, the result does not count.
 
 
 def report(what: str, seconds: list[float]) -> None:
-    """Return the figures as text, in ms."""
+    """Print the figures, in ms."""
     ms = sorted(1000 * second for second in seconds)
     median = statistics.median(ms)
     print(f"{what}: {ms[0]:.0f} / {median:.0f} / {ms[-1]:.0f} ms (min/median/max, n={len(ms)})")
