@@ -32,7 +32,7 @@ def turn_rate(world: World) -> float:
 
 
 def published(world: World, tape: Tape) -> Iterator[bytes]:
-    """Everything that the daemon shows: messages, answers, the log and the recording."""
+    """Return everything that the daemon shows: messages, answers, the log and the recording."""
     for messages in world.bus.published.values():
         yield from {encode(message, "json") for message in messages}
     for replies in world.bus.replies.values():

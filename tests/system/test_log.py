@@ -1,4 +1,4 @@
-"""The log of the real process: who asked, what changed, how it began and ended."""
+"""The log of the real process names each caller and each change with its reason."""
 
 from __future__ import annotations
 
