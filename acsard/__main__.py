@@ -1,4 +1,4 @@
-"""`python -m acsard` is `acsard`."""
+"""Makes `python -m acsard` the same as `acsard`."""
 
 from acsard.cli import entry
 

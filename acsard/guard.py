@@ -15,7 +15,7 @@ latches a fault.
 The guard also checks that the robot comes to rest. When the last fresh command is older than the
 longest ramp that the limits allow, only zero passes. After a stop, a fault or the end of the daemon
 the longest ramp at the stop deceleration counts. The guard remembers these times, so a recording
-keeps its `Memory` beside the robot.
+keeps its `Memory` as well as the robot.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def _wheels(line: bytes) -> Wheels | None:
 def _crc(data: bytes) -> int:
     """Return the CRC-16/XMODEM by the shifts of avr-libc's notes.
 
-    The library that sealed the line has no part in this, so an error there is noticed here.
+    This does not use the library that sealed the line, so an error there is noticed here.
     """
     crc = 0
     for byte in data:

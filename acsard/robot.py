@@ -112,7 +112,7 @@ class Robot:
         """Monotonic time at which the last line was made."""
         self._made = self._said = (self._limiter.state, 0)
         """State of the limiter and its time, at the last line made and at the last line that left.
-        A line that did not leave has no effect."""
+        A line that did not leave does not count."""
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
         """Totals since the start: `commands`, `commands_first_contact` of new senders whose delays
@@ -193,7 +193,7 @@ class Robot:
         # Otherwise neither the mode nor the commander has changed.
         if another or news:
             events += self._told.changes(self._life.mode, self._choice, status[1])
-        # By position: a struct takes three times as long by seventeen names.
+        # Pass by position: with seventeen names a struct takes three times as long.
         return Outputs(
             inputs.now,
             due,
@@ -215,7 +215,7 @@ class Robot:
         """Return whether the next line has a newer command or mode, so that it may go at once."""
         return (self._choice.arrived_ns, self._life.mode) != self._made_of
 
-    # the fate of the line before
+    # The fate of the line before.
 
     def _settle(self, inputs: Inputs) -> None:
         """Keep the effect of the last line if it left, and undo it if it did not."""
@@ -227,7 +227,7 @@ class Robot:
             self._said = self._made
         self._made = self._said
 
-    # fold
+    # Feedback.
 
     def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
         session, before = self.session, self.session.link
@@ -251,7 +251,7 @@ class Robot:
             self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
         events += session.events
         if link != "up":
-            # Without a link there is no ramp, and the command before the loss is old.
+            # Without a link the daemon cannot ramp, and the command before the loss is old.
             self._limiter.cut()
             self._speeds = STILL
             self._made = self._said = (self._limiter.state, self._made_ns)
@@ -309,7 +309,7 @@ class Robot:
             if self._track.event is not None:
                 events.append(self._track.event)
 
-    # requests
+    # Requests.
 
     def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
         if inputs.guard_trip:
@@ -391,7 +391,7 @@ class Robot:
             self._arbiter.require_neutral(self._made_ns)
             events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
 
-    # commands
+    # Commands.
 
     def _hear(self, inputs: Inputs, events: list[Event]) -> None:
         now_ns = inputs.now.mono_ns
@@ -412,14 +412,14 @@ class Robot:
 
     def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
         events.append(refused(refusal))
-        # Every sender with a clock of its own begins so.
+        # Every sender with a clock of its own begins in this state.
         if refusal.reason == "unproven":
             self.counters["commands_first_contact"] += 1
             return
         self.counters[f"command_{refusal.reason}"] += 1
         self._refused_ns, self._refused = now_ns, refusal.text[:MAX_TEXT]
 
-    # limit, invert
+    # Limits and kinematics.
 
     def _drive(self, inputs: Inputs) -> bytes | None:
         now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
@@ -436,7 +436,7 @@ class Robot:
         self._speeds = self._kinematics.wheel_speeds(limiter.twist)
         return self.session.line(now_ns, self._speeds)
 
-    # report
+    # Report.
 
     def _reason(self) -> str:
         match self._life.mode:

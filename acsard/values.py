@@ -1,7 +1,8 @@
-"""The nouns of acsard, in SI units; every other module speaks in these.
+"""The value types of acsard, in SI units, that every other module uses.
 
-What lives here: frozen values without behaviour beyond simple arithmetic on themselves (`gc=False`:
-they are in no cycle). What must not: clocks, I/O, decisions. Wheel order is `WHEELS` everywhere.
+This module holds frozen values without behaviour beyond simple arithmetic on themselves. It reads
+no clock, does no I/O and decides nothing. Types with `gc=False` are never part of a reference
+cycle. Wheel order is `WHEELS` everywhere.
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ WHEELS = ("front_right", "front_left", "rear_left", "rear_right")
 NS_PER_S = 1_000_000_000
 
 ROOT = "acsard"
-"""Begins every key of the native tree: `acsard/<robot.id>/...`."""
+"""The first part of every key of the native tree: `acsard/<robot.id>/...`."""
 
 Role = Literal["viewer", "operator", "maintainer"]
-"""What somebody may do on the bus; each may what those before it may."""
+"""Permission of a client on the bus. Each role includes those before it."""
 
 ROLES: tuple[Role, ...] = get_args(Role)
 
 
 class AcsardError(Exception):
-    """Base of the errors acsard raises on purpose; anything else that is raised is a bug."""
+    """Base of the errors that acsard raises on purpose. Any other exception is a bug."""
 
 
 class Instant(Struct, frozen=True, gc=False):
-    """One reading of both clocks: ages and periods use `mono_ns`, published stamps `wall_ns`."""
+    """One reading of both clocks. Ages and periods use `mono_ns`, published stamps `wall_ns`."""
 
     mono_ns: int
     wall_ns: int
@@ -60,7 +61,7 @@ class WheelSpeeds(Struct, frozen=True, gc=False):
     rear_right: float = 0.0
 
     def as_tuple(self) -> tuple[float, float, float, float]:
-        """The four speeds in `WHEELS` order."""
+        """Return the four speeds in `WHEELS` order."""
         return self.front_right, self.front_left, self.rear_left, self.rear_right
 
 
@@ -80,7 +81,7 @@ class PoseCovariance(Struct, frozen=True, gc=False):
 
 
 class TwistVariances(Struct, frozen=True, gc=False):
-    """Variances of one report in base_link: along x and y in m2/s2, of the turning in rad2/s2."""
+    """Variances of one report in base_link: along x and y in m2/s2, of the turn rate in rad2/s2."""
 
     linear: float
     lateral: float
@@ -88,21 +89,23 @@ class TwistVariances(Struct, frozen=True, gc=False):
 
 
 class Received(Struct, frozen=True):
-    """Bytes as one read of the serial port gave them, and when."""
+    """The bytes of one read of the serial port, and its time."""
 
     at: Instant
     data: bytes
 
 
 class Command(Struct, frozen=True):
-    """A velocity wish of one commander. Three words tell whose it is, here and everywhere:
+    """A velocity that one commander wishes. Three attributes identify its origin:
 
-        source  what it commands as, one of `commands.sources`: the `app` of `cmd/app`
-        sender  its public name, as far as the envelope says: two programs on one source are two
-        clock   what stamped it: the sender's own attachment, Zenoh for it, or a message's header
+    - source: the name under which it commands, one of `commands.sources`: the `app` of `cmd/app`.
+    - sender: its public name, as far as the envelope tells. Two programs on one source are two
+      senders.
+    - clock: the origin of the stamp: the sender's own attachment, Zenoh on its behalf, or a
+      message's header.
 
-    `arrived_ns` is the monotonic time of arrival and alone decides the age; `stamp_ns` is when it
-    was sent by that clock, which nobody has set by ours.
+    `arrived_ns` is the monotonic time of arrival and alone decides the age. `stamp_ns` is the time
+    of sending by `clock`, which is not synchronized with ours.
     """
 
     source: str
@@ -112,43 +115,43 @@ class Command(Struct, frozen=True):
     clock: str = ""
     sender: str = ""
     cancelled: bool = False
-    """The twist is zero only because what was asked for cancels out: nobody let go."""
+    """Whether the requested speeds cancel out to zero, so that the stick is not released."""
     sequence: int | None = None
-    """Its number among those of its sender: none is missing unless it was sent and lost."""
+    """Its number among the commands of its sender. A gap in the numbers means lost commands."""
     shared: bool = False
-    """Several programs may look like this sender: it came by a bridge, or has only its key."""
+    """Whether several programs may look like this sender: it used a bridge, or has only its key."""
     ros: bool = False
-    """It came from ROS, whose tools send no zero by themselves."""
+    """Whether it came from ROS, whose tools send no zero by themselves."""
     stamp_replaced: bool = False
-    """Zenoh took its timestamp away: the sender's clock is ahead of ours."""
+    """Whether Zenoh replaced its timestamp because the sender's clock is ahead of ours."""
     steady: bool = False
-    """The stamp comes from a clock that is never adjusted, as the sender's attachment says."""
+    """Whether the sender declares that nobody adjusts the clock of its stamp."""
 
 
 Verb = Literal["stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set"]
 
 Plain = bool | int | float | str | list[float | str]
-"""The value of a setting, as who asks for it writes it."""
+"""The value of a setting, as a client writes it."""
 
 
 class Request(Struct, frozen=True):
-    """A service call or a stop; `id` finds the caller again, 0 when nobody waits for an answer."""
+    """A service call or a stop; `id` identifies the caller, 0 if nobody waits for an answer."""
 
     verb: Verb
     id: int = 0
     pose: Pose | None = None
     asked_ns: int | None = None
-    """When it arrived, monotonic: a clear must not undo a stop that came after it."""
+    """Monotonic time of its arrival. A clear must not undo a stop that came after it."""
     by: str = ""
-    """Who asked, as `incoming/asker.py` puts it."""
+    """Name of the client, as in `incoming/asker.py`."""
     settings: dict[str, Plain] = {}
-    """What `set` is to set, by key as in `config/live.py`."""
+    """The settings that `set` changes, by key as in `config/live.py`."""
     latch: int | None = None
     """Number of the latch that `clear` or `activate` releases; None if the client names none."""
 
 
 class Answer(Struct, frozen=True):
-    """What became of the `Request` with the same `id`."""
+    """The result of the `Request` with the same `id`."""
 
     id: int
     success: bool
@@ -156,14 +159,14 @@ class Answer(Struct, frozen=True):
 
 
 class Refusal(Struct, frozen=True):
-    """A command that does not count: `reason` is what it is counted under, `text` is for people."""
+    """A command that does not count: `reason` names its counter, and `text` is for people."""
 
     reason: str
     text: str
     source: str = ""
     sender: str = ""
     arrived_ns: int = 0
-    """Whose command it would have been, as far as that is known."""
+    """Monotonic time of its arrival. Unknown values are 0 here, and "" in `source` and `sender`."""
 
 
 EventName = Literal[
@@ -180,29 +183,32 @@ EventName = Literal[
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
     "mode", "commander", "kept_waiting", "first_contact", "command_refused", "fault",
 ]  # fmt: skip
-"""All that the log can be asked for; `deploy/systemd/README.md` says what each means."""
+"""All names of log events. `deploy/systemd/README.md` explains each of them."""
 
 Level = Literal["info", "warning", "error"]
 
 
 class Event(Struct, frozen=True):
-    """Something worth a log line; `text` is for people. `tally.py` keeps it to a line a second."""
+    """An event for the log.
+
+    `text` is for people. `tally.py` writes at most a line per name and second.
+    """
 
     name: EventName
     text: str
     level: Level = "info"
     by: str = ""
-    """Who asked, sent or commands, "" when that is nobody."""
+    """Name of the client that asked, sent or commands, "" without one."""
     kind: str = ""
-    """What is counted apart when it repeats itself: a reason, a change."""
+    """A detail by which repeated events are counted separately: a reason, a change."""
     count: int = 1
-    """How many times, since the last line of this name."""
+    """Number of occurrences since the last line of this name."""
     news: bool = True
-    """False for more of the same: that may wait for its second."""
+    """False for a repetition, which may wait for the next line."""
 
 
 class Estimate(Struct, frozen=True, gc=False):
-    """One feedback line folded into odometry; all its parts share the stamp `at`."""
+    """The result of one feedback line in the odometry. All its parts share the stamp `at`."""
 
     at: Instant
     pose: Pose
@@ -210,39 +216,39 @@ class Estimate(Struct, frozen=True, gc=False):
     covariance: PoseCovariance
     twist_variances: TwistVariances
     positions: tuple[float, float, float, float]
-    """Wheel angles in rad since start, continuous, in `WHEELS` order."""
+    """Wheel angles since the start, rad, continuous, in `WHEELS` order."""
     speeds: WheelSpeeds
     asked_ns: int | None = None
-    """When the line it answers was made, monotonic; None where a reply does not tell which."""
+    """Monotonic time at which the answered line was made, None if that line is unknown."""
     heard_ns: int = 0
-    """When the line was complete here, monotonic."""
+    """Monotonic time at which the line was complete here."""
 
 
 class Wait(Struct, frozen=True):
-    """What a source waits for, and what `drive/words.py` needs to say it."""
+    """The thing that a source waits for, with the details for `drive/words.py`."""
 
     what: Literal[
         "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"
     ]
     source: str = ""
-    """Who must be neutral or prove its clock; who sends nothing but zeros; of higher or equal
-    priority, who has the robot."""
+    """The source that must send a zero, must prove its clock, sends only zeros, or has the
+    robot."""
     seconds: float = 0.0
-    """s without a speed behind the zero of a shared identity, or s that a proof takes."""
+    """Seconds without a speed after the zero of a shared identity, or seconds of a proof."""
     senders: int = 0
-    """How many wait while another sender of the same source is followed."""
+    """Number of senders that wait while another sender of the same source is followed."""
     lasts: float = 0.0
-    """s that it has lasted at the least, one of a few: it must not change each step."""
+    """Least duration of the wait, s, in coarse steps, so that it does not change with each step."""
     kept: str = ""
     """The source that sends speeds meanwhile and is kept waiting."""
     ros: bool = False
-    """The sender that must send a zero sends from ROS."""
+    """Whether the sender that must send a zero uses ROS."""
     shared: bool = False
-    """Several programs may share the identity of the sender that must send a zero."""
+    """Whether several programs may share the identity of the sender that must send a zero."""
 
 
 class SourceStatus(Struct, frozen=True):
-    """What one source is doing: `age_s` since its last accepted command, None if never heard."""
+    """The state of one source; `age_s` since its last accepted command, None before the first."""
 
     name: str
     priority: int
@@ -251,37 +257,38 @@ class SourceStatus(Struct, frozen=True):
 
 
 class WheelsStatus(Struct, frozen=True):
-    """What front and rear of each side say of each other; all empty while they agree."""
+    """Wheel faults and slip, from comparing front and rear wheels. Empty while they agree."""
 
     text: str = ""
-    """What is wrong, in words."""
+    """The trouble in words."""
     left_out: tuple[str, ...] = ()
-    """The wheels that the pose goes without."""
+    """The names of the wheels that the pose ignores."""
     slipping: tuple[str, ...] = ()
-    """`left`, `right`: now, or half a second ago."""
+    """The sides that slip, `left` and `right`, now or within the last half second."""
     differ: tuple[float, float] = (0.0, 0.0)
-    """By which share the front wheel turns more than the rear one, left and right, always."""
+    """Learned shares by which the front wheel turns more than the rear one, left and right."""
 
 
 class RoutersStatus(Struct, frozen=True):
-    """What `bus.connect` names; both are empty where that is."""
+    """The connections of `bus.connect`. All fields are empty if the setting is."""
 
     connected: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()
-    """Those of the connected that are no routers, and hand on nothing."""
+    """Connected endpoints that are not routers and so forward nothing."""
 
 
 class GyroSample(Struct, frozen=True, omit_defaults=True):
-    """What a gyro said: `rate` rad/s about base_link's z, left is +, and its `variance`, rad2/s2.
+    """A turn rate about base_link's z axis by a gyro.
 
-    A variance of 0 is one that the gyro does not tell. `anew`: the first of another gyro.
+    `rate` is in rad/s, left is +. `variance` is in rad2/s2, 0 if the gyro does not report it.
+    `anew` marks the first sample of another gyro.
     """
 
     at_ns: int
-    """When it arrived, monotonic."""
+    """Monotonic time of its arrival."""
     stamp_ns: int | None
-    """When it was measured by the sender's clock; None where that is not told."""
+    """Time of the measurement by the sender's clock, None if the sample has no stamp."""
     rate: float
     variance: float = 0.0
     anew: bool = False
@@ -291,23 +298,23 @@ GyroDoes = Literal[
     "off", "waiting for rest", "used", "silent", "disagrees",
     "reversed", "in degrees", "dead", "not believed",
 ]  # fmt: skip
-"""Of these `used` and `disagrees` (the wheels slip) take the heading from it."""
+"""The state of the gyro. In `used` and `disagrees` (the wheels slip) it gives the heading."""
 
 TrackUse = Literal["shown", "uncertain", "too far off", "used"]
-"""Of the effective track that a gyro implies; the configured one is in use unless it is `used`."""
+"""The use of the track learned from a gyro. Unless `used`, the configured track is in use."""
 
 
 class GyroStatus(Struct, frozen=True):
-    """What the gyro does for odometry, and what is known of it; None is not known yet."""
+    """The state of the gyro, and the results about it; None where one is not known yet."""
 
     does: GyroDoes = "off"
     bias: float | None = None
-    """rad/s"""
+    """Bias, rad/s."""
     delay: float = 0.0
-    """s by which it tells later than the wheels."""
+    """Delay of the gyro relative to the wheels, s."""
     track: float | None = None
     track_deviation: float = 0.0
-    """The effective track it implies, as a share of the configured one; its deviation of that."""
+    """Learned effective track as a share of the configured one, and its relative deviation."""
     track_use: TrackUse = "shown"
 
 
@@ -358,11 +365,11 @@ class Latches(Struct, frozen=True):
 
 
 class Inputs(Struct, frozen=True):
-    """Everything one step may know.
+    """Everything that one step may know.
 
-    `tick` says that the clock's line goes out with this step, `at_once` that one may if there is
-    something new to say; without either only feedback is folded.
-    `opened` counts how often the port has been opened: a new number is a new session with the MCU.
+    With `tick` the line of the period leaves in this step. With `at_once` a line may leave if the
+    command is new. With neither, the step only uses feedback. `opened` counts the openings of the
+    port: a new number is a new session with the board.
     """
 
     now: Instant
@@ -376,47 +383,46 @@ class Inputs(Struct, frozen=True):
     requests: tuple[Request, ...] = ()
     gyro: tuple[GyroSample, ...] = ()
     refusals: tuple[Refusal, ...] = ()
-    """The bus messages refused before they became a `Command`."""
+    """The messages from the bus that were refused before they became a `Command`."""
     guard_trip: str = ""
-    """Why the guard replaced the previous line with STOP; latches a fault."""
+    """Why the guard replaced the previous line with STOP, which latches a fault."""
     superseded: bool = False
-    """The line of the step before did not go out: what it said never happened."""
+    """Whether the line of the step before did not leave and so had no effect."""
     missed: int = 0
-    """Periods that ended without a step, since the step before."""
+    """Number of periods without a step since the step before."""
     events: tuple[Event, ...] = ()
-    """What the shell has to say, to be kept to a line a second with the rest."""
+    """Events of the shell, to be logged together with those of the robot."""
     at_once: bool = False
     leaving: bool = False
-    """The daemon is going down: ramp to zero and stay there."""
+    """Whether the daemon is going down. The robot then ramps to zero and stays there."""
 
 
 class Outputs(Struct, frozen=True):
-    """Everything one step decided."""
+    """Everything that one step decided."""
 
     now: Instant
     due: bool
-    """A line was, by the clock or at once."""
+    """Whether the step had a line to send, for its period or at once."""
     line: bytes | None
-    """The line for the MCU, or None when none is due."""
+    """The line for the board, None if none is due."""
     speeds: WheelSpeeds
     applied: Twist
     linked: bool
     estimates: tuple[Estimate, ...]
     mode: str
     reason: str
-    """Why it moves or does not, in words."""
+    """Why the robot moves or does not, in words."""
     link: str
     source: str
-    """Whose command counts, "" when nobody's does."""
+    """The source whose command is followed, "" without one."""
     command_ns: int | None
-    """When the command that is followed arrived, monotonic; None when none is."""
+    """Monotonic arrival of the command that is followed, None without one."""
     status_changed: bool
-    """One of the four above differs from the step before."""
+    """Whether `mode`, `reason`, `link` or `source` differs from the step before."""
     events: tuple[Event, ...] = ()
     answers: tuple[Answer, ...] = ()
     news: bool = False
-    """Another command is followed, or none any more, or the mode is another one, than when the last
-    line was due."""
+    """Whether the followed command or the mode has changed since the last line that was due."""
     latches: Latches = Latches()
     """The latches in force after the step; the same object until one of them changes."""
 
@@ -431,25 +437,25 @@ class Spread(Struct, frozen=True):
 
 
 class Measured(Struct, frozen=True):
-    """One of the daemon's figures of itself, us."""
+    """One of the daemon's own latencies, us."""
 
     since_start: Spread = Spread()
     last_minute: Spread = Spread()
 
 
 class Recording(Struct, frozen=True):
-    """How the black box does."""
+    """The state of the black box."""
 
     where: str = ""
-    """The directory, "" when nothing is recorded."""
+    """The directory, "" if nothing is recorded."""
     trouble: str = ""
-    """Why it is not recorded just now, in words."""
+    """Why recording fails at present, in words."""
     missing: int = 0
-    """Steps that were not recorded."""
+    """Number of steps that were not recorded."""
 
 
 class Snapshot(Struct, frozen=True):
-    """What `state` and `diagnostics` show beyond one step's outputs."""
+    """Values for `state` and `diagnostics` beyond one step's outputs."""
 
     pose: Pose
     measured: Twist | None  # None while the feedback is silent
@@ -457,23 +463,23 @@ class Snapshot(Struct, frozen=True):
     sources: tuple[SourceStatus, ...]
     counters: dict[str, int]
     refused: str
-    """The last command that was refused and why, "" when none was."""
+    """The last command that was refused and the reason, "" before the first one."""
     refused_age_s: float | None = None
-    """s since one was refused for more than that its sender is new here, None when none was."""
-    feedback_age_s: float | None = None  # since the last good line, None before the first one
+    """Seconds since a command was refused for any reason except a new sender, None before that."""
+    feedback_age_s: float | None = None  # since the last good line, None before it
     missed_last_minute: int = 0
-    """Periods without a step."""
+    """Number of periods without a step in the last minute."""
     figures: dict[str, Measured] = {}
-    """What the daemon measures of itself, by the names in `runtime/figures.py`."""
+    """The daemon's own latencies, by the names in `runtime/figures.py`."""
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
     check: str = "plain"
-    """Which check the serial lines have, in words."""
+    """The check of the serial lines, in words."""
     encoders: tuple[int, ...] = ()
-    """Counts per turn that the lines show, in `WHEELS` order; 0 where they show none."""
+    """Counts per turn that the lines show, in `WHEELS` order; 0 if unknown."""
     sender: str = ""
-    """Whose command counts, of the senders of one source; "" when nobody's does."""
+    """The sender whose command is followed, "" without one."""
     routers: RoutersStatus = RoutersStatus()
     recording: Recording = Recording()
     latch_file: str | None = None
-    """Why the latches would not survive a restart, in words; None where nothing is kept."""
+    """Why the latches would not survive a restart, in words; None if nothing is kept."""

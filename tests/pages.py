@@ -218,8 +218,20 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/python -m tests.pythons python3.12 python3.13": Shown(
         "installs into venvs of other Pythons, for who has them"
     ),
+    ".venv/bin/python -m tests.simulate --seed 1 --hours 24": Shown("takes half an hour"),
+    ".venv/bin/python -m tests.simulate --replay 17": Elsewhere(
+        "tests/simulate/test_simulate.py", "test_a_seed_of_a_replay_is_played_and_reported"
+    ),
+    ".venv/bin/python -m tests.simulate --shrink 17 --keep NAME": Elsewhere(
+        "tests/simulate/test_simulate.py", "test_shrinking_leaves_what_the_finding_needs"
+    ),
+    ".venv/bin/python -m tests.simulate --seed 1 --hours 24 --against ../other": Elsewhere(
+        "tests/simulate/test_simulate.py",
+        "test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else",
+    ),
     ".venv/bin/coverage run": InCi(".venv/bin/coverage run"),
     ".venv/bin/coverage report": InCi(".venv/bin/coverage report"),
+    ".venv/bin/python -m tests.simulate.planted": Shown("takes hours"),
     ".venv/bin/python -m tests.mutation": Shown("takes long, for changes of the core"),
     ".venv/bin/python -m tests.mutation --safety": Shown("takes long, for the same"),
     ".venv/bin/python -m tests.pictures pictures": Elsewhere(

@@ -1,1 +1,1 @@
-"""Shell: owns the Zenoh sessions; who may join, what came in, what goes out."""
+"""Shell package that owns the Zenoh sessions: access rules, receiving, publishing and replying."""

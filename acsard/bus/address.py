@@ -1,4 +1,4 @@
-"""Where the robot of a configuration is, for a tool that wants to talk to it."""
+"""Finds the endpoint, the id and the certificates for a tool that connects to a robot."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from acsard.host.errors import UsageError
 
 
 class Address(NamedTuple):
-    """How to reach a robot."""
+    """The endpoint, id and certificate directory of a robot."""
 
     endpoint: str
     robot_id: str
     tls: str
-    """Directory with our certificate, "" for none."""
+    """Directory with the client's certificate, "" for none."""
 
 
 def address_of(
@@ -29,14 +29,15 @@ def address_of(
     robot_id: str | None = None,
     tls: str | None = None,
 ) -> Address:
-    """Where the robot of a configuration is, unless the options say otherwise.
+    """Return the address of the configuration's robot.
 
-    Raises `UsageError` for an id that no robot can have.
+    A given option replaces the value of the configuration. Raises `UsageError` for an id that no
+    robot can have.
     """
     robot_id = config.robot.id if robot_id is None else robot_id
     require_id(robot_id)
     bus = config.bus
-    # The daemon listens only as a peer; plain endpoints need no certificate.
+    # The daemon listens only in peer mode. Prefer a plain endpoint, which needs no certificate.
     known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
     endpoint = connect or reachable(known[0])
     certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
@@ -44,14 +45,15 @@ def address_of(
 
 
 def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
-    """Where the robot is for a program: what it gives, else what the file says that $ACSARD_CONFIG
-    names, else the defaults; for the certificate $ACSARD_TLS goes before the file.
+    """Return a robot's address for a program that uses the client library.
 
-    Raises `UsageError` for an id that no robot can have, and for a file that cannot be used.
+    Arguments come first, then the file that $ACSARD_CONFIG names, then the defaults. For the
+    certificate directory $ACSARD_TLS overrides the file. Raises `UsageError` for an id that no
+    robot can have and for a file that cannot be used.
     """
     settled = endpoint is not None and robot_id is not None
     if settled and (tls is not None or not _is_tls(endpoint or "")):
-        config = Config()  # whatever the file says
+        config = Config()  # the file cannot change the result
     else:
         config = _named_by_environment()
     where = address_of(config, endpoint, robot_id, tls)
@@ -79,7 +81,7 @@ def _named_by_environment() -> Config:
 
 
 def require_id(robot_id: str) -> None:
-    """Raises `UsageError` for what no robot can be called."""
+    """Raise `UsageError` for an id that no robot can have."""
     try:
         convert(robot_id, Name)
     except ValidationError:

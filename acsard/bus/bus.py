@@ -1,6 +1,7 @@
-"""Owns the Zenoh session: declares every key, and hands on what came in and what goes out.
+"""Owns the daemon's Zenoh session and its keys, takes input from the bus and publishes to it.
 
-Whatever may block (open, declare, put, reply, close) runs in a thread.
+Every Zenoh call that may block (open, declare, put, reply, close) runs in a thread, never on the
+event loop.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ OPEN_TIMEOUT_S = 10.0
 CLOSE_TIMEOUT_S = 0.3
 
 TWIN_PATIENCE_S = 0.5
-"""How long to listen for another daemon with our id or ROS names before claiming them."""
+"""Seconds to listen for another daemon with this robot's id or ROS names before claiming them."""
 
 
 class ZenohBus:
-    """The robot's keys on the bus, while entered."""
+    """The robot's keys on the bus, declared while the context manager is entered."""
 
     def __init__(
         self,
@@ -54,7 +55,15 @@ class ZenohBus:
         topics: tuple[Topic, ...],
         published: tuple[Topic, ...],
     ) -> None:
-        """`topics` are the rows of the table that there are, `published` those that go out."""
+        """Store the settings; entering the bus opens the session.
+
+        Args:
+            silent: native keys that get no ROS endpoint.
+            sources: names of the listed command sources.
+            access: the value of Zenoh's `access_control`.
+            topics: rows of the topic table that this robot offers.
+            published: rows that the daemon publishes.
+        """
         self._settings, self._ros, self._id, self._sources = bus, ros, robot_id, sources
         self._access, self._silent = access, silent
         self._topics, self._published = topics, published
@@ -65,17 +74,17 @@ class ZenohBus:
         self._outlets, self._links = Outlets(), Links(bus, self._inbox)
         self._session: zenoh.Session
         self._kept: list[object] = []
-        """Declared entities: Zenoh undeclares what is no longer referred to."""
+        """Declared entities. Zenoh undeclares an entity when nothing refers to it."""
 
-    # the control loop's view
+    # The control loop calls the methods below.
 
     @property
     def wanted(self) -> frozenset[str]:
-        """Published keys that somebody listens to, in whatever tree."""
+        """Published topics that have a listener in any tree."""
         return self._outlets.wanted
 
     def take(self, queries: int) -> BusInput:
-        """What came in since the last call, at most so many queries."""
+        """Return the input since the last call, with at most `queries` + 1 queries."""
         got = self._inbox.take(queries)
         routers = self._links.news()
         if routers is not None:
@@ -86,25 +95,25 @@ class ZenohBus:
         return replace(got, dropped=dropped, stuck=stuck) if dropped or stuck else got
 
     def publish(self, key: str, message: Message) -> None:
-        """Leave a message for its listeners, until `flush`."""
+        """Queue a message for its listeners. `flush` sends it."""
         self._outlets.publish(key, message)
 
     def flush(self) -> None:
-        """Have what was published sent; never waits for it."""
+        """Wake the thread that sends the queued messages. Never wait for it."""
         self._outlets.flush()
 
     def reply(self, reply: Reply) -> None:
-        """Answer a query by its ticket."""
+        """Reply to the query that holds the ticket `reply.ticket`."""
         self._replies.send(reply)
 
     def retire(self, ticket: int) -> None:
-        """No more replies by this ticket."""
+        """End the query of this ticket: it gets no more replies."""
         self._replies.retire(ticket)
 
-    # opening
+    # Opening the session.
 
     async def __aenter__(self) -> ZenohBus:
-        # A client has nothing to do without its router, and waits for it.
+        # In client mode the daemon can do nothing without its router, so it waits for the router.
         patience_s = OPEN_TIMEOUT_S if self._settings.mode == "peer" else None
         self._session = await in_thread(self._open, patience_s)
         return self
@@ -117,7 +126,7 @@ class ZenohBus:
             if taken:
                 session.close()
                 raise InUseError(taken)
-        # Before the first key is declared, on which something may come in at once.
+        # Set this before the first key is declared, because a sample may arrive at once.
         self._inbox.own_id = session.new_timestamp().get_id()
         self._replies.start(session)
         self._declare_native(session)
@@ -131,7 +140,7 @@ class ZenohBus:
         return session
 
     def _taken(self, seen: set[str]) -> str:
-        """What another daemon has of ours and the mend, or ""."""
+        """Return the error if another daemon has this robot's id or ROS names, else ""."""
         if self._alive in seen:
             return (
                 f"another daemon on this bus already is {self._id}; "
@@ -165,7 +174,11 @@ class ZenohBus:
             self._declare_json(session, topic)
 
     def _declare_json(self, session: zenoh.Session, topic: Topic) -> None:
-        """The same once more for who has no msgpack; kept for nobody, or it were encoded always."""
+        """Publish the topic also as JSON, for clients without msgpack.
+
+        Not latched: a latched publisher would encode every message even without subscribers. A
+        query gets the present value instead.
+        """
         below = json_key(topic.key)
         key, encoding = full_key(self._id, below), encoding_name("json", topic.type)
         self._outlets.declare(session, topic.key, key, "json", encoding)
@@ -180,7 +193,7 @@ class ZenohBus:
                 self._kept.append(session.declare_subscriber(key, on_sample))
             case "query" | "service":
                 on_query = direct(partial(self._inbox.on_ros_query, endpoint))
-                # rmw_zenoh's clients ask complete queryables only.
+                # Clients of rmw_zenoh query only complete queryables.
                 self._kept.append(session.declare_queryable(key, on_query, complete=True))
             case "out":
                 identity = gid(endpoint.token) if endpoint.transport == "rmw" else b""
@@ -191,7 +204,7 @@ class ZenohBus:
         if endpoint.token:
             self._kept.append(session.liveliness().declare_token(endpoint.token))
 
-    # the way down
+    # Closing the session.
 
     async def __aexit__(
         self,
@@ -203,7 +216,7 @@ class ZenohBus:
         try:
             await in_thread(self._close, CLOSE_TIMEOUT_S)
         except TimeoutError:
-            pass  # a stuck remote; the process ends without its good-bye
+            pass  # a stuck remote; the process ends without closing the session
 
     def _close(self) -> None:
         self._outlets.stop(CLOSE_TIMEOUT_S)
@@ -212,14 +225,14 @@ class ZenohBus:
 
 
 def _seen(session: zenoh.Session, alive: str, claims: tuple[str, ...]) -> set[str]:
-    """Which of these liveliness tokens others have, or come to have within our patience."""
+    """Return the liveliness tokens that other sessions hold or declare within TWIN_PATIENCE_S."""
     liveliness = session.liveliness()
     others = {
         token: liveliness.declare_subscriber(token, history=True) for token in (alive, *claims)
     }
     deadline_ns = clock.now().mono_ns + int(TWIN_PATIENCE_S * NS_PER_S)
     found: set[str] = set()
-    # Who has our id has our ROS names as well, and is to be told of the id.
+    # A daemon with our id also has our ROS names. Wait for the id, which is the better message.
     while alive not in found and clock.now().mono_ns < deadline_ns:
         time.sleep(0.01)
         found |= {token for token, other in others.items() if other.try_recv() is not None}

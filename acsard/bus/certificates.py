@@ -1,6 +1,6 @@
-"""The files of a TLS directory: can they be used, and for how long?
+"""Checks the files of a TLS directory and reads the names and the end date of its certificate.
 
-Reading how long takes the library of the extra `lan`.
+Only the end date (`ends_ns`) needs the library of the optional extra `lan`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.values import NS_PER_S
 
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
-"""The files of a TLS directory."""
+"""File names in a TLS directory."""
 
 
 def require_usable(directory: str) -> None:
-    """Raises `CertificateError` or `NotPermittedError`, with the file and the mend."""
+    """Check that the files of a TLS directory can be read and belong together.
+
+    Raises:
+        CertificateError: a file is missing or unusable; the message says how to fix it.
+        NotPermittedError: a file may not be read; the message says how to fix it.
+    """
     if not Path(directory).is_dir():
         raise CertificateError(
             f"there is no directory {directory}: name the one with {CA}, {CERTIFICATE} and {KEY} "
@@ -42,7 +47,8 @@ def require_usable(directory: str) -> None:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_verify_locations(f"{directory}/{CA}")
-        # A password: Zenoh takes no key that wants one, and nobody is to be asked for it here.
+        # The empty password makes OpenSSL fail for an encrypted key instead of prompting for its
+        # password on the terminal. Zenoh accepts no encrypted key.
         context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
     except (ssl.SSLError, ValueError) as error:
         raise CertificateError(
@@ -52,25 +58,25 @@ def require_usable(directory: str) -> None:
 
 
 def common_name(directory: str) -> str:
-    """The name in the certificate in `directory`, "" where it cannot be told."""
+    """Return the common name of the certificate in `directory`, "" if it cannot be read."""
     subject: Any = _shown(directory).get("subject", ())
     names = [value for part in subject for kind, value in part if kind == "commonName"]
     return str(names[-1]) if names else ""
 
 
 def shown_at(endpoint: str, directory: str) -> str:
-    """Return the common name that a client shows at this endpoint, "" where it shows none."""
+    """Return the common name that a client presents at this endpoint, "" without a certificate."""
     return common_name(directory) if directory and endpoint.startswith(TLS) else ""
 
 
 def names_in(directory: str) -> list[str]:
-    """The host names and addresses that the certificate in `directory` is for."""
+    """Return the host names and addresses that the certificate in `directory` is valid for."""
     alternative: Any = _shown(directory).get("subjectAltName", ())
     return [_plain(str(name)) for _, name in alternative]
 
 
 def _plain(name: str) -> str:
-    """An IPv6 address as everybody writes it; the standard library has all its zeros."""
+    """Return an IPv6 address in its short form, because the standard library writes every zero."""
     try:
         return str(ipaddress.ip_address(name))
     except ValueError:
@@ -78,9 +84,10 @@ def _plain(name: str) -> str:
 
 
 def _shown(directory: str) -> dict[str, Any]:
-    """What is in the certificate in `directory`; empty where it cannot be told.
+    """Return the decoded certificate in `directory`, or an empty dict if it cannot be read.
 
-    Read by showing it to ourselves: the standard library tells a name only of who has connected.
+    The standard library decodes only the certificate of a connected peer. This function therefore
+    connects a TLS client and a TLS server in memory, which both use this certificate.
     """
     shown = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     asks, shows = ssl.MemoryBIO(), ssl.MemoryBIO()
@@ -96,15 +103,15 @@ def _shown(directory: str) -> dict[str, Any]:
         for side in (one, other, one, other):
             with suppress(ssl.SSLWantReadError):
                 side.do_handshake()
-    except (OSError, ValueError):  # an SSLError is an OSError
+    except (OSError, ValueError):  # SSLError is an OSError
         return {}
     return dict(other.getpeercert() or {})
 
 
 def ends_ns(directory: str) -> int | None:
-    """Wall-clock time at which the certificate in `directory`, or its authority's, ends.
+    """Return when the certificate in `directory` or its authority's expires, whichever is first.
 
-    None when that cannot be read.
+    The result is wall-clock time in ns, or None if it cannot be read.
     """
     try:
         from cryptography import x509

@@ -1,7 +1,7 @@
-"""Many robots on one bus: which `--id` names, who is there, and what comes from all of them.
+"""Parses the `--id` lists for several robots; finds these robots, follows or stops them.
 
-Over TLS only exact keys pass, since a few wildcards can take a router's time: there each robot has
-to be named.
+Over TLS the access rules pass exact keys only, because a few wildcards can take a router's time
+without bound. A client over TLS must therefore name each robot.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from acsard.values import ROOT
 
 ALL = "*"
 PRESENT_S = 2.0
-"""Who is there says so within."""
+"""Seconds to wait for the liveliness tokens of the daemons that run."""
 
 
 def named(text: str) -> tuple[str, ...]:
-    """The ids of an `--id` for many, `("*",)` for all there are; () for one robot's.
+    """Return the ids in an `--id` for several robots: `("*",)` for all, () if it names one robot.
 
-    Raises `UsageError` for what no robot can be called.
+    Raises `UsageError` for a text that is not a list of robot ids.
     """
     if text == ALL:
         return (ALL,)
@@ -45,9 +45,9 @@ def named(text: str) -> tuple[str, ...]:
 
 
 def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[str]:
-    """Those of the ids, or all, whose daemon is there.
+    """Return the sorted ids, out of `ids` or out of all robots, whose daemon is running.
 
-    Raises `NoAnswerError` when all were meant and nobody is there, or may be seen.
+    Raises `NoAnswerError` if `ids` asks for all robots and none is visible from here.
     """
     found = set()
     for one in ids:
@@ -60,7 +60,7 @@ def present(session: zenoh.Session, ids: Sequence[str], endpoint: str) -> list[s
 
 
 def around(session: zenoh.Session, robot_id: str, endpoint: str) -> Around | None:
-    """Whether this robot is there, and who else; None where the session is being closed."""
+    """Return whether this robot and others are present, or None if the session is closing."""
     try:
         if not session.info.links():
             return Around(linked=False, here=False)
@@ -74,8 +74,9 @@ def around(session: zenoh.Session, robot_id: str, endpoint: str) -> Around | Non
 
 
 def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
-    """Tell these robots to stop, or all: at once, whoever else is there and slow to answer.
+    """Stop these robots, or all of them for "*".
 
+    The stop is sent at once: it waits for no answer, so a slow robot does not delay the others.
     `sender` is the caller's sender id, `NAME/SECRET`.
     """
     by = msgspec.msgpack.encode({"sender": sender})
@@ -84,12 +85,12 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
 
 
 def seen(endpoint: str, robots: int) -> str:
-    """How many there are by a wildcard, and where that was asked: another place may see others."""
+    """Return how many robots a wildcard found and where. Elsewhere others may be visible."""
     return f"all seen at {endpoint}: {robots} robot{'' if robots == 1 else 's'}"
 
 
 def nobody(endpoint: str) -> str:
-    """Why no robot is seen by a wildcard, in words."""
+    """Return why a wildcard found no robot, as a message."""
     if endpoint.startswith(TLS):
         return (
             "no robot is seen: over TLS only exact keys pass, so name them, --id robot1,robot2 "
@@ -100,7 +101,7 @@ def nobody(endpoint: str) -> str:
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:
-    """The samples of a key of all of these robots; `robot_of` says whose one is."""
+    """Subscribe to one key of all these robots. `robot_of` gives the robot of a sample."""
     topic = by_key(name)
     latched = topic is not None and topic.latched
     keys = [full_key(one, name) for one in ids]
@@ -111,6 +112,6 @@ def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscriptio
 
 
 def robot_of(key: str) -> str:
-    """Whose key this is; "" for a wildcard, which is no robot's."""
+    """Return the robot id in a full key, "" for a key expression with a wildcard."""
     root, _, rest = key.partition("/")
     return rest.partition("/")[0] if root == ROOT and not set(key) & set("*$") else ""

@@ -1,7 +1,7 @@
-"""Who we are to a daemon: the role by what it answers, the certificate by what we show.
+"""Finds out a client's identity: its role by the keys that answer, its certificate by its own file.
 
-Zenoh tells a daemon nothing of the link that a question came by. But the access rules let each role
-ask for its own key and those below it, so that the highest that answers is the role.
+Zenoh does not tell the daemon which link a query came by. But the access rules let each role query
+only its own key and those of lower roles, so the highest key that answers is the role.
 """
 
 from __future__ import annotations
@@ -21,28 +21,31 @@ from acsard.messages.topics import full_key, whoami_key
 from acsard.values import NS_PER_S, ROLES, Role
 
 WHOAMI_S, WHOAMI_MORE_S = 2.0, 0.3
-"""For the first answer, and for those that come with it."""
+"""Seconds to wait for the first answer, and for more answers once one has come."""
 
 Ask = Callable[[str, Callable[[zenoh.Sample], object]], None]
-"""Asks a key and calls back with what it answers, if it does."""
+"""A function that queries a key and calls back with each sample that answers."""
 
 
 class Identity(Struct, frozen=True):
-    """Who a client is to the daemon."""
+    """The identity of a client as the daemon sees it."""
 
     role: Role | Literal[""]
-    """What its link lets it do; "" when it may not even ask, or the daemon does not tell."""
+    """The role of the client's link, "" if no key answered."""
     certificate: str
-    """The name in its certificate, "" without one."""
+    """The common name of the client's certificate, "" without one."""
     sender: str
-    """Its name on each command."""
+    """The client's name on each command."""
     robot: str = ""
-    """The id that was asked for."""
+    """The id of the robot that was queried."""
     endpoint: str = ""
-    """Where."""
+    """The endpoint of the query."""
 
     def lacks(self, key: str) -> str:
-        """Why one may not use a key below the robot's id, "" when that is not known."""
+        """Return why this client may not use a key below the robot's id.
+
+        "" means that it may, or that neither its role nor its certificate is known.
+        """
         least = least_role(key)
         if not self.role:
             return self.silence
@@ -52,10 +55,10 @@ class Identity(Struct, frozen=True):
 
     @property
     def silence(self) -> str:
-        """Why nobody answers us, the likeliest first; "" with a role, or without a certificate.
+        """The likeliest reasons why no key answered, "" with a role or without a certificate.
 
-        From here the silence of a robot that is not there, one that is stuck, and one that does
-        not know our certificate are the same: none of them is claimed.
+        A client cannot distinguish a robot that is absent, one that is stuck and one that does not
+        list the client's certificate. The message therefore asserts none of the three.
         """
         return "" if self.role or not self.certificate else self._nobody()
 
@@ -72,7 +75,7 @@ class Identity(Struct, frozen=True):
         )
 
     def words(self) -> str:
-        """Role and certificate in a sentence."""
+        """Return the role and the certificate in a sentence."""
         if self.role:
             whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
             whose += "" if self.certificate else " a certificate here, by this link"
@@ -81,7 +84,10 @@ class Identity(Struct, frozen=True):
 
 
 def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "") -> Identity:
-    """Ask this robot, there, who we are; `tls` is our certificate's directory, "" for none."""
+    """Query the robot for this client's role; return its identity.
+
+    Blocks for up to WHOAMI_S. `tls` is the directory of the client's certificate, "" for none.
+    """
     answers: SimpleQueue[str] = SimpleQueue()
     for one in ROLES:
         ask(whoami_key(one), lambda sample: answers.put(str(sample.key_expr)))
@@ -89,7 +95,7 @@ def identity(ask: Ask, tls: str, sender: str, robot: str = "", endpoint: str = "
     while best < len(ROLES) - 1 and (left := end - _now_s()) > 0:
         with suppress(Empty):
             role = answers.get(timeout=left).rpartition("/")[2]
-            # What one may not ask gets no answer: the others come at the same time, or never.
+            # A key that this client may not query never answers. The other answers arrive together.
             end = min(end, _now_s() + WHOAMI_MORE_S)
             best = max(best, next((n for n, r in enumerate(ROLES) if r == role), -1))
     name = common_name(tls) if tls else ""

@@ -1,7 +1,7 @@
-"""What came in over the bus and waits for the next step: bounded, filled by Zenoh's threads.
+"""Buffers the samples and queries from the bus until the next control step takes them.
 
-A callback here only copies what it is given and never calls Zenoh back; the control loop takes
-from it when it steps.
+Zenoh's threads fill the buffers, and every buffer is bounded. A callback here only copies its input
+and never calls Zenoh back, except to send a refusal through `Replies`.
 """
 
 from __future__ import annotations
@@ -20,28 +20,31 @@ from acsard.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key,
 from acsard.ros.transports import Endpoint
 
 ARRIVALS = 16
-"""Samples held of one key between two steps, the newest; at 1000 Hz and 100 steps a second 10 come
-in from one who sends all he may. What comes in on other keys than those of listed sources is held
-together: no flood pushes out a command on another key."""
+"""Newest samples buffered per key between two steps. A sender at the limit of 1000 Hz puts 10 of
+them into one step at 100 Hz. The samples on keys of unlisted sources share one buffer, so a flood
+there cannot push out a command on a listed key."""
 
 SAMPLES = 64
-"""Samples of a gyro held: what one of 400 Hz says while the loop stands still for 150 ms."""
+"""Newest gyro samples buffered: a gyro at 400 Hz fills them while the loop stands still for 150
+ms."""
 
 OTHERS = ""
-"""Where samples on all other keys go."""
+"""The buffer's key for samples on all unlisted keys."""
 
 ALL = "*"
-"""In the place of a certificate's name."""
+"""Placeholder for the certificate's name in a key."""
 
 STOPS = 16
-"""Stops held, apart from all else: no flood of anything can push one out."""
+"""Stops buffered. They have a buffer of their own, so that no flood can push one out."""
 
 QUERIES = 256
-"""Queries held, as many service calls, and as many of ROS for parameters, of which one is answered
-in a step: the last of so many 2.6 s late. The next one is told to ask again."""
+"""Queries buffered in each of three queues: services, other native queries, and the slow ones. One
+slow query is answered per step, so the last of 256 waits 2.6 s. Further queries are refused with
+`BUSY`."""
 
 ATTACHMENT_BYTES = 256
-"""An rmw_zenoh attachment has 33, ours up to 140; a longer one is cut, and nobody's."""
+"""Bytes of an attachment that are kept. An attachment of rmw_zenoh has 33, ours up to 140. A longer
+one is cut, so it decodes to no sender."""
 
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
@@ -50,15 +53,17 @@ T = TypeVar("T")
 
 
 class Inbox:
-    """Samples and queries of one robot, until they are taken."""
+    """Samples and queries of one robot, buffered until `take`."""
 
     def __init__(
         self, prefix: str, replies: Replies, sources: tuple[str, ...], waker: Waker
     ) -> None:
         self.own_id: zenoh.TimestampId | None = None
-        """The id this session stamps unstamped samples with: no stamp of theirs."""
+        """The id with which this session stamps samples that came without a timestamp. Such a
+        timestamp is not the sender's."""
         self.routers: frozenset[str] = frozenset()
-        """The ids that routers stamp them with: when they came by there, and nobody's name."""
+        """The ids with which routers stamp samples. Such an id tells when a sample passed a router,
+        but does not identify its sender."""
         self._prefix, self._replies = prefix, replies
         self._arrivals: dict[str, deque[Arrival]] = {
             key: deque(maxlen=ARRIVALS)
@@ -69,14 +74,20 @@ class Inbox:
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
         self._slow: deque[Query] = deque()
-        """Those of ROS for parameters, and settings: one takes as long as all others of a step."""
+        """ROS parameter queries and settings. One of them takes as long as all other queries of a
+        step."""
         self._overrun = 0
         self._any = False
-        """Something has come in; set behind it, so that none is overlooked."""
+        """Whether something has arrived. It is set after the item is queued, so that no item is
+        overlooked."""
         self._waker = waker
 
     def take(self, queries: int) -> BusInput:
-        """What came in since the last call, at most so many queries."""
+        """Return the input since the last call, stops first and the other samples by arrival time.
+
+        It holds at most `queries` queries, and one more if all of them are services and a slow
+        query waits.
+        """
         if not self._any:
             return NOTHING
         self._any = False
@@ -88,21 +99,24 @@ class Inbox:
         asked = taken_of(self._services, queries) + taken_of(self._slow, 1)
         asked += taken_of(self._questions, queries - len(asked))
         if self._services or self._slow or self._questions:
-            self._any = True  # those wait for the next step
+            self._any = True  # the rest waits for the next step
         overrun, self._overrun = self._overrun, 0
         return BusInput(tuple(arrivals), tuple(asked), overrun)
 
-    # Zenoh's threads
+    # Zenoh's threads call the methods below.
 
     def on_sample(self, sample: zenoh.Sample) -> None:
-        """A sample on a native key."""
+        """Queue a sample on a native key."""
         key = str(sample.key_expr)
-        # A stop to all robots comes by the key it was sent on.
+        # A stop to all robots arrives under the key that it was sent on.
         key = "stop" if key == STOP_ALL else key.removeprefix(self._prefix)
         self._arrived(sample, key, str(sample.encoding), "native")
 
     def on_ros_sample(self, endpoint: Endpoint, sample: zenoh.Sample) -> None:
-        """A sample on a ROS key, which names its encoding nowhere: it stands for a native one."""
+        """Queue a sample on a ROS key as a sample of the native key that it stands for.
+
+        ROS keys carry no encoding, so the endpoint supplies it.
+        """
         key = str(sample.key_expr)
         native = endpoint.native if key == endpoint.key else key
         self._arrived(sample, native, endpoint.encoding, endpoint.transport)
@@ -137,11 +151,14 @@ class Inbox:
             self._overrun += 1
         held.append(arrival)
         self._any = True
-        if key != IMU:  # which is for the next line that the wheels send
+        if key != IMU:  # a gyro sample waits for the next feedback of the wheels
             self._waker.command()
 
     def _line(self, key: str) -> deque[Arrival]:
-        """The queue of a key. The certificates of one source share one, as they share a limit."""
+        """Return the buffer of a key.
+
+        The certificates of one source share it, as they share a rate limit.
+        """
         held = self._arrivals.get(key)
         if held is None:
             held = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
@@ -153,14 +170,14 @@ class Inbox:
         self._waker.stop()
 
     def on_query(self, topic: str, query: zenoh.Query) -> None:
-        """A query that reached a row of the native table."""
+        """Queue a query that matched a row of the native topic table."""
         asked = str(query.key_expr).removeprefix(self._prefix)
         if asked != topic and (topic in VERBS or topic.startswith(JSON_TREE)):
-            return  # letting go of it ends it; a wildcard reaches the plain key as well
+            return  # dropping the query ends it; a wildcard also matches the plain key
         self._asked(query, topic, asked, "", "native")
 
     def on_ros_query(self, endpoint: Endpoint, query: zenoh.Query) -> None:
-        """A call of a ROS service."""
+        """Queue a call of a ROS service."""
         if str(query.key_expr) == endpoint.key:
             native = endpoint.native
             self._asked(query, native, native, endpoint.key, endpoint.transport)
@@ -175,7 +192,7 @@ class Inbox:
     def _asked(self, query: zenoh.Query, topic: str, asked: str, key: str, via: Via) -> None:
         arrived = clock.now()
         if topic == STOP:
-            # The stop itself never waits in a line with other questions, nor is it turned away.
+            # The stop itself never waits behind other queries and is never refused as busy.
             by = _bytes(query.attachment, ATTACHMENT_BYTES)
             self._stop(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
@@ -205,17 +222,17 @@ class Inbox:
 
 
 def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
-    """A copy, cut where it is too long: one byte too many is enough to refuse it by."""
+    """Copy a payload, cut to `most` + 1 bytes: the extra byte shows that it is too long."""
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 
 def most_of(held: deque[T]) -> int:
-    """No flood that goes on while they are taken out makes them more than it may hold."""
+    """Return the buffer's capacity, so that a flood during `take` cannot make it take for ever."""
     return held.maxlen or len(held)
 
 
 def taken_of(held: deque[T], most: int) -> list[T]:
-    """Take up to `most` out; another thread may be putting in."""
+    """Remove and return up to `most` items. Another thread may be appending meanwhile."""
     taken: list[T] = []
     while held and len(taken) < most:
         taken.append(held.popleft())

@@ -1,6 +1,7 @@
-"""Whether what `bus.connect` names is connected: a thread of its own asks Zenoh, which may block.
+"""Watches whether the endpoints of `bus.connect` are connected.
 
-Zenoh connects again by itself and says nothing of it; nobody would know that a router is missing.
+Zenoh reconnects by itself and does not report it, so nobody would notice a missing router. A thread
+of its own polls Zenoh, because the call may block.
 """
 
 from __future__ import annotations
@@ -15,44 +16,48 @@ from acsard.config.settings import BusConfig
 from acsard.values import RoutersStatus
 
 EVERY_S = 0.5
-"""How often to ask: it takes Zenoh 0.1 ms."""
+"""Seconds between two polls. One poll takes Zenoh 0.1 ms."""
 
 STOP_S = 0.05
 
 
 class Links:
-    """Looks after the links of one session."""
+    """Watcher of the links of one session."""
 
     def __init__(self, bus: BusConfig, inbox: Inbox) -> None:
-        """The inbox is told which routers there are."""
+        """Prepare the watcher. It writes the ids of connected routers to `inbox.routers`."""
         self._bus, self._inbox = bus, inbox
         self._status: RoutersStatus | None = None
         self._news = False
-        """Set behind the status, so that none is overlooked."""
+        """Whether the status has changed. It is set after the status, so that no change is
+        overlooked."""
         self._over = Event()
         self._thread = Thread(target=self._run, name="links", daemon=True)
         self._session: zenoh.Session
 
     def news(self) -> RoutersStatus | None:
-        """What is connected, if that is another than at the last call; never waits."""
+        """Return the status if it has changed since the last call, else None. Never wait."""
         if not self._news:
             return None
         self._news = False
         return self._status
 
     def start(self, session: zenoh.Session) -> None:
-        """Begin to ask: also where we connect to nothing, a router may have connected to us."""
+        """Start polling.
+
+        Poll even without `bus.connect`, because a router may have connected to the daemon.
+        """
         self._session = session
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask no more; whoever looks up a name is not waited for."""
+        """Stop polling. Do not wait for a name lookup that is under way."""
         self._over.set()
         if self._thread.is_alive():
             self._thread.join(STOP_S)
 
     def _run(self) -> None:
-        connects = False  # first it has time to
+        connects = False  # the first poll reports nothing: Zenoh has had no time to connect yet
         while True:
             status = self._look()
             if connects and status != self._status:
@@ -67,7 +72,7 @@ class Links:
             info = self._session.info
             far = {str(link.dst): str(link.zid) for link in info.links()}
             kinds = {str(one.zid): one.whatami for one in info.transports()}
-        except zenoh.ZError:  # it is being closed
+        except zenoh.ZError:  # the session is closing
             return self._status or RoutersStatus()
         routers = (zid for zid, kind in kinds.items() if kind == zenoh.WhatAmI.ROUTER)
         self._inbox.routers = frozenset(routers)
@@ -79,10 +84,11 @@ class Links:
 
 
 def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[str, ...]:
-    """Which endpoints no link leads to, by the far `ends` of the links.
+    """Return the endpoints that no link leads to, given the far `ends` of all links.
 
-    A client has one link only: with that none is missing. Who has dialled us (the door, a bridge, a
-    ROS node) has a port of its own there. Names are looked up, which may block.
+    A client has one link only, so with any link it misses none. A program that connected to the
+    daemon (the TLS gateway, a bridge, a ROS node) has an ephemeral port at its end and matches no
+    endpoint. Host names are resolved, which may block.
     """
     if mode == "client":
         return () if ends else endpoints
@@ -90,7 +96,10 @@ def unreached(mode: str, endpoints: tuple[str, ...], ends: set[str]) -> tuple[st
 
 
 def _leads_there(endpoint: str, ends: set[str]) -> bool:
-    """Zenoh has addresses of its links where the configuration may have names."""
+    """Return whether a link leads to the endpoint.
+
+    Zenoh lists addresses; the endpoint may be a name.
+    """
     bare = endpoint.partition("?")[0].partition("#")[0]
     protocol, _, place = bare.partition("/")
     host, _, port = place.rpartition(":")
@@ -98,7 +107,7 @@ def _leads_there(endpoint: str, ends: set[str]) -> bool:
         return True
     try:
         found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM)
-    except (OSError, ValueError):  # its name is lost, which does not end a link
+    except (OSError, ValueError):  # the name no longer resolves, which does not end a link
         return bool(port) and any(
             end.startswith(f"{protocol}/") and end.endswith(f":{port}") for end in ends
         )

@@ -1,10 +1,10 @@
-"""What goes out: each published topic on every key that somebody listens to.
+"""Publishes each topic on every key that has a listener.
 
-A topic has one outlet in the native tree and one in each ROS tree that has it. A message is
+A topic has one outlet in the native tree and one in each ROS tree that has the topic. A message is
 encoded once per encoding, and not at all for a tree without listeners.
 
-The control loop only leaves messages in slots, the newest of each topic; a thread of its own
-encodes and sends them. A bus that is locked, by whomever, costs messages and never a period.
+The control loop only leaves messages in slots, which keep the newest of each topic. A thread of its
+own encodes and sends them, so a bus that blocks costs messages and never a control period.
 """
 
 from __future__ import annotations
@@ -25,24 +25,25 @@ from acsard.values import NS_PER_S
 
 OPTIONS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
-    # One priority for all puts of the loop: another thread's blocked put on the same priority
-    # would hold them up.
+    # All puts of the loop share one priority: a blocked put of another thread on the same priority
+    # would delay them.
     "priority": zenoh.Priority.REAL_TIME,
 }
 
 HELD = 16
-"""Messages of one topic that wait for the thread, the newest: odometry of 0.16 s, which is longer
-than the machine or a client that joins usually holds it up."""
+"""Newest messages of one topic that wait for the thread. This is odometry of 0.16 s, longer than
+the machine or a joining client usually blocks the thread."""
 
 STUCK_NS = NS_PER_S // 4
-"""A round of puts takes 0.1 ms, a few more on a busy machine; longer, and somebody holds it up."""
+"""A round of puts takes 0.1 ms, a little longer on a busy machine. If it takes longer than this,
+the bus is blocked."""
 
 HEARTBEAT = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5)
-"""As rmw_zenoh has it for what is kept for late comers."""
+"""Heartbeat of latched ROS topics, as rmw_zenoh sets it for samples kept for late subscribers."""
 
 
 def direct(callback: Callable[[Any], None]) -> Any:
-    """Called on the thread that received; by default each callback gets a thread of its own."""
+    """Wrap a callback to run on Zenoh's receiving thread instead of a thread of its own."""
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
@@ -70,20 +71,22 @@ class Outlets:
         self._kept: list[object] = []
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
-        """The topics that somebody listens to."""
+        """The topics that have a listener."""
         self._slots: dict[str, deque[Message]] = {}
         self._bell = Lock()
-        """Held while nothing waits: to release it wakes the thread, at the least cost there is."""
+        """A lock that is held while no message waits. Releasing it wakes the thread, which is the
+        cheapest way to do so."""
         self._bell.acquire()
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0
         self._began_ns: int | None = None
-        """When the round under way began."""
+        """Monotonic time at which the present round began, None between rounds."""
         self._error: BaseException | None = None
         self._thread = Thread(target=self._run, name="outlets", daemon=True)
 
     def _count(self, outlet: _Outlet, wanted: bool) -> None:
-        # By one of Zenoh's threads at a time; replaced whole, for the loop may be reading it.
+        # Zenoh's threads call this one at a time, under the lock. The set is replaced as a whole,
+        # because the control loop may be reading it.
         with self._counting:
             outlet.wanted = wanted
             self.wanted = frozenset(
@@ -92,10 +95,10 @@ class Outlets:
                 if any(one.wanted for one in outlets)
             )
 
-    # the control loop's side: nothing here waits, or calls Zenoh
+    # The control loop calls the methods below. None of them waits or calls Zenoh.
 
     def publish(self, topic: str, message: Message) -> None:
-        """Leave a message for its listeners; `flush` has it sent."""
+        """Queue a message for its listeners. `flush` sends it."""
         slot = self._slots[topic]
         if len(slot) == HELD:
             self._dropped += 1
@@ -103,7 +106,10 @@ class Outlets:
         self._waiting = True
 
     def flush(self) -> None:
-        """Have the thread send what was published; raises what it died of."""
+        """Wake the thread to send the queued messages.
+
+        Raise the error that ended the thread, if any.
+        """
         if self._error is not None:
             raise self._error
         if self._waiting:
@@ -112,30 +118,31 @@ class Outlets:
 
     @property
     def behind(self) -> bool:
-        """There may be something for `losses` to tell."""
+        """Whether `losses` may have something to report."""
         return self._began_ns is not None or self._stuck or self._dropped > 0
 
     def losses(self, now_ns: int) -> tuple[int, bool]:
-        """Messages dropped since the last call, and whether the bus has got stuck meanwhile."""
+        """Return the number of messages dropped since the last call, and if the bus blocked."""
         dropped, self._dropped = self._dropped, 0
         began_ns, was = self._began_ns, self._stuck
         self._stuck = began_ns is not None and now_ns - began_ns > STUCK_NS
         return dropped, self._stuck and not was
 
-    # the thread's side
+    # The thread runs the code below.
 
     def start(self) -> None:
-        """Begin to send; what was published before waits until then."""
+        """Start sending. Messages published earlier wait until then."""
         self._thread.start()
 
     def stop(self, timeout: float) -> None:
-        """Send what waits, and no more; gives up after so many s."""
+        """Send the queued messages and stop. Give up after `timeout` s."""
         self._leaving = True
         self._ring()
         self._thread.join(timeout)
 
     def _ring(self) -> None:
-        if self._bell.locked():  # else it has not yet begun the round it was woken for
+        # If the lock is free, the thread has not started the round that it was woken for.
+        if self._bell.locked():
             self._bell.release()
 
     def _run(self) -> None:
@@ -149,7 +156,7 @@ class Outlets:
                     while slot:
                         self._send(topic, slot.popleft())
                 self._began_ns = None
-        except BaseException as error:  # noqa: BLE001 - raised in the loop: a bug ends the process
+        except BaseException as error:  # noqa: BLE001 - raised again by flush(), so it ends the process
             self._error = error
 
     def _send(self, topic: str, message: Message) -> None:
@@ -172,9 +179,10 @@ class Outlets:
         gid: bytes = b"",
         signed: bytes = b"",
     ) -> None:
-        """Open `key` for a topic; with a `gid` its samples carry rmw_zenoh's attachment.
+        """Open `key` for a topic.
 
-        Without, they carry what they are `signed` with.
+        With a `gid` the samples carry an attachment of rmw_zenoh, else the attachment `signed`, if
+        any.
         """
         if latched:
             publisher: Any = zenoh.ext.declare_advanced_publisher(
@@ -192,12 +200,14 @@ class Outlets:
         outlet = _Outlet(publisher, form, gid, signed)
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:
-            self._count(outlet, wanted=True)  # it is kept for those who are still to come
+            # Its samples are kept for late subscribers, so they are always encoded.
+            self._count(outlet, wanted=True)
             return
 
         def matching(status: zenoh.MatchingStatus) -> None:
             self._count(outlet, status.matching)
 
         self._kept.append(publisher.declare_matching_listener(direct(matching)))
-        if publisher.matching_status.matching:  # else it has been told meanwhile, if it has come
+        # Otherwise the listener above reports the next subscriber.
+        if publisher.matching_status.matching:
             self._count(outlet, True)

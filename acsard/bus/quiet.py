@@ -1,4 +1,7 @@
-"""Pure: why nothing comes on a key, in words; what can be seen, `bus/fleet.py` asks."""
+"""Explains why no sample arrives on a key.
+
+Pure: `fleet.around` looks and this module interprets.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,22 @@ from acsard.config.settings import TLS
 from acsard.messages.topics import JSON_TREE, Topic, key_hint, row_of
 
 MOST = 5
-"""Robots that are named in place of one that is not there."""
+"""Robots that the message names at most when the requested one is not there."""
 
 
 class Around(Struct, frozen=True):
-    """What can be seen from here."""
+    """The result of a look at the bus from this client."""
 
     linked: bool
-    """Somebody is connected at the endpoint."""
+    """Whether the endpoint has a link."""
     here: bool
-    """The robot that is meant is there."""
+    """Whether the requested robot is present."""
     others: tuple[str, ...] = ()
-    """The ids of the others; over TLS they cannot be seen."""
+    """The ids of the other robots. Over TLS they are not visible."""
 
 
 def why(key: str, robot_id: str, endpoint: str, around: Around) -> str:
-    """Why nothing comes on a key below the id of a robot, and what to do about it."""
+    """Return why no sample arrives on a key of a robot, and how to fix it."""
     if not around.linked:
         return (
             f"nobody is connected at {endpoint} any more: the daemon or router there has ended "
@@ -34,7 +37,8 @@ def why(key: str, robot_id: str, endpoint: str, around: Around) -> str:
     if around.here:
         return f"robot {robot_id} is there, but {_silent(key)}"
     if around.others:
-        # All of them are told in the order of their likeness: none is too far from a typing error.
+        # A cutoff of 0.0 lists every robot, the most similar id first, however unlike the typed
+        # one.
         near = get_close_matches(robot_id, around.others, MOST, 0.0)
         more = len(around.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")

@@ -1,8 +1,8 @@
-"""Sends replies from a thread of its own, since a client that is stuck would hold the loop.
+"""Sends replies from a thread of its own, because a stuck client would block the control loop.
 
-What lives here: the Zenoh queries that wait for their replies. Each has a ticket, a number: it is
-issued when the query comes in, replies are sent by it, and when it is retired the query is let go,
-which ends the client's wait.
+This module holds the Zenoh queries that wait for their replies. Each query gets a numbered ticket
+when it arrives, and replies name that ticket. Retiring the ticket drops the query, which ends the
+client's wait.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import zenoh
 from acsard.incoming.queries import Reply
 
 TICKETS = 1024
-"""Queries whose replies are still being sent; more are let go unanswered."""
+"""Queries held at once. Further queries are dropped without an answer."""
 
 
 class Replies:
-    """The queries of one robot that are not answered yet."""
+    """The queries of one robot that are not finished yet."""
 
     def __init__(self, prefix: str) -> None:
         self._prefix = prefix
         self._queries: dict[int, tuple[zenoh.Query, str]] = {}
         self._tickets = count(1)
         self._queue: queue.SimpleQueue[Reply | int | None] = queue.SimpleQueue()
-        """Replies and retired tickets, in order; None ends the thread."""
+        """Replies and retired tickets, in order. None ends the thread."""
 
     def issue(self, query: zenoh.Query, key: str) -> int | None:
-        """A ticket to reply to this query by, or None when too many are out.
+        """Return a ticket for this query, or None if too many are held.
 
-        Replies go out on `key`, or on their own below the prefix when it is "".
+        The replies go out on `key`, or if `key` is "" on the key of each reply below the prefix.
         """
         if len(self._queries) > TICKETS:
             return None
@@ -41,19 +41,19 @@ class Replies:
         return ticket
 
     def send(self, reply: Reply) -> None:
-        """Answer a query."""
+        """Queue a reply to a query."""
         self._queue.put(reply)
 
     def retire(self, ticket: int) -> None:
-        """No more replies by this ticket."""
+        """Queue the end of a query: it gets no more replies."""
         self._queue.put(ticket)
 
     def start(self, session: zenoh.Session) -> None:
-        """Begin to send; what was answered before waits until then."""
+        """Start sending. Replies queued earlier wait until then."""
         threading.Thread(target=self._run, args=(session,), name="replies", daemon=True).start()
 
     def stop(self) -> None:
-        """Send what waits, and no more."""
+        """Send the queued replies and stop."""
         self._queue.put(None)
 
     def _run(self, session: zenoh.Session) -> None:
@@ -70,7 +70,7 @@ class Replies:
             try:
                 self._reply(session, query, key, item)
             except zenoh.ZError:
-                pass  # the client has gone
+                pass  # the client has disconnected
 
     def _reply(self, session: zenoh.Session, query: zenoh.Query, key: str, reply: Reply) -> None:
         if not reply.ok:
@@ -81,6 +81,6 @@ class Replies:
             reply.payload,
             encoding=reply.encoding,
             attachment=reply.attachment or None,
-            # Where a storage answers too, clients keep the newest.
+            # A storage may reply too. The timestamp lets clients keep the newest reply.
             timestamp=session.new_timestamp(),
         )

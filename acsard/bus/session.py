@@ -1,6 +1,7 @@
-"""Zenoh sessions as acsard opens them: the daemon's, the door's, and the tools' clients.
+"""Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
 
-What lives here: the session settings with the reason for each. What must not: keys or messages.
+This module holds the session settings and the reason for each. It knows no keys or messages beyond
+the rate limits.
 """
 
 from __future__ import annotations
@@ -20,15 +21,16 @@ from acsard.host.errors import CertificateError, InUseError, UnreachableError, U
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0
-"""Commands let in per key: enough for a zero 1 ms after a command, too few to cost a period. The
-door lets in as many stops: one that is left out says the same as that of the millisecond before."""
+"""Commands accepted per key and second: enough for a zero 1 ms after a command, too few to cost a
+control period. The TLS gateway accepts as many stops. A stop beyond the limit repeats the one of
+the previous millisecond, so dropping it is safe."""
 
 MAX_SESSIONS = 256
-"""Clients at once, at the machine and at the door each; idle connections of strangers must not
-keep a person out for long."""
+"""Clients at once, on the robot's machine and at the TLS gateway each. Idle connections of
+strangers must not keep an operator out for long."""
 
 MESSAGE_BYTES = 65536
-"""Largest message taken from a link; commands are held to far less in code."""
+"""Largest message that a link accepts, bytes. The code holds commands to a far lower limit."""
 
 
 def daemon_session(
@@ -38,16 +40,23 @@ def daemon_session(
     limited: tuple[str, ...],
     access: dict[str, object],
 ) -> zenoh.Session:
-    """The daemon's session: a peer that listens where it is told, finds nobody by itself.
+    """Open the daemon's session: a peer or client without multicast discovery.
 
-    `limited` are the ROS keys commands come in on, `access` is who may do what. Who comes by TLS
-    comes through the door. Raises `InUseError` when the address is taken. Blocks, as a client until
-    its router is there; call it in a thread.
+    A client over TLS connects to the TLS gateway, not to this session. In client mode this call
+    blocks until the router answers, so call it in a thread.
+
+    Args:
+        sources: names of the listed command sources.
+        limited: ROS keys on which commands arrive.
+        access: the value of Zenoh's `access_control`.
+
+    Raises:
+        InUseError: the session cannot listen, for example because the address is taken.
     """
     settings = _base(bus.mode) | {
         "listen/endpoints": list(bus.plain),
         "connect/endpoints": list(bus.connect),
-        # Peers behind a router find each other by gossip only; without a router there is nobody.
+        # Peers behind a router find each other by gossip only. Without a router no peers exist.
         "scouting/gossip/enabled": bool(bus.connect),
         "timestamping/enabled": True,
         "queries_default_timeout": 3000,
@@ -67,28 +76,32 @@ def door_session(
     limited: tuple[str, ...],
     access: dict[str, object],
 ) -> zenoh.Session:
-    """The door's session: a router between the network, by TLS, and the daemon on this machine."""
+    """Open the TLS gateway's session, a router.
+
+    It connects TLS clients with the daemon on this machine.
+    """
     settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
-    # No DELETE on their key, which is none, may keep a stop out. At the daemon none is limited.
+    # Limit puts only: a flood of DELETEs, which are not stops, must not use up the limit of the
+    # stops. The daemon's own session does not limit stops.
     stops = _at_most("stops", ["put"], [full_key(robot_id, "stop")])
     settings |= _limits(robot_id, sources, limited, access, stops)
     settings |= {
         "listen/endpoints": list(bus.outside),
         "connect/endpoints": [reachable(bus.plain[0])],
         "scouting/gossip/enabled": False,
-        # Who does not stamp must not seem to: the daemon would take the door for the sender.
+        # The gateway must not stamp samples: the daemon would take the gateway for their sender.
         "timestamping/enabled": False,
     }
     return _opened(settings, bus.outside)
 
 
 def reachable(endpoint: str) -> str:
-    """Where somebody on this machine reaches what listens on every address."""
+    """Return the endpoint by which a program on this machine reaches a listen endpoint."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 def no_endpoint(text: str) -> UsageError:
-    """What to raise for it."""
+    """Return the error for a text that is not an endpoint."""
     return UsageError(f'{text} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
 
 
@@ -96,15 +109,15 @@ PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
 
 
 def _listening() -> dict[str, object]:
-    """Strangers who connect and say nothing, or too much."""
+    """Return the limits against strangers who connect and send nothing, or too much."""
     return {
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/unicast/accept_timeout": 1000,
-        # With 32, 300 idle connections keep a person out for 2 s; so many cost 3 MB then.
+        # With 32, 300 idle connections keep an operator out for 2 s. With 512 they cost 3 MB.
         "transport/unicast/accept_pending": 512,
         "transport/unicast/max_sessions": MAX_SESSIONS,
         "transport/link/tx/lease": 2000,
-        # A stopped subscriber must not hold a put: by default each waits 1 ms for room.
+        # A stopped subscriber must not delay a put. By default each put waits 1 ms for room.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
     }
@@ -117,7 +130,7 @@ def _limits(
     access: dict[str, object],
     *more: dict[str, object],
 ) -> dict[str, object]:
-    """Who may do what, and how often."""
+    """Return the access rules and the rate limits as Zenoh settings."""
     limits = [_command_limits(robot_id, sources, limited), *more]
     return {"access_control": access, "downsampling": limits}
 
@@ -134,17 +147,22 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
 
 
 def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
-    """A client of the daemon (or a router) at `endpoint`; a peer behind one would reach no other.
+    """Open a client session to the daemon or router at `endpoint`.
 
-    `tls` is the directory with the certificates for an endpoint like "tls/robot.local:7449".
-    Raises `UsageError` for what is no endpoint, `NotPermittedError` and `CertificateError` for the
-    certificates, and `UnreachableError` when nobody answers there.
+    It is a client because a peer that connects to a router would reach nobody else. `tls` is the
+    directory with the certificates for an endpoint like "tls/robot.local:7449".
+
+    Raises:
+        UsageError: `endpoint` is not an endpoint.
+        NotPermittedError: a certificate file may not be read.
+        CertificateError: a certificate is missing or unusable.
+        UnreachableError: no daemon or router answers there.
     """
     if "/" not in endpoint:
         raise no_endpoint(endpoint)
     settings = _base("client") | {
         "connect/endpoints": [endpoint],
-        # What accepts and then says nothing is no daemon; a person waits for this.
+        # A server that accepts and then sends nothing is not a daemon, and a person waits here.
         "transport/unicast/open_timeout": 3000,
         "timestamping/enabled": True,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
@@ -156,7 +174,8 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
             "that `acsard lan init` or `lan add` made for you"
         )
     if secured:
-        require_usable(tls)  # Zenoh says of them what it says of a daemon that is not there
+        # Zenoh reports unusable certificates as if the daemon were absent.
+        require_usable(tls)
         settings |= _tls(tls)
     try:
         return zenoh.open(_config(settings))
@@ -169,7 +188,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
                 or f"is `acsard run` running, is this its bus.listen, has it room (at most "
                 f"{MAX_SESSIONS} connections)? ({first_line(error)})"
             )
-        ) from None  # its own words are those of its source files
+        ) from None  # Zenoh's message names its own source files
 
 
 def _base(mode: str) -> dict[str, object]:
@@ -177,7 +196,8 @@ def _base(mode: str) -> dict[str, object]:
         "mode": mode,
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
-        # Its parts cannot be set alone. Without it a router that comes back waits seconds for us.
+        # Zenoh takes the retry settings only as a whole. With its defaults the daemon would
+        # reconnect seconds after a router comes back.
         "connect/retry": {
             "period_init_ms": 100,
             "period_max_ms": 500,
@@ -187,7 +207,10 @@ def _base(mode: str) -> dict[str, object]:
 
 
 def _tls(directory: str) -> dict[str, object]:
-    """Both ends show a certificate of the same CA, and a link ends with its certificate."""
+    """Return the TLS settings.
+
+    Both ends present a certificate of one CA, and a link ends when its certificate does.
+    """
     certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
     return {
         "transport/link/tls": {
@@ -205,9 +228,10 @@ def _tls(directory: str) -> dict[str, object]:
 def _command_limits(
     robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
 ) -> dict[str, object]:
-    """A limit per listed source, so that none uses up another's; one more for all unlisted.
+    """Return the rate limits: one per listed source, so that no source uses up another's.
 
-    The certificates of a source share a limit, but each connection has limits of its own.
+    All unlisted sources share one limit. The certificates of a source share its limit, but each
+    connection has limits of its own.
     """
     listed = [*sources, "*"]
     below = [*source_keys(listed), *source_keys(listed, "*"), "imu"]
@@ -232,17 +256,18 @@ def _config(settings: dict[str, object]) -> zenoh.Config:
 
 
 def first_line(error: Exception) -> str:
-    """What a Zenoh error says, without the source paths it carries."""
+    """Return the first line of a Zenoh error without the paths of its source files."""
     text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
     return text[0][:200].strip() if text else type(error).__name__
 
 
 def log_from_environment() -> None:
-    """Zenoh's own log, only when RUST_LOG asks for it: it goes to standard output."""
+    """Start Zenoh's own log if RUST_LOG is set. It goes to standard output."""
     if "RUST_LOG" not in os.environ:
         return
     wish = os.environ.get("NO_COLOR")
-    if not coloured(sys.stdout):  # it looks at this alone, and colours pipes and files
+    # Zenoh looks at NO_COLOR alone and would colour pipes and files too.
+    if not coloured(sys.stdout):
         os.environ["NO_COLOR"] = "1"
     zenoh.try_init_log_from_env()
     if wish is None:

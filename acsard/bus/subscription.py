@@ -1,4 +1,4 @@
-"""What comes on one key, held until it is taken: for those who follow a robot from outside."""
+"""Subscriptions for clients: the samples of a key, queued until the client takes them."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ from acsard.host import clock
 from acsard.values import NS_PER_S
 
 QUEUED = 1000
-"""Samples held for a slow reader; the oldest are dropped beyond that."""
+"""Samples queued for a slow reader. Beyond that the oldest are dropped."""
 
 
 class Arrivals:
-    """What Zenoh's thread hands over, until it is taken: a callback and an event."""
+    """The queue between Zenoh's thread, which fills it, and the waiting reader."""
 
     def __init__(self) -> None:
         self.declared: list[Any] = []
-        """What Zenoh gave for it."""
+        """The Zenoh subscribers that fill this queue."""
         self._held: deque[zenoh.Sample] = deque(maxlen=QUEUED)
         self._event = threading.Event()
         self._wake: Callable[[], object] = self._event.set
         self._closed = False
 
     def take(self, sample: zenoh.Sample) -> None:
-        """One has come."""
+        """Append a sample. Zenoh's thread calls this."""
         self._held.append(sample)
         self._wake()
 
     def close(self) -> None:
-        """No more will come."""
+        """Mark the end: no more samples will arrive."""
         self._closed = True
         self._wake()
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Have this called, on a thread of Zenoh's, when something has come or all has ended."""
+        """Call `wake` on Zenoh's thread whenever a sample arrives or the subscription ends."""
         self._wake = wake
 
     def try_recv(self) -> zenoh.Sample | None:
-        """The next, or None when there is none now; raises `ZError` when none will be."""
+        """Return the next sample, or None if none has arrived; raise `ZError` after the end."""
         try:
             return self._held.popleft()
         except IndexError:
@@ -54,38 +54,41 @@ class Arrivals:
             return None
 
     def wait(self, seconds: float | None) -> None:
-        """Until something has come, all has ended, or so long."""
+        """Wait until a sample arrives, the subscription ends or `seconds` pass."""
         if not self._held and not self._closed:
             self._event.wait(seconds)
         self._event.clear()
 
     def undeclare(self) -> None:
-        """No more of them."""
+        """Undeclare the subscribers."""
         for one in self.declared:
             one.undeclare()
 
 
 class Subscription:
-    """The samples of a key in their order."""
+    """The samples of a key in the order of their arrival."""
 
     def __init__(self, queue: Any, key: str = "") -> None:
-        """With `key` only those on exactly it, not what a stranger put on a wildcard."""
+        """Read from a queue.
+
+        With `key`, skip samples that were put on another key or a wildcard.
+        """
         self._queue, self._key = queue, key
 
     def try_recv(self) -> zenoh.Sample | None:
-        """The next sample, or None when there is none now."""
-        for _ in range(QUEUED):  # no flood holds the caller
+        """Return the next sample, or None if none has arrived."""
+        for _ in range(QUEUED):  # bounded, so that a flood of other samples cannot hold the caller
             sample: zenoh.Sample | None = self._queue.try_recv()
             if sample is None or not self._key or on(self._key, sample):
                 return sample
         return None
 
     def add(self, sample: zenoh.Sample) -> None:
-        """Take one that was asked for as if it had come by itself."""
+        """Append a sample that a query fetched, as if it had been published."""
         self._queue.take(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
-        """What comes, until nothing has for `timeout` s or the session is closed."""
+        """Yield samples until none arrives for `timeout` s or the session closes."""
         quiet_since_ns = clock.mono_ns()
         try:
             while True:
@@ -106,11 +109,11 @@ class Subscription:
             self.undeclare()
 
     async def arriving(self) -> AsyncGenerator[zenoh.Sample, None]:
-        """What comes, until the session is closed."""
+        """Yield samples until the session closes."""
         come, loop = asyncio.Event(), asyncio.get_running_loop()
 
         def wake() -> None:
-            with suppress(RuntimeError):  # the loop has ended
+            with suppress(RuntimeError):  # the event loop has ended
                 loop.call_soon_threadsafe(come.set)
 
         self._queue.wakes(wake)
@@ -129,25 +132,25 @@ class Subscription:
             self.undeclare()
 
     def undeclare(self) -> None:
-        """No more of them."""
+        """Undeclare the subscribers."""
         try:
             self._queue.undeclare()
         except zenoh.ZError:
-            pass  # with its session closed it is no more already
+            pass  # the session is closed, which undeclared them
 
 
 def on(key: str, sample: zenoh.Sample) -> bool:
-    """It came on exactly this key: what a stranger put on a wildcard did not."""
+    """Return whether the sample was put on exactly this key, not on a wildcard that includes it."""
     return str(sample.key_expr) == key
 
 
 def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
-    """Encoding and payload of a sample or answer, as a `Decoder` takes them."""
+    """Return the encoding and the payload of a sample or reply, as a `Decoder` takes them."""
     return str(sample.encoding), sample.payload.to_bytes()
 
 
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
-    """Subscribe; a latched key begins with what is kept of it."""
+    """Subscribe to the keys. With `latched` the kept sample of each key comes first."""
     arrivals = Arrivals()
     handler = zenoh.handlers.Callback(arrivals.take, arrivals.close)
     for key in keys:

@@ -1,7 +1,7 @@
-"""Why a TLS endpoint cannot be reached: looked at step by step, since Zenoh says one thing for all.
+"""Diagnoses why a TLS endpoint cannot be reached, step by step: Zenoh has one error for all causes.
 
-What lives here: a connection tried once more with Python's own TLS, and a sentence for each way it
-ends. What must not: the session itself.
+The module repeats the connection with Python's own TLS and has a message for each way it ends. It
+does not open the Zenoh session.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ import time
 from acsard.bus.certificates import CA, CERTIFICATE, KEY
 
 PATIENCE_S = 2.0
-"""For the other side to take the connection, and to answer in TLS."""
+"""Seconds for the server to accept the connection, and again to answer in TLS."""
 
 REFUSAL_S = 0.5
-"""Who does not want our certificate says so at once; who wants it waits for us."""
+"""A server that rejects our certificate says so at once. One that accepts it waits for data, so
+silence of this many seconds means that it accepts it."""
 
 AWAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)
-"""No machine takes it, so that nothing is known of its ports."""
+"""Errors by which no machine has the address, so that nothing is known about its ports."""
 
 EXPIRED, NOT_YET, WRONG_NAME, WRONG_ADDRESS = 10, 9, 62, 64
-"""OpenSSL's verify codes (X509_V_ERR_...); the others are of an authority that is not ours."""
+"""OpenSSL's verify codes (X509_V_ERR_...). All others mean a certificate of another authority."""
 
 
 def trouble(endpoint: str, directory: str) -> str:
-    """What is wrong with the way to `endpoint` with the certificates in `directory`, and the mend.
+    """Return what prevents a connection to `endpoint` with these certificates, and how to fix it.
 
-    "" when nothing is seen from here. Takes a few seconds at most.
+    Returns "" if this machine finds no fault. Takes a few seconds at most.
     """
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     host = host.strip("[]")
@@ -66,14 +67,14 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     except ssl.SSLError as error:
         return _of_ours(error.reason or str(error), host, directory)
     except TimeoutError:
-        return ""  # it waits for us: the certificates are good at both ends
+        return ""  # the server waits for data, so both certificates are accepted
     except OSError:
         return f"{host} ends the connection at once: is a TLS endpoint of acsard there?"
     return ""
 
 
 def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -> str:
-    """Their certificate is not good to us."""
+    """Return the message for a server certificate that this machine rejects."""
     now = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
     match error.verify_code:
         case code if code == EXPIRED:
@@ -98,7 +99,10 @@ def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -
 
 
 def _of_ours(reason: str, host: str, directory: str) -> str:
-    """Ours is not good to them; `reason` is OpenSSL's name of their alert."""
+    """Return the message for a client certificate that the server rejects.
+
+    `reason` is OpenSSL's name of the server's TLS alert.
+    """
     mine = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (

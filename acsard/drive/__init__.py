@@ -1,1 +1,2 @@
-"""The base's behaviour, pure: kinematics, odometry, command choice, limits and modes."""
+"""Pure package for the motion of the base: kinematics, odometry, choice of command, limits and
+modes."""

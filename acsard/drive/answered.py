@@ -1,7 +1,7 @@
-"""Is there an answer to each line? Of a link that is up, and loses some, nothing else would tell.
+"""Warns if the board leaves lines of an established link unanswered, which nothing else would show.
 
-Told once, until it is well again or the link is lost: a microcontroller that reports by a clock of
-its own, at another rate than ours, is no fault, and looks the same.
+The warning comes once, until the link is sound again or lost. A board that reports by a clock of
+its own at another rate looks the same and is not faulty.
 """
 
 from __future__ import annotations
@@ -9,23 +9,23 @@ from __future__ import annotations
 from acsard.values import Event
 
 WINDOW = 1000
-"""Lines sent that are looked at together: 10 s at 100 Hz."""
+"""Lines sent that are examined together: 10 s at 100 Hz."""
 
 LOST = 0.02
-"""Share of them from which on it is told; a sound link loses none."""
+"""Share of lost answers that causes the warning. A sound link loses none."""
 
 
 class Answered:
-    """Compares the totals of lines sent and of good lines, window by window."""
+    """A comparison of the totals of lines sent and of good lines, window by window."""
 
     def __init__(self, reply_period: float) -> None:
-        """`reply_period` s of an MCU that is known to report by its own clock, else 0."""
+        """Start; `reply_period` is that of a board with a clock of its own, s, else 0."""
         self._own_clock = reply_period > 0.0
         self._since: tuple[int, int] | None = None
         self._told = False
 
     def look(self, sent: int, good: int, linked: bool) -> Event | None:
-        """The totals by now; what there is to tell of them."""
+        """Take the present totals; return the warning, if one is due."""
         if not linked or self._own_clock:
             self._since, self._told = None, False
             return None

@@ -1,9 +1,10 @@
-"""What a line says of how far the wheels rolled since the one before: each second, each count once.
+"""Computes how far the wheels rolled since the last believed line.
 
-By the encoders' own counts where there are such; else by whole counts that the speeds show; else by
-the speeds times the time. What no line reported lies between two speeds; but a silence so long that
-the wheels were told to stand went on as before it no longer than until then. What lines should have
-told that cannot be true is left to the next one that can.
+Each second and each count is used exactly once. The angles come from the encoders' own counts, else
+from whole counts that the speeds show, else from speed times time. A time that no line reported is
+filled half with the speed before it and half with the speed after it. But if the silence was so
+long that the daemon commanded rest, the earlier speed counts only until then. The motion of
+impossible lines is left to the next possible one.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from acsard.mcu.lattice import on
 from acsard.values import Pose, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
-"""s of lines that could not be true, up to which the robot is held to have gone on as it did; or so
-many lines, however far apart they are."""
+"""Impossible lines over which the robot is assumed to have kept its motion: this many seconds of
+them, or this many lines at any distance."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
 
@@ -29,33 +30,35 @@ class Rolled(Struct, frozen=True, gc=False):
     """Wheel angles since the last line that was believed, rad in `WHEELS` order."""
 
     pieces: tuple[Motors, ...]
-    """In the order in which they came about, an arc each; without those that are nothing."""
+    """The angles in the order in which they occurred, one arc each, without empty ones."""
     turned: Motors
-    """By the encoders' counts, which are cumulative: before the `pieces`."""
+    """The angles by the encoders' cumulative counts. They precede the `pieces`."""
     seen: Motors
-    """What this line alone says, as it rolls: no rounding made good, no lines before it."""
+    """The angles in `seconds` by this line's own speeds or counts, without corrections for
+    rounding."""
     seconds: float
-    """in which `seen` came about,"""
+    """Duration of `seen`, s."""
     bridged: float
-    """of it, that no line reported,"""
+    """Part of `seconds` that no line reported, s."""
     unknown: float
-    """besides, in which nobody knows what the robot did,"""
+    """Further time in which the motion of the robot is unknown, s."""
     known: float
-    """and in which all of `pieces` and `turned` came about; 0 where some of the way is unknown."""
+    """Duration of `pieces` and `turned` together, s; 0 if a part of the motion is unknown."""
 
 
 class Rolling:
-    """Remembers the lines that were passed over; `take` the next one that can be true."""
+    """The lines that were passed over, until `take` of the next possible one."""
 
     def __init__(self, quiet: float = math.inf) -> None:
-        """`quiet` s of silence make the link stale, and wheels are told to stand then."""
+        """Start; after `quiet` s of silence the link is stale and the daemon commands rest."""
         self._quiet = quiet
         self._lost = self._gap = self._counted = 0.0
-        """s of the lines passed over: without counts, unreported before them, with counts."""
+        """Seconds of the lines passed over: those without counts, the gaps before them, those with
+        counts."""
         self._turned, self._skipped = NOWHERE, 0
 
     def skip(self, line: Feedback) -> None:
-        """Pass over a line: of counts nothing is lost, else only its time is known."""
+        """Pass over a line. Its counts are kept, and of a line without counts only the time."""
         self._skipped += 1
         if line.turned is None:
             self._lost += line.dt
@@ -65,14 +68,16 @@ class Rolling:
             self._turned = plus(self._turned, line.turned)
 
     def take(self, line: Feedback, before: WheelSpeeds) -> Rolled:
-        """What the next line says; the last one that was believed said `before`."""
+        """Return the angles by the next line; the last believed line had the speeds `before`."""
         speeds, dt, bridged = line.speeds.as_tuple(), line.dt, line.bridged
         if not (self._skipped or bridged or line.gap or line.turned is not None):
-            # Nearly every line without counts of its own: the rest of this, of that line alone.
+            # The short way for nearly every line: the general way below gives the same for this
+            # line alone.
             seen = times(speeds, dt)
             pieces = _some(seen if line.counted is None else line.counted)
             return Rolled(pieces, NOWHERE, seen, dt, 0.0, 0.0, dt)
-        # Of lost lines without counts: it went on at about this speed, or too long to guess.
+        # Lost lines without counts are filled in at about this speed, unless they last too long to
+        # guess.
         guessed = self._lost <= MAX_LOST_S or self._skipped <= MAX_LOST
         lost, unknown = (self._lost, 0.0) if guessed else (0.0, self._lost)
         turned, unknown, known = self._turned, unknown + self._gap, lost + self._counted + dt
@@ -100,36 +105,36 @@ def _some(*pieces: Motors) -> tuple[Motors, ...]:
 
 
 def plus(a: Motors, b: Motors) -> Motors:
-    """Wheel by wheel."""
+    """Return the sum of two sets of wheel angles."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3]
 
 
 def times(a: Motors, factor: float) -> Motors:
-    """Wheel by wheel."""
+    """Return wheel angles or speeds times a factor."""
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
 
 
 class Step(Struct, frozen=True, gc=False):
-    """A line's part of the way."""
+    """The part of the way that one line added."""
 
     pose: Pose
-    """Where it was before."""
+    """The pose before the line."""
     pieces: tuple[Motors, ...]
-    """How its wheels turned from there, rad,"""
+    """How far the wheels turned in it, rad."""
     gyro: Turn | None
-    """by a gyro too,"""
+    """The turn by a gyro, None without one."""
     speeds: WheelSpeeds
-    """and the speeds they said."""
+    """The speeds in the line."""
     turn: float
-    """rad that the heading turned,"""
+    """Change of the heading, rad."""
     on_trial: bool
-    """which a gyro on trial will put right once it is proved."""
+    """Whether a gyro on trial will correct the turn when the gyro is proven."""
     share: float = 1.0
-    """The track that its wheels turned it by, of the configured one."""
+    """The track by which the wheels turned the robot, as a share of the configured one."""
 
 
 def count_of(line: Feedback) -> float:
-    """rad of the coarsest encoder's count, of a line that shows whole ones; 0 if none does."""
+    """Return the angle of the coarsest encoder's count that a line shows, rad, 0 if unknown."""
     rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
     return max([
         step * turned / speed for turned, speed, step in rows

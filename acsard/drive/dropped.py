@@ -1,7 +1,8 @@
-"""Lines that cannot be true: how many of them are too many, and what to do about it.
+"""Warns if many lines are impossible.
 
-One now and then is damage on a plain line, and dropping it is what the check is for. Over one in a
-hundred is worth saying: then either the wire is bad or the bound is, and true lines are lost.
+An impossible line now and then is damage on a plain line, and dropping it is the purpose of the
+check. With more than one in a hundred, either the wire is bad or the bound is, and true lines are
+lost.
 """
 
 from __future__ import annotations
@@ -9,20 +10,20 @@ from __future__ import annotations
 from acsard.values import Event
 
 WINDOW = 1000
-"""Lines that are looked at together: 10 s at 100 Hz."""
+"""Lines that are examined together: 10 s at 100 Hz."""
 
 SHARE = 0.01
-"""Of a window, from which on it is told: once in each."""
+"""Share of a window's lines that causes a warning, once per window."""
 
 
 class Dropped:
-    """Counts what was dropped of each window."""
+    """A count of the dropped lines in each window."""
 
     def __init__(self) -> None:
         self._lines = self._count = 0
 
     def line(self, why: str) -> Event | None:
-        """The next line, with why it was dropped or ""; what there is to tell of it."""
+        """Take the next line, with the reason if it was dropped, else ""; return a due warning."""
         self._lines += 1
         event = None
         if why:

@@ -34,10 +34,10 @@ KEEP_NS = 3600 * NS_PER_S
 """A clock that was silent for this time is forgotten, to save memory."""
 
 EARLY_NS = NS_PER_S // 20
-"""Delays that fall by more than this are no jitter: a backlog pours in, or the clock was set."""
+"""Delays that fall by more than this are not jitter: a backlog pours in, or the clock was set."""
 
 WAVER_NS = NS_PER_S
-"""Delays that rise by more than this are no jitter: the network held commands back."""
+"""Delays that rise by more than this are not jitter: the network held commands back."""
 
 FALLS_NS = NS_PER_S // 50
 """The last of several minima that is lower by more than this still falls."""

@@ -1,10 +1,11 @@
-"""How well a straight line between two known speeds tells what the robot did in between.
+"""Estimates how far the motion in a gap deviates from a straight line between two known speeds.
 
-It is off by s_a t2 / 2 after t s without lines, along and turning, with s_a what the acceleration
-deviates by. The limits bound that, but few drives stay at them. So s_a is measured where there are
-lines: how far the way of every fifth of a second was off the one that its first and its last speed
-would have made. The robot changes its acceleration at any time, so that s_a2 itself grows with t.
-It is never off by more than all of the faster speed: who stood before and after has been nowhere.
+After t s without lines the deviation is s_a t2 / 2, along and turning, where s_a is the standard
+deviation of the acceleration. The limits bound s_a, but few drives stay at them. Therefore s_a is
+measured while lines come: it compares the way in every fifth of a second with the way that the
+first and the last speed would have made. The robot may change its acceleration at any time, so s_a2
+itself grows with t. The deviation never exceeds the way at the faster speed: a robot that stood
+before and after the gap has not moved.
 """
 
 from __future__ import annotations
@@ -12,21 +13,23 @@ from __future__ import annotations
 from acsard.values import REST, Twist
 
 GUESS = Twist(0.125, 0.5)
-"""m/s2 and rad/s2; s_a over `SPAN` before anything is measured: an eighth of the default limits,
-which random driving at them hardly reaches."""
+"""Assumed s_a over `SPAN` before any measurement, m/s2 and rad/s2: an eighth of the default limits,
+which random driving at these limits hardly reaches."""
 
 SPAN = 0.2
-"""s over which the deviation is measured."""
+"""Time over which the deviation is measured, s."""
 
 FIRST, MOST = 4.0, 300.0
-"""Spans that the guess counts for, and that are remembered: a minute of driving."""
+"""Number of spans for which the assumption counts, and number that is remembered: a minute of
+driving."""
 
 GROWTH = 5
-"""The power of time by which the variance grows: 4 of s_a2 t4 / 4, and 1 of s_a2."""
+"""Power of the time with which the variance grows: 4 from s_a2 t4 / 4, and 1 from the growth of
+s_a2."""
 
 
 class Gaps:
-    """Measures s_a while lines come; tells the variances of the way while none did."""
+    """The measured s_a, and the variances of the way in gaps."""
 
     def __init__(self) -> None:
         self._along = (GUESS.linear * SPAN**2 / 2) ** 2
@@ -35,18 +38,18 @@ class Gaps:
         self.interrupt(REST)
 
     def interrupt(self, twist: Twist) -> None:
-        """What comes now begins with `twist`, and is not measured with what came before."""
+        """Start a new span with `twist`, independent of the span before."""
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
         self._bridged, self._given = 0.0, (0.0, 0.0)
 
     def follow(self, twist: Twist, dt: float) -> None:
-        """A line said that the last `dt` s were driven with `twist`."""
+        """Take a line that reports `twist` for the last `dt` s."""
         linear, angular = twist.linear, twist.angular
         self._bridged, self._given = 0.0, (0.0, 0.0)
         self._seconds += dt
         self._distance += linear * dt
         self._turn += angular * dt
-        span = self._seconds - dt  # between the two lines that are taken to be known
+        span = self._seconds - dt  # the time between the two lines whose speeds are taken as known
         if span < SPAN:
             return
         first = self._first
@@ -60,9 +63,9 @@ class Gaps:
         self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
 
     def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """m2 along and rad2 for more of one gap, `seconds` long, that a line was drawn across.
+        """Return the variances, m2 along and rad2, that `seconds` more of a filled gap add.
 
-        A gap may come in pieces, one behind the other: it counts as a whole.
+        A gap may come in several consecutive pieces. They count as one gap.
         """
         bridged, given = self._bridged + seconds, self._given
         along, yaw = self.unseen(bridged, before, after)
@@ -71,7 +74,7 @@ class Gaps:
         return max(0.0, along - given[0]), max(0.0, yaw - given[1])
 
     def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
-        """m2 along and rad2 by which `seconds` between two known twists may deviate."""
+        """Return the variances of `seconds` between two known twists, m2 along and rad2."""
         scale = (seconds / SPAN) ** GROWTH
         fastest = max(abs(before.linear), abs(after.linear)) * seconds
         turning = max(abs(before.angular), abs(after.angular)) * seconds

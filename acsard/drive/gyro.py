@@ -1,14 +1,16 @@
-"""The heading from a gyro, where there is one: the distance stays the wheels'.
+"""Takes the heading from a gyro, if there is one. The distance remains that of the wheels.
 
-Gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from gyros and
-odometry in mobile robots, 1996): a gyro knows nothing of skidding wheels, wheels nothing of its
-bias. The bias is what it says at rest (`gyro_bias.py`), its delay and the track it implies come
-from comparing both (`gyro_match.py`). Until both have agreed in a turn the wheels tell every way,
-which is made up for then: a gyro that says the opposite, degrees or nothing is named and not used
-(`gyro_trial.py`). Silent, or out of all proportion to the wheels, it leaves them alone.
+The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
+gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
+does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison
+with the wheels gives its delay and the effective track (`gyro_match.py`).
 
-What has been handed out is remembered and not the time: whatever came late or was held over for a
-moment is in the next line's turn, and no error of that kind adds up.
+Until both have agreed in a turn, the heading is that of the wheels, and it is corrected afterwards.
+A gyro that reads the opposite, degrees or nothing is reported and not used (`gyro_trial.py`). If a
+gyro is silent or out of all proportion to the wheels, the heading is that of the wheels.
+
+The module remembers the angle that it has returned, not the time. A sample that comes late, or is
+held back for a moment, is part of the next line's turn, so such errors do not add up.
 """
 
 from __future__ import annotations
@@ -27,31 +29,32 @@ from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
 
 REST_S = 0.2
-"""s of four zeros until the robot stands."""
+"""Seconds of four zero speeds after which the robot stands."""
 
 SILENT_NS = NS_PER_S // 5
-"""A gyro of which nothing came for so long is silent; until then it turns on as it did."""
+"""Age of the last sample at which the gyro is silent, ns. Until then its last rate continues."""
 
 LATEST_NS = NS_PER_S // 4
-"""A stamp that says more is of a clock that was set."""
+"""Delay of a stamp above which the sender's clock was set, ns."""
 
 DRIFT = 0.01
-"""By which share the gyro's clock may go apart from ours."""
+"""Relative drift between the gyro's clock and ours that is allowed."""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
-"""How much earlier or later than the wheels a gyro may tell."""
+"""Least and greatest delay of the gyro against the wheels, ns."""
 
 LEAST_DELAY_S = 0.002
-"""Less is not worth moving it for."""
+"""Smallest correction of the delay that is applied, s."""
 
 SLIP_S = 0.5
-"""s after the last contradiction for which it slips on."""
+"""Seconds after the last contradiction for which the wheels still count as slipping."""
 
 MOST_SLIP_S = 5.0
-"""s that wheels slip in one go; a gyro that contradicts them for longer is stuck, or no gyro."""
+"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is stuck, or no
+gyro."""
 
 ENOUGH_BLOCKS = 20.0
-"""Blocks of turning after which the proportion is believed."""
+"""Blocks of turning after which the ratio to the wheels is believed."""
 
 WORDS: dict[GyroDoes, str] = {
     "off": "",
@@ -68,24 +71,26 @@ WORDS: dict[GyroDoes, str] = {
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """By how much the robot turned since the line before: rad, and its variance, rad2.
+    """The turn of the robot since the line before: rad, and its variance, rad2.
 
-    How far the gyro's scale is off is no part of that: it does not average out (`uncertainty.py`).
+    The variance does not include the error of the gyro's scale, which does not average out
+    (`uncertainty.py`).
     """
 
     angle: float
     variance: float
     rate: float
-    """rad/s, what it says now, and its variance: the angle may hold what came late."""
+    """The present turn rate by the gyro, rad/s. The angle may include late samples, so it is not dt
+    times this rate."""
     rate_variance: float
     wheels: float | None = None
-    """rad the wheels would tell for this turn, skidding as they do."""
+    """The angle that the wheels would report for this turn, including their skid, rad."""
     slips: bool = False
-    """The wheels do: they told another turn of late."""
+    """Whether the wheels slip: lately they reported another turn than the gyro."""
 
 
 class Heading(Protocol):
-    """Who tells by how much the robot turned, beside its wheels: a `Gyro`."""
+    """A source of the robot's turn besides its wheels: a `Gyro`."""
 
     owes: bool
 
@@ -95,70 +100,72 @@ class Heading(Protocol):
 
 
 class Gyro:
-    """One gyro beside the wheels: `hear` its samples, then ask each line's `turn`."""
+    """One gyro. The caller passes its samples to `hear` and calls `turn` for each line."""
 
     def __init__(self) -> None:
         self._rest_s = self._since_rest_s = 0.0
         self._learned: Track | None = None
-        """What the gyro before this one taught."""
+        """The track that the gyro before this one taught."""
         self.owes = False
-        """The wheels told the turn of the last line, until the trial ends."""
+        """Whether the turn of the last line came from the wheels and the gyro corrects it after its
+        trial."""
         self._does: GyroDoes = "silent"
         self.events: list[Event] = []
-        """What the last `turn` found worth a log line."""
+        """Events of the last `turn`, for the log."""
         self._begin()
 
     def _begin(self) -> None:
-        """Of this gyro nothing is known, neither bias nor delay nor which way it turns."""
+        """Start with an unknown gyro, of which neither bias nor delay nor direction is known."""
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
-        """Samples of times that no line has reached yet."""
+        """Samples later than the last line."""
         self._promptest = Promptest(DRIFT)
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
-        """The time of the last sample that was taken."""
+        """Time of the last sample that was taken."""
         self._rate = 0.0
         self._angle = self._given = 0.0
-        """rad turned by all samples taken, and what of it was handed out."""
+        """Angle turned by all samples taken, and the part of it that was returned, rad."""
         self._variance = 0.0
-        """rad2 of what was not handed out yet."""
+        """Variance of the angle that was not returned yet, rad2."""
         self._slip_s = self._slipped_s = 0.0
         self._noise = 0.0
         """Variance of the last sample."""
         self._hole = False
-        """Since the last line, or in it, some of the turn was not heard."""
+        """Whether a part of the turn since the last line, or in it, was not received."""
         self.forgive()
 
     @property
     def status(self) -> GyroStatus:
-        """What it does now."""
+        """The present state of the gyro."""
         known, learned = self._bias.value if self._bias.known else None, self.learned
         track, deviation = (None, 0.0) if learned is None else (learned.share, learned.deviation)
         return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track, deviation)
 
     @property
     def learned(self) -> Track | None:
-        """The effective track it implies; None until it has turned with the wheels for a while."""
+        """The effective track by the gyro, None until the robot has turned for a while."""
         match = self._match
         if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
             return self._learned
         return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
 
     def hear(self, samples: tuple[GyroSample, ...]) -> None:
-        """What came since the last step, in order."""
+        """Take the samples since the last step, in order."""
         for sample in samples:
             if sample.anew:
-                self._learned = self.learned  # the wheels' and the floor's, whoever told it
+                # The track belongs to the wheels and the floor, whichever gyro measured it.
+                self._learned = self.learned
                 self._begin()
             self._hole |= len(self._heard) == self._heard.maxlen
             self._heard.append((self._time_of(sample), sample))
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
-        """What it turned until a line of the time `at_ns`; None when only the wheels can tell.
+        """Return the turn until a line of the time `at_ns`, or None if the wheels must provide it.
 
-        `wheels` rad over `dt` s is what they say; `still` that all four stood. After a gap `dt` is
-        0 and the turn is all that came about in it.
+        `wheels` is the turn by the wheels in rad over `dt` s. `still` means that all four wheels
+        stood. After a gap `dt` is 0, and the turn is that of the whole gap.
         """
         self.events, self.owes = [], False
         self._rest_s = self._rest_s + dt if still else 0.0
@@ -169,10 +176,12 @@ class Gyro:
         held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
         angle, variance = self._angle + held - self._given, self._variance
         self._given, self._variance = self._angle + held, 0.0
-        # What is heard of a silence only after it the wheels have told: the line after is theirs.
+        # The wheels have provided the turn of a silence, and the samples that end it cover that
+        # turn again. So the turn of the line after a silence comes from the wheels too.
         lost, self._hole = silent or self._hole, silent
         self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
-        variance += 2.0 * self._bias.variance * self._since_rest_s * dt  # it does not average out
+        # The error of the bias does not average out.
+        variance += 2.0 * self._bias.variance * self._since_rest_s * dt
         tried = False if lost else self._try(wheels, angle, variance, dt, resting)
         if not lost and self._bias.known and dt > 0.0 and not self._trial.open:
             self._compare(wheels, angle, dt)
@@ -189,24 +198,28 @@ class Gyro:
         return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
 
     def forgive(self) -> None:
-        """Owe nothing: the pose was set, and what it was before is of no account."""
+        """Drop the owed correction, because the pose was set."""
         self._owed = self._owed_variance = 0.0
-        """rad by which it told more than the wheels while it was on trial: owed if it is proved."""
+        """Excess of the gyro's turn over the wheels' during the trial, rad, owed to the pose if the
+        gyro is proven; and its variance."""
 
     def taken_back(self, turn: float) -> float:
-        """Of lines that it `owes`, the wheels' turn has become another one, by so many rad.
+        """Note that the wheels' turn of lines that this gyro `owes` has changed by `turn` rad.
 
-        Returns the rad of that which it had put right before.
+        Return the part of this change that the gyro has already corrected.
         """
         verdict = self._trial.verdict
         if verdict == "none yet":
             self._owed -= turn
         return turn if verdict == "good" else 0.0
 
-    # samples
+    # Samples.
 
     def _time_of(self, sample: GyroSample) -> int:
-        """When it was measured, by our clock and but for a constant: stamps come without jitter."""
+        """Return when a sample was measured, by our clock and up to a constant.
+
+        Its stamp has no jitter.
+        """
         last, self._last = self._last, sample
         if last is None or sample.stamp_ns is None or last.stamp_ns is None:
             return sample.at_ns
@@ -217,7 +230,7 @@ class Gyro:
         return sample.at_ns - max(0, int(late))
 
     def _take(self, until_ns: int, resting: bool) -> None:
-        """Add up the samples of times until then; at rest they tell the bias."""
+        """Add up the samples until a time. At rest they update the bias instead."""
         bias, heard = self._bias, self._heard
         until_ns += self._delay_ns
         while heard and heard[0][0] <= until_ns:
@@ -236,12 +249,14 @@ class Gyro:
             if not stands:
                 self._variance += self._noise * span * span
 
-    # beside the wheels
+    # Comparison with the wheels.
 
     def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
-        """Until a turn has proved it: whether this line is one that the wheels tell.
+        """Test a gyro that is not proven yet.
 
-        That is every one but at rest, where they would not see that somebody turns the robot.
+        Return whether this line's turn comes from the wheels.
+
+        It does, except at rest, where the wheels would not notice that a person turns the robot.
         """
         trial, known = self._trial, self._bias.known
         if not trial.open or resting:
@@ -268,7 +283,7 @@ class Gyro:
         self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
 
     def _shift(self) -> None:
-        """At rest, where it moves nothing, put the gyro's time right."""
+        """Correct the gyro's delay. This happens at rest, where it moves nothing."""
         delay = self._match.delay()
         if delay is not None and abs(delay) >= LEAST_DELAY_S:
             earliest, latest = DELAYS_NS

@@ -1,7 +1,7 @@
-"""What a gyro says while the robot stands: its bias, learned at every rest (zero-velocity update).
+"""Learns a gyro's bias, its reading while the robot stands, at every rest (zero-velocity update).
 
-The bias walks on between two rests, so that a later rest counts for more the longer ago the last
-one is: the scalar Kalman filter of a random walk. The first estimate is the plain mean.
+The bias drifts between two rests, so a rest counts for more if the one before was long ago: this is
+the scalar Kalman filter of a random walk. The first estimate is the plain mean.
 """
 
 from __future__ import annotations
@@ -9,33 +9,33 @@ from __future__ import annotations
 import math
 
 KNOWN_S = 0.5
-"""s of rest that the bias takes to be known at all."""
+"""Seconds of rest before the bias is known."""
 
 MAX_BIAS = 0.2
-"""rad/s; more than any gyro that is worth its wires has, so the robot is being turned."""
+"""Greatest plausible bias, rad/s. A higher rate means that a person turns the robot."""
 
 WALK = 1e-4
-"""rad/s per square root of a s, by which the bias of a cheap gyro walks (with temperature)."""
+"""Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""Standard deviations from the bias at which a sample is no noise."""
+"""Standard deviations from the bias beyond which a sample is not noise."""
 
 SLACK = 0.01
-"""rad/s beside them, for what shakes a robot that stands."""
+"""rad/s that are allowed in addition, for vibration of a robot that stands."""
 
 LEAST_NOISE = 1e-5
-"""rad/s; a gyro that says the same again and again is coarse and not without noise."""
+"""Least noise, rad/s. A gyro that repeats one value is coarse, not free of noise."""
 
 ANEW_S = 1.0
-"""s of rest in which all says the same other bias, after which it is that: a gyro that was started
-again or grew warm, or one that was turned when it was first listened to."""
+"""Seconds of rest with one other bias after which that one is taken. The gyro was restarted or grew
+warm, or the robot was turned while the first bias was learned."""
 
 LEARNING = 0.02
-"""Share of a new sample in the estimate of the noise: the last fifty count."""
+"""Weight of a new sample in the estimate of the noise: about the last fifty count."""
 
 
 class Bias:
-    """The bias, how certain it is, and the noise of a sample; rad/s."""
+    """The bias, its variance, and the noise of a sample; in rad/s and rad2/s2."""
 
     def __init__(self) -> None:
         self.value = 0.0
@@ -44,22 +44,21 @@ class Bias:
         """Variance of one sample."""
         self._rested_s, self._samples = 0.0, 0
         self._other: Bias | None = None
-        """What the samples say that contradict it, one after the other."""
+        """A second estimate, from consecutive samples that contradict this one."""
 
     @property
     def known(self) -> bool:
-        """The robot has stood for long enough."""
+        """Whether the robot has stood long enough."""
         return self._rested_s >= KNOWN_S
 
     def drift(self, dt: float) -> None:
-        """`dt` s have passed, at rest or not."""
+        """Let `dt` s pass, at rest or not."""
         self.variance += WALK * WALK * dt
 
     def rest(self, rate: float, variance: float, dt: float) -> bool:
-        """A sample while the wheels stand; False, and nothing learned, for one that says a turn.
+        """Learn from a sample while the wheels stand; return False if it shows a turn instead.
 
-        `variance` is what the gyro claims for it, 0 where it claims nothing; `dt` s is its share of
-        the rest.
+        `variance` is the gyro's own claim, 0 without one. `dt` s is the sample's share of the rest.
         """
         if not self.known:
             return self._average(rate, variance, dt)
@@ -72,12 +71,15 @@ class Bias:
         gain = self.variance / (self.variance + noise)
         self.value += gain * error
         self.variance *= 1.0 - gain
-        # What of the error the bias explains is no noise.
+        # The part of the error that the bias explains is not noise.
         self.noise += LEARNING * ((1.0 - gain) * error * error - self.noise)
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """A turn of a robot whose wheels stand, or another bias: a turn does not stay the same."""
+        """Return whether a contradicting sample belongs to another bias instead of a turn.
+
+        Another bias is one that stays constant. It then replaces this one.
+        """
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
             return False
@@ -88,7 +90,7 @@ class Bias:
         return True
 
     def _average(self, rate: float, variance: float, dt: float) -> bool:
-        """The mean of the first samples, and their spread (Welford)."""
+        """Update the mean of the first samples and their variance (Welford)."""
         if abs(rate) > MAX_BIAS:
             return False
         self._rested_s += dt

@@ -1,9 +1,9 @@
-"""Gyro and wheels compared: how far the robot turns per turn of its wheels, and when that is told.
+"""Compares a gyro with the wheels: the ratio of their turns, and the gyro's delay.
 
-With w(t) the wheels' turn rate and g(t) the gyro's, g(t) = a w(t - T): a is the configured
-effective track over the true one, T how late the gyro tells. For small T that is
-g = a w - a T dw/dt, whose coefficients least squares finds from means over a tenth of a second;
-what it forgets, it forgets while the robot turns. T is where the two rates correlate best.
+Let w(t) be the turn rate by the wheels and g(t) that by the gyro. Then g(t) = a w(t - T), where a
+is the configured effective track over the true one and T is the gyro's delay. For small T that is g
+= a w - a T dw/dt. Least squares finds its coefficients from means over a tenth of a second. It
+forgets old data only while the robot turns.
 """
 
 from __future__ import annotations
@@ -12,80 +12,86 @@ import math
 from collections import deque
 
 BLOCK_S = 0.1
-"""s over which rates are compared: encoder counts are coarse over a line."""
+"""Time over which rates are compared, s. Over a single line encoder counts are coarse."""
 
 LEAST_RATE = 0.05
-"""rad/s; slower blocks tell nothing of the ratio."""
+"""Least turn rate of a block, rad/s, for it to show the ratio."""
 
 LEAST_CHANGE = 0.3
-"""rad/s2; without it a block tells nothing of the delay."""
+"""Least change of the rate, rad/s2, for a block to show the delay."""
 
 MEMORY = 0.995
-"""What is left of a block after the next: the last 20 s of turning count."""
+"""Factor by which the weight of a block falls with each new one: the last 20 s of turning count."""
 
 ROUGH, FINE = 0.5, 0.1
-"""Deviation of the ratio before anything is known, and at best: it differs with floor and rate."""
+"""Standard deviation of the ratio before any data, and at best: it depends on floor and rate."""
 
 STRETCH = 1.0
-"""rad to one side over which is seen how far the ratio is off: a moment's lag is little of it."""
+"""Turn to one side over which the error of the ratio is measured, rad. It is long compared with a
+moment's lag."""
 
 KEPT, PRIOR = 0.9, 0.1
-"""What is left of a stretch after the next, and the stretches that what is assumed counts for."""
+"""Factor by which the weight of a stretch falls with each new one; weight of the initial
+assumption."""
 
 DELAY_S = 0.2
-"""Deviation of the delay before anything is known."""
+"""Standard deviation of the delay before any data, s."""
 
 NO_DELAY = 0.0, 0.0, 1.0 / DELAY_S**2
-"""What the sums are when nothing is known of it."""
+"""The sums of the delay before any data."""
 
 BLOCK_NOISE, BLOCK_SHARE = 0.01, 0.03
-"""Deviation of a block's mean: rad/s, and share of it."""
+"""Standard deviation of a block's mean: in rad/s, and as a share of the rate."""
 
 LAG_S = 0.05
-"""s of delay that are no contradiction while the delay is not known."""
+"""Delay that is not a contradiction while the delay is unknown, s."""
 
 CERTAIN_S = 0.004
-"""A delay is told when its deviation is below this."""
+"""Standard deviation of the delay below which it is reported, s."""
 
 WINDOW_S = 0.2
-"""s over which both must contradict each other."""
+"""Time over which both must contradict each other, s."""
 
 LEAST_SLIP = 0.015
-"""rad in that time that are never a contradiction: encoder counts, a shake."""
+"""Difference over that time that is never a contradiction, rad: encoder counts, a shake."""
 
 CERTAIN = 3.0
-"""Deviations from which on it is one."""
+"""Standard deviations beyond which the difference is a contradiction."""
 
 
 class Match:
-    """Takes each line's turn by wheels and by gyro."""
+    """The comparison, from each line's turn by wheels and by gyro."""
 
     def __init__(self) -> None:
         self._ww, self._wg = 1.0 / ROUGH**2, 1.0 / ROUGH**2
-        """The prior: the ratio is 1, by and large."""
+        """The prior: the ratio is roughly 1."""
         self._wd, self._dg, self._dd = NO_DELAY
         self._off = self._way = 0.0
-        """rad of this stretch that the ratio did not foresee, and that the wheels say,"""
+        """For this stretch: the part of the turn that the ratio did not predict, and the turn, both
+        in rad."""
         self._ways = PRIOR * STRETCH**2
         self._offs = ROUGH**2 * self._ways
-        """and the squares of both, of the stretches before."""
+        """The sums of the squares of both over the stretches before."""
         self._lag = LAG_S
         self.blocks = 0.0
-        """How many blocks of turning are remembered."""
+        """Number of blocks of turning that are remembered."""
         self._solve()
         self._wheels = self._gyro = self._time = 0.0
         self._rate = self._began = 0.0
-        """The wheels' rate now, and when the block began."""
+        """The present rate by the wheels, and that at the start of the block."""
         self._window: deque[tuple[float, float, float]] = deque()
         self._sums = [0.0, 0.0, 0.0]
 
     @property
     def spread(self) -> float:
-        """By how much the ratio is another one from stretch to stretch, as a standard deviation."""
+        """Standard deviation of the ratio between stretches."""
         return math.sqrt(self._offs / self._ways)
 
     def delay(self) -> float | None:
-        """s by which the gyro is later than assumed, once that is certain; then it is assumed."""
+        """Return by how many s the gyro is later than assumed, None while that is uncertain.
+
+        After a result the new delay is assumed.
+        """
         ratio, slope = self.ratio, self._slope
         spread = self._dd - self._wd * self._wd / self._ww
         if ratio < ROUGH / 2 or spread * (CERTAIN_S * ratio) ** 2 < 1.0:
@@ -96,10 +102,13 @@ class Match:
         return -slope / ratio
 
     def add(self, wheels: float, gyro: float, dt: float, slips: bool) -> None:
-        """A line: what both say it turned, rad, over its `dt` s; of a slip nothing is learned."""
+        """Take a line: the turns by wheels and gyro, rad, in its `dt` s.
+
+        Do not learn from a slip.
+        """
         self._slide(wheels, gyro, dt)
         rate = wheels / dt
-        # The mean of two lines, since a count more or less is a step.
+        # Take the mean of two lines, because a count more or less is a step.
         smooth, self._rate = (rate + self._rate) / 2, rate
         self._wheels += wheels
         self._gyro += gyro
@@ -111,7 +120,10 @@ class Match:
             self._began = smooth
 
     def contradiction(self, variance: float) -> bool:
-        """The gyro, with this variance in rad2 over the window, denies what the wheels say."""
+        """Return whether the gyro contradicts the wheels.
+
+        `variance` is that of the gyro's turn over the window, rad2.
+        """
         wheels, gyro, time = self._sums
         if time < WINDOW_S * 0.95:
             return False
@@ -154,10 +166,10 @@ class Match:
         self._solve()
 
     def _solve(self) -> None:
-        """The coefficients of w and dw/dt, which stay the same until a block says more."""
+        """Solve for the coefficients of w and dw/dt."""
         det = self._ww * self._dd - self._wd * self._wd
         self.ratio = (self._wg * self._dd - self._dg * self._wd) / det
-        """rad the robot turns per rad its wheels say."""
+        """The robot's turn by the gyro per turn by the wheels."""
         self._slope = (self._dg * self._ww - self._wg * self._wd) / det
         self.deviation = max(FINE, ROUGH / math.sqrt(1.0 + self.blocks))
-        """How certain the ratio is."""
+        """Standard deviation of the ratio."""

@@ -1,9 +1,9 @@
-"""Is this a gyro, and does it say rad/s about an axis that points up? The first turn tells.
+"""Tests in the first turn whether a gyro measures rad/s about an axis that points up.
 
-A gyro that is mounted upside down, counts in degrees or is not read at all says another turn than
-the wheels do, and so does a gyro beside wheels that slip. Which of them is wrong is told by which
-has been right before: one that has never agreed with the wheels in a turn is no gyro yet. Wheels
-that skid turn the robot by less than they roll, so that they agree within wide bounds.
+A gyro that is mounted upside down, reads degrees or is disconnected reports another turn than the
+wheels. So does a sound gyro if the wheels slip. Which of the two is wrong depends on the past: a
+gyro that has never agreed with the wheels in a turn is not believed yet. Skidding wheels turn the
+robot by less than they roll, so the two need to agree only within wide bounds.
 """
 
 from __future__ import annotations
@@ -11,48 +11,54 @@ from __future__ import annotations
 from typing import Literal
 
 LEAST_RATE = 0.1
-"""rad/s by the wheels, from which on a line to the other side is another turn, and no count more or
-less."""
+"""Turn rate by the wheels, rad/s. A line at this rate or above to the other side is a new turn, not
+a difference of one count."""
 
 SLOWEST, STRETCH_S = 0.05, 0.5
-"""rad/s by the wheels, in the mean over so many s; slower is no turn: of unequal tyres the wheels
-say one on a straight, beside which below `LEAST_RATE` no gyro is dead that says nothing."""
+"""Mean turn rate by the wheels, rad/s, over this many s; a slower motion is not a turn. With
+unequal tyres the wheels report a turn on a straight, so below `LEAST_RATE` a gyro that reads
+nothing is not called dead."""
 
 PROPORTIONS = (0.25, 2.5)
-"""Between these a robot turns per turn of its wheels, whatever it skids."""
+"""Range of the robot's turn per turn by the wheels, at any skid."""
 
 PROVED, REFUTED = 0.1, 0.4
-"""rad in one direction by the wheels in which a gyro proves itself, or does not: it may be late."""
+"""Turn to one side by the wheels, rad, in which a gyro is proven or refuted. Refuting takes more,
+because the gyro may be late."""
 
 REFUTED_S = 0.3
-"""s of turning before it is refuted: no gyro is as late as that."""
+"""Seconds of turning before a gyro is refuted. No gyro is as late as that."""
 
 DEGREES = (15.0, 150.0)
-"""57.3 as wide as the proportions."""
+"""The range for a gyro that reads degrees: as wide a range around 57.3."""
 
 Verdict = Literal["none yet", "good", "reversed", "in degrees", "dead", "not believed"]
 
 
 class Trial:
-    """Takes both turns line by line until the gyro is proved; one that is refuted may be later."""
+    """The trial of a gyro, line by line until it is proven.
+
+    A refuted gyro may still be proven later.
+    """
 
     def __init__(self) -> None:
         self.verdict: Verdict = "none yet"
         self._wheels = self._gyro = self._seconds = 0.0
         self._stretch = self._stretch_s = self._stretch_gyro = 0.0
-        """rad by the wheels, s, and rad by the gyro of this stretch;"""
+        """Turn by the wheels, duration and turn by the gyro in the present stretch: rad, s, rad."""
         self._fast = self._fast_gyro = 0.0
-        """rad by both of those that were fast enough for a gyro to be dead."""
+        """Turns by wheels and gyro over the stretches that were fast enough to call a gyro dead,
+        rad."""
 
     @property
     def open(self) -> bool:
-        """It has not proved itself."""
+        """Whether the gyro is not proven yet."""
         return self.verdict != "good"
 
     def add(self, wheels: float, gyro: float, dt: float, certain: bool = True) -> None:
-        """A line: rad that wheels and gyro say it turned in its `dt` s.
+        """Take a line: the turns by wheels and gyro, rad, in its `dt` s.
 
-        Without a certain bias it is only seen that it tells degrees.
+        Without a certain bias the only possible verdict is "in degrees".
         """
         self._stretch += wheels
         self._stretch_gyro += gyro
@@ -65,7 +71,7 @@ class Trial:
                 self._fast_gyro += self._stretch_gyro
             self._stretch = self._stretch_s = self._stretch_gyro = 0.0
         if wheels * self._wheels < 0.0 and abs(wheels) >= LEAST_RATE * dt:
-            # Of a turn to the other side a late gyro still tells the one before.
+            # In a turn to the other side a late gyro still reports the turn before.
             self._begin()
             return
         self._wheels += wheels
@@ -83,7 +89,7 @@ class Trial:
         self._wheels = self._gyro = self._seconds = self._fast = self._fast_gyro = 0.0
 
     def _says_nothing(self) -> bool:
-        """In turns that are no straight of unequal tyres, this one among them."""
+        """Return whether the gyro reads nothing in turns that are too fast for a straight."""
         fast, gyro = self._fast, self._fast_gyro
         if abs(self._stretch) >= LEAST_RATE * self._stretch_s:
             fast, gyro = fast + self._stretch, gyro + self._stretch_gyro
@@ -99,7 +105,7 @@ class Trial:
 
 
 def _named(ratio: float) -> Verdict:
-    """What is wrong with a gyro that says so much per turn of the wheels."""
+    """Return the fault of a gyro that has this ratio to the wheels."""
     least, most = PROPORTIONS
     if DEGREES[0] <= abs(ratio) <= DEGREES[1]:
         return "in degrees"

@@ -1,9 +1,9 @@
-"""Which effective track the wheels turn the robot by: the configured one, or what a gyro taught.
+"""Chooses the effective track by which the wheels turn the robot: configured, or learned by a gyro.
 
-While a gyro tells the heading, each turn teaches how far the robot turns per turn of its wheels
-(`gyro_match.py`). Where the wheels are alone again, that is worth more than a track nobody measured
-on this floor. It is used where `[odometry] learned_track` asks for it, once it is known, and within
-bounds. Only turns to come are others by it: the pose does not jump.
+While a gyro tells the heading, each turn shows how far the robot turns per turn of its wheels
+(`gyro_match.py`). When the wheels are alone again, this track is better than one that nobody
+measured on this floor. It is used if `[odometry] learned_track` asks for it, once it is known and
+if it lies within bounds. It affects only later turns, so the pose does not jump.
 """
 
 from __future__ import annotations
@@ -13,19 +13,21 @@ from msgspec import Struct
 from acsard.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
-"""Standard deviation at best, as a share: the next floor is another one, and so is the next rate.
-That is half of `gyro_match.FINE`, how far a single moment of it may be off: a way has many."""
+"""Least relative standard deviation, because the next floor and the next rate differ. It is half of
+`gyro_match.FINE`, the error of a single moment, because a way has many moments."""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Standard deviations, as shares: it is known from the first on, and no more beyond the second."""
+"""Relative standard deviations: the track is known below the first one, and no longer known above
+the second."""
 
 BOUNDS = (0.5, 2.5)
-"""Shares of the configured track. Robots skid by 1.4 to 1.9 on most floors, by 2.5 on slippery ones
-(drive.wheel_separation alone); beyond, either of the two is wrong."""
+"""Range of the learned track as a share of the configured one. Robots skid by 1.4 to 1.9 on most
+floors, by 2.5 on slippery ones (with drive.wheel_separation alone). Beyond the range one of the two
+tracks is wrong."""
 
 INWARDS = 1.05
-"""By which factor within the bounds it has to come before it is used: at a bound each turn would
-else be by another track."""
+"""Factor by which the track must lie inside the range before it is used. Without it the track would
+change with each turn at a bound."""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
@@ -40,28 +42,28 @@ class Track(Struct, frozen=True):
 
     share: float = 1.0
     deviation: float = 0.0
-    """Its standard deviation as a share of itself; 0 for the configured one, whose own `[odometry]`
-    declares."""
+    """Standard deviation as a share of the track. It is 0 for the configured track, whose deviation
+    `[odometry]` declares."""
 
 
 CONFIGURED = Track()
 
 
 class LearnedTrack:
-    """Decides which of them is used, and remembers it."""
+    """The decision between the configured and the learned track."""
 
     def __init__(self, multiplier: float) -> None:
-        """`multiplier` is the configured track over the wheel separation."""
+        """Start; `multiplier` is the configured track over the wheel separation."""
         self._multiplier = multiplier
         self.use: TrackUse = "uncertain"
-        """What becomes of the learned one."""
+        """The present use of the learned track."""
         self.used = CONFIGURED
-        """The one to turn by."""
+        """The track by which the wheels turn the robot."""
         self.event: Event | None = None
-        """What the last look changed."""
+        """The event of the last `look`, if it changed the use."""
 
     def look(self, learned: Track | None) -> None:
-        """What has been learned by now; None is nothing yet."""
+        """Take the track learned so far, None before the first one."""
         before, self.event = self.use, None
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
@@ -81,7 +83,7 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Both multipliers in words, and which of them is in use."""
+    """Return both multipliers in words, and which one is in use."""
     value = learned.share * multiplier
     configured = "" if use == "used" else " in use"
     return (
@@ -91,7 +93,7 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Of what a gyro has taught; "" where that is nothing yet."""
+    """Return the tracks in words, "" if the gyro has taught none yet."""
     if gyro.track is None:
         return ""
     return beside(Track(gyro.track, gyro.track_deviation), multiplier, gyro.track_use)

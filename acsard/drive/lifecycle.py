@@ -1,4 +1,4 @@
-"""The latches, the facts beside them, and the mode that follows from both.
+"""Holds the latches and the other facts, and derives the mode from both.
 
 A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
 time, and only `activate` releases `inactive`. Neither may release a stop or a `deactivate` that its

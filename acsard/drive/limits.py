@@ -1,8 +1,8 @@
-"""Wished twist -> safe twist: speed, wheel saturation, acceleration, deceleration, jerk.
+"""Limits a wished twist: speed, wheel saturation, acceleration, deceleration and jerk.
 
-Two ways to move: `follow` a commander, each axis by its own limits; `coast` to rest without one,
-both axes falling together so that no wheel's speed ever grows on the way down (invariant 2).
-Jerk shapes speeding up only: what brakes the robot is never later for the sake of comfort.
+There are two ways to move. `follow` obeys a commander, each axis by its own limits. `coast` goes to
+rest without one, and both axes fall together, so that no wheel's speed ever grows on the way
+(invariant 2). Jerk limits speeding up only, because comfort must not delay braking.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ class _State(Struct, frozen=True):
 
 
 class Limiter:
-    """Remembers the twist it last allowed and moves it by the limits."""
+    """The last allowed twist, moved by the limits."""
 
     def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
         self._kinematics = kinematics
         self.state = _State(REST, 0.0, 0.0)
-        """All it remembers; put back to undo a step whose line did not go out."""
+        """The whole memory. Restoring it undoes a step whose line did not leave."""
         self.use(limits)
 
     def use(self, limits: LimitsConfig) -> None:
-        """By these limits from now on; what is too fast for them falls by its deceleration.
+        """Use these limits from now on. A twist above them falls by the deceleration.
 
-        Not so where a wheel's limit is lowered, which holds at once: that is for a robot at rest.
+        A lower wheel speed limit holds at once, so it may change only at rest.
         """
         self._linear = _Axis(
             limits.linear_speed,
@@ -62,11 +62,11 @@ class Limiter:
 
     @property
     def twist(self) -> Twist:
-        """What was allowed last."""
+        """The twist that was allowed last."""
         return self.state.twist
 
     def follow(self, wished: Twist, dt: float) -> Twist:
-        """Move towards `wished` (finite) for `dt` s; what may be applied now."""
+        """Move towards the finite twist `wished` for `dt` s; return the twist to apply."""
         goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
         now = self.state
         linear, slope_v = _approach(
@@ -75,16 +75,16 @@ class Limiter:
         angular, slope_w = _approach(
             now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
         )
-        # The axes move at their own pace, so a corner of the two can ask more of a wheel than
-        # either end does.
+        # Each axis moves at its own pace, so the two together can ask more of a wheel than at
+        # either end.
         twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)
         self.state = _State(twist, slope_v, slope_w)
         return twist
 
     def coast(self, dt: float, stop: bool = False) -> Twist:
-        """Fall towards rest for `dt` s, along the line to it; `stop` brakes by the stop limits.
+        """Fall towards rest for `dt` s in a straight line; `stop` brakes by the stop limits.
 
-        A negative `dt` changes nothing: it must not speed up the robot.
+        A negative `dt` changes nothing, because it must not speed up the robot.
         """
         dt, twist = max(0.0, dt), self.twist
         seconds = max(
@@ -97,14 +97,14 @@ class Limiter:
         return fallen
 
     def cut(self) -> Twist:
-        """Rest at once: there is nobody at the other end to ramp."""
+        """Come to rest at once. Without a link the daemon cannot ramp."""
         self.state = _State(REST, 0.0, 0.0)
         return REST
 
     def _within_speed(self, wished: Twist) -> Twist:
-        """Both axes scaled together until each is within its limit: curvature is kept.
+        """Return the twist with both axes scaled together to their limits, so curvature is kept.
 
-        An axis whose limit is 0 is left out, as those that a planar base does not have.
+        An axis with the limit 0 is set to zero first and does not slow down the other one.
         """
         linear = wished.linear if self._linear.speed else 0.0
         angular = wished.angular if self._angular.speed else 0.0
@@ -123,10 +123,10 @@ def _braking(axis: _Axis, stop: bool) -> float:
 def _approach(
     speed: float, goal: float, slope: float, dt: float, axis: _Axis
 ) -> tuple[float, float]:
-    """`speed` after `dt` on the way to `goal`, and the slope used, within the axis's limits."""
+    """Return `speed` after `dt` s on the way to `goal`, and the slope used, within the limits."""
     if dt <= 0.0:
         return speed, slope
-    # Through zero in two parts: what slows the robot is deceleration, what follows is not.
+    # Pass zero in two parts: slowing down is deceleration, and speeding up afterwards is not.
     target = 0.0 if speed * goal < 0 else goal
     most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
     wanted = (target - speed) / dt
@@ -134,8 +134,8 @@ def _approach(
         slope = slope if slope * wanted > 0 else 0.0  # left over from braking
         step = axis.jerk * dt
         most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
-        # The slope may not fall faster than jerk either, as far as the goal is not passed; nor is
-        # it steeper for jerk's sake than it may be: it braked, or what it may be was lowered.
+        # The slope may not fall faster than jerk allows unless it would pass the goal. It also
+        # never exceeds the acceleration, which may have been lowered.
         most = min(axis.acceleration, max(most, abs(slope) - step))
     used = max(-most, min(most, wanted))
     # Landing exactly: wanted * dt need not give the difference back in floating point.
@@ -143,9 +143,10 @@ def _approach(
 
 
 def _flattenable(away: float, step: float, dt: float) -> float:
-    """The steepest slope from which falling by `step` every `dt` ends within `away`.
+    """Return the steepest slope from which falling by `step` every `dt` ends within `away`.
 
-    Slopes s, s - step, ... over n more periods add up to dt ((n + 1) s - step n (n + 1) / 2).
+    The slopes s, s - step and so on over n more periods add up to dt ((n + 1) s - step n (n + 1) /
+    2).
     """
     n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)
     return (away / dt + step * n * (n + 1) / 2.0) / (n + 1)

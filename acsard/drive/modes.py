@@ -1,6 +1,6 @@
 """The robot's mode, derived from latches and facts by one ordered list.
 
-    leaving   the daemon is going down, for good
+    leaving   the daemon is going down
     fault     a fault is latched until `clear`
     stopped   a stop is latched until `clear`
     inactive  the robot is switched off until `activate`

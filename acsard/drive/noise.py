@@ -1,19 +1,20 @@
-"""How far a step may be off what the wheels report: the odometry's noise model, and its parameters.
+"""The noise model of the odometry: errors of one step, and of the parameters.
 
 The travel of a side, dl or dr, has an independent error of variance k |dl| or k |dr| (Siegwart,
-Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2.4). With L the track that is
+Nourbakhsh & Scaramuzza, Introduction to Autonomous Mobile Robots, 5.2.4). With the track L that
+gives
 
     var(d) = k (|dl| + |dr|) / 4     var(dyaw) = k (|dl| + |dr|) / L2
     cov(d, dyaw) = k (|dr| - |dl|) / (2 L)
 
-The settings say more than one k can: `distance_variance_per_metre` D and `yaw_variance_per_metre`
-Y are k / 2 and 2 k / L2 if the sides are all there is. So k = min(2 D, Y L2 / 2) is theirs, what
-remains of D or Y is an error of the base as a whole, and `yaw_variance_per_radian` is what skidding
-adds to every turn.
+The settings express more than one k can. If only the sides erred, `distance_variance_per_metre` D
+would be k / 2 and `yaw_variance_per_metre` Y would be 2 k / L2. So k = min(2 D, Y L2 / 2) is the
+noise of the sides, and the rest of D or Y is an error of the base as a whole. The skid adds
+`yaw_variance_per_radian` to every turn.
 
-The parameters' errors do not average out (Borenstein & Feng, Measurement and Correction of
-Systematic Odometry Errors in Mobile Robots, 1996), so they are no noise: `columns` says how each of
-them, one standard deviation off, bends a step.
+The errors of the parameters do not average out (Borenstein & Feng, Measurement and Correction of
+Systematic Odometry Errors in Mobile Robots, 1996), so they are not noise. `columns` gives the
+effect on a step of each parameter that is off by one standard deviation.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from acsard.drive.kinematics import Kinematics
 from acsard.drive.learned_track import CONFIGURED, Track
 
 Column = tuple[float, float, float, float]
-"""m per m, m per rad, rad per m, rad per rad: what a parameter adds to distance and turn, of
-distance and turn."""
+"""The effect of a parameter's error on a step: m per m, m per rad, rad per m and rad per rad. The
+first two add to the distance and the last two to the turn, for each m and rad of the step."""
 
 
 SLIPPING = 100.0
-"""By which every variance that the wheels tell is larger while they slip."""
+"""Factor on every variance of the wheels while they slip."""
 
 
 class Noise:
-    """Variances of one step in base_link."""
+    """The variances of one step in base_link."""
 
     def __init__(self, odometry: OdometryConfig, track: float) -> None:
-        """`track` in m is the one that the wheels turn the robot by."""
+        """Compute the model; `track` is the one by which the wheels turn the robot, m."""
         wheels = min(
             2 * odometry.distance_variance_per_metre,
             odometry.yaw_variance_per_metre * track * track / 2,
@@ -49,9 +50,10 @@ class Noise:
         self._to_both = wheels / (2 * track)
 
     def of(self, distance: float, turn: float, turned: float) -> tuple[float, float, float]:
-        """var(d) m2, var(dyaw) rad2 and cov(d, dyaw) m rad of a step of `distance` m and `turn`.
+        """Return var(d) m2, var(dyaw) rad2 and cov(d, dyaw) m rad of a step, in m and rad.
 
-        `turned` rad is what counts as turning of it: |turn|, or less where that is encoder noise.
+        `turned` rad is the part of the step that counts as turning: |turn|, or less if a part is
+        encoder noise.
         """
         left, right = abs(distance - self._half * turn), abs(distance + self._half * turn)
         path, sides = abs(distance), left + right
@@ -63,18 +65,18 @@ class Noise:
 
 
 def in_use(odometry: OdometryConfig) -> Track | None:
-    """The track to begin with; None where no other one is to be learned."""
+    """Return the initial track, None if the track is not to be learned."""
     return CONFIGURED if odometry.learned_track else None
 
 
 def columns(
     odometry: OdometryConfig, kinematics: Kinematics, learned: Track | None = None
 ) -> tuple[Column, ...]:
-    """What one standard deviation of each uncertain parameter does; certain ones are left out.
+    """Return the effect of one standard deviation of each uncertain parameter; omit certain ones.
 
-    In dl = r m_l phi_l, dr = r m_r phi_r and dyaw = (dr - dl) / (m_L b), with the multipliers m.
-    Where a track is to be `learned` its error has the last column, being none of the configured
-    one's, and does nothing as long as that is the one in use.
+    The parameters are those of dl = r m_l phi_l, dr = r m_r phi_r and dyaw = (dr - dl) / (m_L b),
+    with the multipliers m. With a `learned` track the last column is its error, independent of the
+    configured track's. It is zero while the configured track is in use.
     """
     used = learned or CONFIGURED
     track = kinematics.track * used.share
@@ -90,7 +92,7 @@ def columns(
         share = 0.0 if used.deviation else odometry.wheel_separation_multiplier_std / separation
         rows.append((0.0, 0.0, 0.0, -share))
     if odometry.distance_scale_std:
-        # Radii and track alike: every turn stays what it was.
+        # This scales radii and track alike, so turns do not change.
         rows.append((odometry.distance_scale_std, 0.0, 0.0, 0.0))
     if learned is not None:
         rows.append((0.0, 0.0, 0.0, -learned.deviation))

@@ -1,4 +1,4 @@
-"""Wheel speeds over time -> pose, twist and covariance of base_link in odom.
+"""Integrates wheel speeds into pose, twist and covariance of base_link in odom.
 
 One step of dt, with left and right the mean wheel speeds of a side (kinematics, equation 1):
 
@@ -8,8 +8,8 @@ One step of dt, with left and right the mean wheel speeds of a side (kinematics,
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
 Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. They
-agree as dyaw -> 0. How far that may be off is `uncertainty.py`'s, for the pose, and
-`twist_uncertainty.py`'s.
+agree as dyaw -> 0. `uncertainty.py` and `twist_uncertainty.py` compute the errors of the pose and
+of the twist.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from acsard.values import (
 )
 
 REST_S = 0.2
-"""s of four wheels that report 0.00, after which the robot is at rest."""
+"""Seconds with four wheels at 0.00 after which the robot is at rest."""
 
 TAKEN_BACK = 128
-"""Lines at most that are taken back of a lie that was believed."""
+"""Largest number of lines that are recomputed when a wheel proves faulty."""
 
 
 class Odometry:
-    """Integrates feedback; its state is pose, covariance and the wheel angles."""
+    """The odometry: pose, covariance and wheel angles, integrated from feedback."""
 
     def __init__(
         self,
@@ -61,46 +61,54 @@ class Odometry:
         response_time: float = FeedbackConfig().response_time,
         quiet: float = math.inf,
     ) -> None:
-        """`encoder_counts` per wheel turn, 0 if unknown; `response_time` s of a slow wheel;
-        `quiet` s of silence, after which the wheels are told to stand."""
+        """Start at the origin.
+
+        Args:
+            odometry: The table `[odometry]`.
+            kinematics: The kinematics of the base.
+            encoder_counts: Counts per wheel turn, 0 if unknown.
+            response_time: Response time of a slow wheel, s.
+            quiet: Duration of silence after which the daemon commands rest, s.
+        """
         self._kinematics, self._declared = kinematics, odometry
         self._track, self._share = in_use(odometry), 1.0
-        """The track in use where one is learned; and what it is of the configured one."""
+        """The track in use, None if none is learned; and its share of the configured one."""
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
-        """rad of counts at rest, whose way is not clear yet."""
+        """Counts at rest whose direction is not clear yet, rad."""
         self._steps_seen = NOWHERE
-        """Those of the lines of which the counts are known;"""
+        """Quantization steps, rad/s, whose count the pose's covariance finally uses."""
         self._steps_of, self._coarsest = NOWHERE, 0.0
-        """of the last line, and the largest of them that is known, rad/s."""
+        """Quantization steps of the last line, and the largest known one of them, rad/s."""
         self._path = Path()
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
         self._gaps = Gaps()
         self._witness = Witness(kinematics, encoder_counts, response_time)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
-        """Of the last lines."""
+        """The last lines, for recomputation."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
-        """rad that no wheel turns between the edges of one count."""
+        """Angle that no wheel turns between the edges of one count, rad."""
         self._still = 0.0
-        """s without a wheel speed."""
+        """Seconds without any wheel speed."""
         self.twist = REST
         """Twist of the last feedback."""
         self.speeds = STILL
         """Wheel speeds of the last feedback."""
         self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
-        """Gaps in which it drove and the pose stood, s of them, and s that were bridged."""
+        """Number of gaps in which the robot moved and the pose stood still, their duration in s,
+        and the time that gap filling covered in s."""
         self.travelled = 0.0
-        """m since the start, forwards and backwards."""
+        """Distance since the start, forwards and backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """With these variances from now on."""
+        """Use these variances from now on."""
         self._uncertainty.use(odometry)
         self._twist_uncertainty.use(odometry)
 
     def turn_by(self, track: Track) -> None:
-        """With this effective track from now on, where the wheels tell the turn."""
+        """Use this effective track from now on for the turns that the wheels provide."""
         if track != self._track:
             self._track, self._share = track, track.share
             parameters = columns(self._declared, self._kinematics, track)
@@ -109,35 +117,39 @@ class Odometry:
             self._twist_uncertainty.bent_by(parameters, apart)
 
     def set_pose(self, pose: Pose) -> None:
-        """Put base_link at `pose` in odom, as certain as at the start; wheel angles go on."""
+        """Set the pose of base_link in odom, as certain as at the start.
+
+        The wheel angles continue.
+        """
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)
 
     @property
     def pose(self) -> Pose:
-        """Pose of base_link in odom now."""
+        """The present pose of base_link in odom."""
         return self._path.pose
 
     def missed(self) -> dict[str, int]:
-        """What no line told, as counters: those that are 0 are left out."""
+        """Return counters of the time that no line reported, without those that are 0."""
         ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     @property
     def doubt(self) -> WheelsStatus:
-        """Which wheels the pose goes without, and which slip."""
+        """The wheels that the pose ignores, and those that slip."""
         return self._witness.status
 
     @property
     def events(self) -> list[Event]:
-        """What the last line had to tell of wheels that are doubted."""
+        """Events of the last line about wheel faults."""
         return self._witness.events
 
     def skip(self, feedback: Feedback) -> None:
-        """Pass over a line that cannot be true: what it should have told is left to the next one.
+        """Pass over an impossible line and leave its motion to the next one.
 
-        Counts are cumulative: what they made of it then stays true. Else only its time is known.
+        Counts are cumulative, so they lose nothing. Without counts only the time of the line is
+        kept.
         """
         self._rolling.skip(feedback)
 
@@ -146,11 +158,11 @@ class Odometry:
     ) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
-        After a gap without counts only the uncertainty advances. At rest nothing does: a count to
-        and fro is left to the line that tells where it went. Where `gyro` tells the turn since the
-        line before, the wheels tell the distance only. `told` is what the wheels are to do, by
-        which one that lies is found: then its side's other wheel stands in, and what it made of the
-        lines until then is taken back.
+        After a gap without counts only the uncertainty advances. At rest nothing does: a count back
+        and forth waits until its direction is clear. If `gyro` provides the turn since the line
+        before, the wheels provide only the distance. `told` is the commanded wheel speeds, by which
+        a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
+        recomputed.
         """
         speeds, dt, before = feedback.speeds, feedback.dt, self.twist
         said, witness = speeds.as_tuple(), self._witness
@@ -197,8 +209,10 @@ class Odometry:
         )
 
     def _see(self, line: Feedback) -> None:
-        """How coarse its speeds are is the twist's covariance; the counts that it shows are the
-        pose's: all four, once every wheel turns."""
+        """Take the resolution of the line's speeds for the twist's covariance.
+
+        Take its count for the pose's covariance, finally once every wheel turns.
+        """
         if line.steps is not self._steps_of:
             self._steps_of = line.steps
             self._coarsest = max([step for step in line.steps if step < math.inf], default=0.0)
@@ -209,19 +223,22 @@ class Odometry:
         self._uncertainty.show_count(count_of(line))
 
     def _wheels_turn(self, rolled: Rolled) -> float:
-        """rad by which the wheels say the robot turned since the last line that was believed."""
+        """Return the turn since the last believed line by the wheels, rad."""
         turned = rolled.turned
         for piece in rolled.pieces:
             turned = plus(turned, piece)
         return self._kinematics.moved(self._witness.believed(turned))[1]
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
-        """The wheel angles to advance by; at rest counts are held until it is clear where to."""
+        """Return the wheel angles to advance by.
+
+        At rest, hold counts until their direction is clear.
+        """
         turned = rolled.turned
         if self._held != NOWHERE:
             turned = plus(self._held, turned)
         if turned == NOWHERE:
-            self._held = NOWHERE  # it has come back
+            self._held = NOWHERE  # the count has come back
             return rolled.pieces
         if at_rest and max(map(abs, turned)) <= self._unsettled:
             self._held = turned
@@ -230,10 +247,9 @@ class Odometry:
         return (turned, *rolled.pieces)
 
     def _take_back(self, gyro: Heading | None) -> None:
-        """Take back what a wheel, found to lie, made of the last lines that it lied in.
+        """Recompute the last lines in which a wheel, now found faulty, was wrong.
 
-        The steps since are gone through anew without it, so that the pose leaps by what was wrong;
-        but what a gyro has put right of it, or will, is right.
+        The pose jumps by the error, except for the part that a gyro has corrected or will correct.
         """
         lies = list(takewhile(lambda step: self._witness.lied(step.speeds), reversed(self._steps)))
         if not lies:
@@ -253,9 +269,10 @@ class Odometry:
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
     ) -> list[tuple[float, float]]:
-        """m and rad for each of so many wheel angles: (4) to (7) are linear.
+        """Return the arcs for these wheel angles, m and rad: (4) to (7) are linear.
 
-        A gyro tells one turn for all of them, else a track of this share of the configured one.
+        A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
+        one.
         """
         believed, kinematics = self._witness.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]
@@ -271,7 +288,7 @@ class Odometry:
         on_trial: bool,
         slips: bool,
     ) -> float:
-        """Advance by wheel angles in rad, an arc for each piece; by how many rad it turned."""
+        """Advance by wheel angles in rad, one arc for each piece; return the turn, rad."""
         path, turned = self._path, 0.0
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
@@ -285,7 +302,7 @@ class Odometry:
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
-        """Doubt a way that was bridged; else measure how twists change from line to line."""
+        """Add the uncertainty of a filled gap, or else measure how twists change between lines."""
         if bridged > 0.0:
             self.bridged += bridged
             self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
@@ -309,7 +326,7 @@ class Odometry:
         return variances
 
     def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
-        """What the robot did in so many seconds between two twists is unknown: it has not moved."""
+        """Account for `seconds` of unknown motion between two twists. The pose stands still."""
         if before != REST or after != REST:
             self.gaps += 1
             self.unseen += seconds

@@ -1,8 +1,8 @@
-"""Where a chain of arcs leads: exact arcs, summed so that millions of them stay exact.
+"""Integrates a chain of exact arcs, with sums that stay exact over millions of arcs.
 
-The chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along
-yaw + dyaw/2. What rounding loses of each sum is kept beside it and added to the next (Kahan,
-Further Remarks on Reducing Truncation Errors, 1965); a turn is 2 pi, not the double nearest to it.
+The chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along yaw +
+dyaw/2. The rounding error of each sum is kept with it and added to the next (Kahan, Further
+Remarks on Reducing Truncation Errors, 1965). A turn is 2 pi, not the double nearest to it.
 """
 
 from __future__ import annotations
@@ -12,17 +12,17 @@ import math
 from acsard.values import Pose
 
 TAU_REST = 2.4492935982947064e-16
-"""rad; 2 pi less `math.tau`."""
+"""2 pi minus `math.tau`, rad."""
 
 
 class Path:
-    """The pose at the end of the arcs driven so far."""
+    """The pose at the end of the arcs so far."""
 
     def __init__(self) -> None:
         self.set(Pose())
 
     def set(self, pose: Pose) -> None:
-        """Go on from `pose`."""
+        """Continue from `pose`."""
         self._x, self._x_rest = pose.x, 0.0
         self._y, self._y_rest = pose.y, 0.0
         self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
@@ -30,12 +30,12 @@ class Path:
         """Pose of base_link in odom, yaw within [-pi, pi]."""
 
     def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
-        """Go on by an arc of length `distance` m through `turn` rad.
+        """Advance by an arc of length `distance` m through `turn` rad.
 
-        Returns its chord: m along x, m along y, and its direction in rad.
+        Return its chord: m along x, m along y, and its direction in rad.
         """
         half = turn / 2
-        # sin(h)/h loses nothing in doubles down to tiny h; only h = 0 needs its limit.
+        # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
         chord = distance * (math.sin(half) / half if half else 1.0)
         heading = self._yaw + half
         dx, dy = chord * math.cos(heading), chord * math.sin(heading)
@@ -56,14 +56,14 @@ class Path:
 
 
 def plus(a: float, b: float) -> tuple[float, float]:
-    """a + b as the double nearest to it and what that leaves out, exactly (Knuth)."""
+    """Return a + b as the nearest double, and its exact rounding error (Knuth)."""
     total = a + b
     of_b = total - a
     return total, (a - (total - of_b)) + (b - of_b)
 
 
 def arc(pose: Pose, distance: float, turn: float) -> Pose:
-    """`pose` after an arc of length `distance` m through `turn` rad."""
+    """Return `pose` after an arc of length `distance` m through `turn` rad."""
     half, yaw = turn / 2, math.remainder(pose.yaw, math.tau)
     chord = distance * (math.sin(half) / half if half else 1.0)
     heading = yaw + half
@@ -74,7 +74,7 @@ def arc(pose: Pose, distance: float, turn: float) -> Pose:
 
 
 def _wrapped(yaw: float, turn: float) -> tuple[float, float]:
-    """yaw + turn within [-pi, pi], and what that leaves out."""
+    """Return yaw + turn within [-pi, pi], and its rounding error."""
     total, rest = plus(yaw, turn)
     wrapped = math.remainder(total, math.tau)
     if wrapped != total:

@@ -1,16 +1,16 @@
-"""Can this feedback be true, and do the wheels do what they are told?
+"""Checks whether feedback is possible and whether the wheels obey their commands.
 
-Two questions to every feedback line. `impossible`: no wheel turns that fast or changes that
-quickly; such a line is not folded, and several in a row are a fault. `watch`: over half a second
-the wheels' feedback contradicts what they were sent; the fault names the wheel.
+Each feedback line is checked twice. `impossible` rejects a line that shows a wheel turning or
+changing faster than any wheel can; the line is not used, and several in a row are a fault. `watch`
+compares the feedback with the commands over half a second and reports a fault of a named wheel.
 
-What a healthy wheel does is modelled as a first-order lag behind its command. Between the model
-and the feedback there is room for load, slip and coarse encoders: only what no healthy wheel does
-counts as evidence, and evidence must last.
+The model of a healthy wheel is a first-order lag behind its command. The bounds around it leave
+room for load, slip and coarse encoders. Only behaviour that no healthy wheel shows is evidence, and
+evidence must last.
 
-A wheel that goes on turning when it is told to stand is a runaway, unless it is slowing down. Once
-it has been at rest, what turns it is not its command: a hand, or a slope. That is told, and never a
-fault: the zero that is being sent is all that a fault could say.
+A wheel that keeps turning when it should stand is a runaway, unless it is slowing down. If it has
+been at rest since, something else than its command turns it: a hand, or a slope. That is reported
+but is never a fault, because a fault could only send the zero that is being sent anyway.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ REPEATED = 3
 """Impossible lines in a row that make a fault: 30 ms at 100 Hz."""
 
 SLACK = 2.0
-"""rad/s; below this coarse encoders and a robot at rest look like anything."""
+"""rad/s. Below this, coarse encoders and a robot at rest look like any fault."""
 
 STEPS = 2
-"""Counts by which two reports may differ beside what the wheel did: either may hold one more."""
+"""Counts by which two reports may differ besides the wheel's motion: each may be off by one."""
 
 LEAST = 0.005
-"""rad/s; a line says less as zero."""
+"""rad/s. A line reports a smaller speed as zero."""
 
 ROLLED_S = 0.2
-"""How long wheels must turn by hand before it is told: rocking to rest is no news."""
+"""Seconds that wheels must turn by hand before it is reported. A robot that rocks to rest is
+not."""
 
 TOLD_AGAIN_S = 1.0
-"""A push is told at most this often."""
+"""Least time between two reports of a push, s."""
 
 
 _FAULTS = {
@@ -51,52 +52,54 @@ _FAULTS = {
 
 
 class _Wheel:
-    """What one wheel should be doing, and for how long it has not."""
+    """The expected motion of one wheel, and how long it has deviated."""
 
     def __init__(self) -> None:
         self.driven = False
-        """It has been told to turn, and not seen at rest since it was told to stand."""
+        """Whether the wheel turned on command and has not come to rest since the command ended."""
         self.forget()
 
     def forget(self) -> None:
-        """Start over; but a wheel that has not come to rest still has to."""
+        """Start over. A wheel that has not come to rest yet still must."""
         self.expected = 0.0
         self.seen = 0.0
         self.evidence = dict.fromkeys(_FAULTS, 0.0)
         self.suspected = False
-        """There is some of that."""
-        # Infinity lets the first line count as slowing down. With 0, a wheel that was already
-        # too fast would never count as slowing down: slow motors latched "runaway" that way.
+        """Whether there is evidence of any kind."""
+        # Infinity lets the first line count as slowing down. With 0, a wheel that was already too
+        # fast would never count as slowing down: slow motors latched "runaway" that way.
         self.slowest = math.inf
-        """Slowest speed since the wheel became faster than it should be, rad/s."""
+        """Slowest speed since the wheel became too fast, rad/s."""
 
     def signs(self, told: float, speed: float, share: float, still: bool) -> tuple[bool, ...]:
-        """Whether it looks dead, reversed, running away, stuck: in the order of `_FAULTS`.
+        """Return whether the wheel shows each of the `_FAULTS`, in their order.
 
-        `share` is how far towards its command it should have come; `still` that all wheels should
-        stand.
+        `share` is the part of the way to its command that it should have covered in this line.
+        `still` means that all wheels should stand.
         """
         expected = self.expected = self.expected + (told - self.expected) * share
-        size, turns = abs(expected), abs(speed)
+        size, wish, turns = abs(expected), abs(told), abs(speed)
         driven = self.driven = not still or (self.driven and turns > SLACK)
         constant, self.seen = speed == self.seen, speed
-        most = max(size, abs(told))
+        most = size if size > wish else wish
         fast = driven and turns > 1.5 * most + SLACK
         slowing = turns < self.slowest - SLACK
         if slowing or not fast:
             self.slowest = turns
         moving = size > SLACK and expected * told > 0
-        constant = constant and driven and speed != 0.0
         return (
             moving and turns < 0.1 * size,
             moving and speed * expected < 0 and turns > 0.3 * size,
             fast and not slowing,
-            constant and abs(speed - expected) > SLACK + 0.3 * most,
+            constant and driven and speed != 0.0 and abs(speed - expected) > SLACK + 0.3 * most,
         )
 
 
 class Sanity:
-    """Judges feedback line by line; remembers the last possible one and each wheel's evidence."""
+    """The judgement of feedback, line by line.
+
+    It remembers the last possible line and the evidence against each wheel.
+    """
 
     def __init__(self, feedback: FeedbackConfig) -> None:
         self._settings = feedback
@@ -107,24 +110,24 @@ class Sanity:
         self._rolled = 0.0
         self._untold = TOLD_AGAIN_S
         self.turned = ""
-        """What the last `watch` has to tell of wheels turned by hand, or ""."""
+        """The message of the last `watch` about wheels turned by hand, or ""."""
 
     def forget(self) -> None:
-        """Start over: the link was gone, or a fault has been cleared."""
+        """Start over, because the link was lost or a fault has been cleared."""
         self._last, self._since, self._impossible = None, 0.0, 0
         for wheel in self._wheels:
             wheel.forget()
 
     @property
     def doubtful(self) -> bool:
-        """So many impossible lines in a row that the feedback cannot be trusted."""
+        """Whether so many impossible lines came in a row that the feedback cannot be trusted."""
         return self._impossible >= REPEATED
 
     def impossible(self, feedback: Feedback) -> str:
-        """Why no robot can have sent this line, "" when one can.
+        """Return why no robot can have sent this line, "" if one can.
 
-        A slew is judged against the last possible line and the time since, so that a real step
-        is believed as soon as it could have happened.
+        A change of speed is judged against the last possible line and the time since, so a real
+        step is believed as soon as it could have happened.
         """
         self._since += max(feedback.dt, feedback.since)
         if feedback.gap:
@@ -144,8 +147,9 @@ class Sanity:
         for name, now, then, step in rows:
             size, change = abs(now), abs(now - then)
             if size <= fastest and change <= most:
-                continue  # whatever its encoder's steps are
-            # Of steps that are not proven counts a lying encoder may make as many as it likes.
+                continue  # possible for any encoder steps
+            # Unless the steps are proven counts they allow no excess speed: a faulty encoder may
+            # show any steps.
             room = 0.0 if line.counted is None or step == math.inf else step
             if size > fastest + room:
                 return f"{name} {now:.2f} rad/s is over feedback.wheel_speed"
@@ -155,9 +159,9 @@ class Sanity:
         return ""
 
     def watch(self, sent: WheelSpeeds, seen: WheelSpeeds, dt: float) -> str:
-        """The fault that `dt` s more of this make, naming the wheel; "" while all is well.
+        """Return the fault that `dt` s more of these speeds show, with the wheel's name, or "".
 
-        `sent` is what the wheels are told, `seen` what they report, rad/s.
+        `sent` is the commanded speeds and `seen` the reported ones, rad/s.
         """
         limit, response = self._settings.fault_time, self._settings.response_time
         share = dt / (response + dt) if dt else 0.0
@@ -166,9 +170,10 @@ class Sanity:
         rows = zip(WHEELS, self._wheels, sent.as_tuple(), seen.as_tuple(), strict=True)
         for name, wheel, told, speed in rows:
             signs = wheel.signs(told, speed, share, still)
-            if not (True in signs or wheel.suspected):
+            odd = True in signs
+            if not (odd or wheel.suspected):
                 continue
-            wheel.suspected = True in signs
+            wheel.suspected = odd
             for kind, bad in zip(_FAULTS, signs, strict=True):
                 lasted = wheel.evidence[kind] + dt if bad else 0.0
                 wheel.evidence[kind] = lasted
@@ -177,7 +182,7 @@ class Sanity:
         return ""
 
     def _notice(self, seen: WheelSpeeds, dt: float, still: bool) -> None:
-        """Tell once in a while of wheels that turn though they were at rest and are told to be."""
+        """Report, at intervals, wheels that turn after a rest against their command."""
         fastest = 0.0
         if still:
             rows = zip(self._wheels, map(abs, seen.as_tuple()), strict=True)

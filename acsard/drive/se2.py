@@ -1,9 +1,9 @@
-"""Errors of a planar pose as motions in SE(2), in axes of odom at the robot.
+"""Represents errors of a planar pose as motions in SE(2), in the axes of odom at the robot.
 
-The error of an estimate is log(estimate^-1 truth): the constant twist that leads, in one unit of
-time, from where the robot is believed to be to where it is. In axes of base_link a step carries it
-on by the adjoint of the step's inverse; turned into the axes of odom, which keep their direction,
-only the lever of the way is left of that: `seen_from`.
+The error of an estimate is log(estimate^-1 truth): the constant twist that leads in one unit of
+time from the estimated to the true pose. In the axes of base_link a step transforms it by the
+adjoint of the step's inverse. In the axes of odom, whose direction is fixed, only the lever arm of
+the step remains of that: `seen_from`.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ ORIGIN: Vector = (0.0, 0.0, 0.0)
 
 
 def plus(a: Vector, b: Vector) -> Vector:
-    """a + b"""
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 def bracket(a: Vector, b: Vector) -> Planar:
-    """x and y of the Lie bracket [a, b]; its yaw is always 0."""
+    """Return x and y of the Lie bracket [a, b]. Its yaw is always 0."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
 
 
 def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector]:
-    """The rows of `times` E[[a, e] e'], e of covariance `p`."""
+    """Return the rows of `times` E[[a, e] e'], where e has covariance `p`."""
     x, y, yaw = times * a[0], times * a[1], times * a[2]
     return (
         (y * p.xyaw - yaw * p.xy, y * p.yyaw - yaw * p.yy, y * p.yawyaw - yaw * p.yyaw),
@@ -38,7 +38,10 @@ def brackets(a: Vector, p: PoseCovariance, times: float) -> tuple[Vector, Vector
 
 
 def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
-    """xx, xy and yy of E[[a, b] [a, b]'], a and b independent with covariances `p` and `q`."""
+    """Return xx, xy and yy of E[[a, b] [a, b]'].
+
+    The errors a and b are independent and have the covariances `p` and `q`.
+    """
     return (
         p.yy * q.yawyaw - 2 * p.yyaw * q.yyaw + p.yawyaw * q.yy,
         p.yyaw * q.xyaw - p.xy * q.yawyaw - p.yawyaw * q.xy + p.xyaw * q.yyaw,
@@ -47,7 +50,10 @@ def bracket_covariance(p: PoseCovariance, q: PoseCovariance) -> Vector:
 
 
 def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
-    """E[[e, [e, b]] b'] and its transpose, b of covariance `p`; `a` is E[e yaw] of an e."""
+    """Return E[[e, [e, b]] b'] plus its transpose.
+
+    The error b has the covariance `p`, and `a` is E[e yaw].
+    """
     x, y, yaw = a
     return PoseCovariance(
         2 * (x * p.xyaw - yaw * p.xx),
@@ -60,13 +66,13 @@ def twice_bracketed(p: PoseCovariance, a: Vector) -> PoseCovariance:
 
 
 def seen_from(error: Vector, dx: float, dy: float) -> Vector:
-    """The same error after the robot has moved by `dx`, `dy` m in odom."""
+    """Return the same error after the robot has moved by `dx`, `dy` m in odom."""
     x, y, yaw = error
     return x - dy * yaw, y + dx * yaw, yaw
 
 
 def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
-    """The covariance of an error of covariance `p`, seen from `dx`, `dy` m further."""
+    """Return the covariance `p` of an error after the robot has moved by `dx`, `dy` m."""
     return PoseCovariance(
         p.xx - 2 * dy * p.xyaw + dy * dy * p.yawyaw,
         p.xy + dx * p.xyaw - dy * p.yyaw - dx * dy * p.yawyaw,
@@ -80,7 +86,7 @@ def carried(p: PoseCovariance, dx: float, dy: float) -> PoseCovariance:
 def added(
     p: PoseCovariance, along: float, yaw: float, both: float, c: float, s: float
 ) -> PoseCovariance:
-    """`p` and the noise of a step in direction (`c`, `s`): its variances and their covariance."""
+    """Return `p` plus the noise of a step in direction (`c`, `s`): its variances and covariance."""
     cc, cs = along * c, along * s
     return PoseCovariance(
         p.xx + cc * c,
@@ -102,9 +108,9 @@ def stepped(
     c: float,
     s: float,
 ) -> PoseCovariance:
-    """`p` seen from `dx`, `dy` m further, and the noise of the step there.
+    """Return `p` after a move by `dx`, `dy` m, plus the noise of that step.
 
-    What `carried` and `added` say one after the other, in one: each line takes a step.
+    This is `carried` and `added` in one function, because each line takes a step.
     """
     xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
     cc, cs = along * c, along * s
@@ -119,7 +125,7 @@ def stepped(
 
 
 def total(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
-    """p + q"""
+    """Return p + q."""
     return PoseCovariance(
         p.xx + q.xx,
         p.xy + q.xy,
@@ -131,7 +137,7 @@ def total(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
 
 
 def difference(p: PoseCovariance, q: PoseCovariance) -> PoseCovariance:
-    """p - q"""
+    """Return p - q."""
     return PoseCovariance(
         p.xx - q.xx,
         p.xy - q.xy,

@@ -1,24 +1,26 @@
-"""What the linear covariance leaves out: errors of the heading that bend the errors of the place.
+"""Adds what the linear covariance leaves out: errors of the heading that bend the position error.
 
-A heading that errs and comes back makes a straight shorter, never longer: of second order, and on a
-straight all there is of it. 60 m at k = 1e-5 (`noise.py`) are 17 mm to first order, and in truth
-0.12 m.
+A heading that errs and returns makes a straight shorter, never longer. This is an effect of second
+order, and on a straight it is the whole error along the way. After 60 m at k = 1e-5 (`noise.py`)
+the error is 17 mm to first order, and in truth 0.12 m.
 
-Each stretch of the way composes the error e so far with one of its own, w. By Baker, Campbell and
-Hausdorff
+Each stretch of the way composes the error e so far with an error w of its own. By Baker, Campbell
+and Hausdorff
 
     log(exp(e) exp(w)) = e + w + [e, w] / 2 + [e, [e, w]] / 12 + [w, [w, e]] / 12 + ...
 
-e = x + J p has a part x from noise, of covariance P, and one from the parameters' errors p, unit
-normal, by their columns J; w = n + W p likewise with Q and W. The third term adds to x and y
+The error e = x + J p has a part x from noise, of covariance P, and one from the parameters' errors
+p, unit normal, with the columns J. Likewise w = n + W p, with Q and W. The third term adds to x and
+y
 
     [x, n] / 2           independent of all before: its covariance is summed
     p_i M_i              M_i = sum of ([J_i, n] + [x, W_i]) / 2, with its covariance with x
     p_i p_k C_ik         C_ik = sum of ([J_i, W_k] + [J_k, W_i]) / 2, or half of that for i = k
 
-which are uncorrelated with each other and with e. Of the last two the noise's are taken. Without
-parameters that is equation 55 of Barfoot & Furgale, Associating Uncertainty with Three-Dimensional
-Poses for Use in Estimation Problems, IEEE Transactions on Robotics 30 (2014).
+which are uncorrelated with each other and with e. Of the last two terms of the series only the
+noise's part is used. Without parameters the result is equation 55 of Barfoot & Furgale, Associating
+Uncertainty with Three-Dimensional Poses for Use in Estimation Problems, IEEE Transactions on
+Robotics 30 (2014).
 """
 
 from __future__ import annotations
@@ -37,43 +39,44 @@ from acsard.drive.se2 import (
 from acsard.values import PoseCovariance
 
 MAX_HEADING_VARIANCE = 1.0
-"""rad2; beyond that the series says nothing, and nothing is added to the linear covariance."""
+"""rad2. With a greater variance of the heading the series does not converge, and nothing is added
+to the linear covariance."""
 
 NOTHING = PoseCovariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class SecondOrder:
-    """The second moment of what noise and parameters add to x and y beside the linear part."""
+    """The second moment that noise and parameters add to x and y besides the linear part."""
 
     def __init__(self, columns: int) -> None:
         self._noise: Vector = ORIGIN
-        """xx, xy, yy of all [x, n] / 2 and M_i."""
+        """xx, xy and yy of the sum of all [x, n] / 2 and M_i."""
         self._with_x: list[tuple[Vector, Vector]] = []
         """E[M_i x'], row by row."""
         self._bent: dict[tuple[int, int], Planar] = {}
-        """C_ik"""
+        """C_ik."""
         for _ in range(columns):
             self.widen()
         self.xx = self.xy = self.yy = 0.0
-        """m2, axes of odom; no step changes them, for x and y have no lever."""
+        """m2 in the axes of odom. No step changes them, because x and y have no lever arm."""
 
     def widen(self) -> None:
-        """There is one column more, of which nothing has come so far."""
+        """Add a column that has had no effect so far."""
         self._with_x.append((ORIGIN, ORIGIN))
         i = len(self._with_x) - 1
         self._bent |= {(i, k): (0.0, 0.0) for k in range(i + 1)}
 
     def carry(self, dx: float, dy: float) -> None:
-        """The robot has moved by so many m in odom: x is seen from there now."""
+        """Transform the correlation with x after a move of the robot by `dx`, `dy` m in odom."""
         self._with_x = [(seen_from(a, dx, dy), seen_from(b, dx, dy)) for a, b in self._with_x]
 
     def compose(
         self, p: PoseCovariance, q: PoseCovariance, j: list[Vector], w: list[Vector]
     ) -> PoseCovariance:
-        """Add a stretch with (`q`, `w`) to the way before with (`p`, `j`).
+        """Add a stretch with (`q`, `w`) to the way before it with (`p`, `j`).
 
-        All as seen from the end of the stretch, to where it has been carried. Returns what is to be
-        added to the linear p + q.
+        All arguments are as seen from the end of the stretch, to which `carry` has moved this
+        object. Return the term to add to the linear p + q.
         """
         xyaw, yyaw, yawyaw = p.xyaw, p.yyaw, p.yawyaw
         for x, y, yaw in j:
@@ -97,11 +100,11 @@ class SecondOrder:
     def _bend_noise(
         self, i: int, p: PoseCovariance, q: PoseCovariance, column: Vector, new: Vector
     ) -> None:
-        """M_i += ([J_i, n] + [x, W_i]) / 2"""
+        """Apply M_i += ([J_i, n] + [x, W_i]) / 2."""
         x, y = self._with_x[i]
         by_new_x, by_new_y = brackets(new, p, -0.5)
         by_noise_x, by_noise_y = brackets(column, q, 0.5)
-        # [x, W] / 2 correlates with M as it was, too: twice, once from each side.
+        # [x, W] / 2 also correlates with the earlier M, twice: once from each side.
         ax, ay = bracket(new, plus(plus(x, x), by_new_x))
         bx, by = bracket(new, plus(plus(y, y), by_new_y))
         cx, cy = bracket(column, by_noise_x)
@@ -114,7 +117,8 @@ class SecondOrder:
         )
 
     def _settle(self) -> None:
-        # E[p_i p_k p_l p_m] of unit normals is 3 if all are one, 1 if they are two pairs.
+        # For unit normals E[p_i p_k p_l p_m] is 3 if all are the same one and 1 if they form two
+        # pairs.
         xx, xy, yy = self._noise
         mean_x = mean_y = 0.0
         for (i, k), (x, y) in self._bent.items():

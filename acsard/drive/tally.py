@@ -1,7 +1,8 @@
-"""Events -> log lines: what happens again and again is a line a second, with how often.
+"""Throttles events into log lines: repeated events become one line per second with their number.
 
-Of one name a few lines may come at once, and then one a second; what came meanwhile is counted
-and told with the next. So whoever floods the bus, and a wire that flaps, cannot flood the log.
+A few lines of one name may come at once, and then one per second. The events in between are counted
+and reported with the next line. So neither a client that floods the bus nor a wire that flaps can
+flood the log.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ BURST = 5
 """Lines of one name that may come at once: as fast as people press buttons."""
 
 MOST = 8
-"""Kinds and names told apart in one line: a stranger may send under as many as he likes."""
+"""Kinds and names that one line distinguishes. A stranger may send under any number of them."""
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 
@@ -38,7 +39,7 @@ class _Held:
         _count(self._by, event.by, event.count)
 
     def line(self) -> Event:
-        """All of them in one, as bad as the worst; the words are the last one's."""
+        """Return all of them as one event, with the worst level and the text of the last."""
         last, what = self.last, _numbered(self._kinds)
         if self.count > last.count and last.text:
             what = f"{what or f'{self.count} times'}; the last"
@@ -48,15 +49,15 @@ class _Held:
 
 
 class Tally:
-    """How often each name has been told, and what waits."""
+    """The waiting events, and when each name may have its next line."""
 
     def __init__(self) -> None:
         self._held: dict[EventName, _Held] = {}
         self._free_ns: dict[EventName, int] = {}
-        """When each line of a name so far has had its second."""
+        """Time at which the lines of a name so far are paid for, at a second each."""
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
-        """What to write now, of these and of those that waited."""
+        """Take events; return the lines to write now, from these and from those that waited."""
         for event in events:
             self._held.setdefault(event.name, _Held()).add(event)
         if not self._held:
@@ -65,7 +66,7 @@ class Tally:
         return tuple([self._held.pop(name).line() for name in told])
 
     def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
-        """There is room for a line of this name; it is taken."""
+        """Return whether a line of this name may be written now, and if so charge it."""
         free_ns = self._free_ns.get(name, now_ns)
         if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
             return False
@@ -74,11 +75,11 @@ class Tally:
 
 
 NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
-"""So begins a line that has been put together of several."""
+"""The start of a line that combines several events."""
 
 
 def together(before: Event, line: Event) -> Event:
-    """Two lines of one name as one: how often in all, and the words of the last."""
+    """Return two lines of one name as one, with the total number and the text of the last."""
     count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
     level = max(before.level, line.level, key=LEVELS.index)
     names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))
@@ -94,7 +95,7 @@ def _count(counts: Counter[str], what: str, times: int) -> None:
 
 
 def _numbered(counts: Counter[str]) -> str:
-    """Like `12 x stale, 1 x not_finite`; what came once and alone without its number."""
+    """Return a text like `12 x stale, 1 x not_finite`; a single event has no number."""
     if counts.total() == 1:
         return next(iter(counts))
     return ", ".join(f"{times} x {what}" for what, times in counts.most_common())

@@ -1,4 +1,7 @@
-"""What the log is told of modes, commanders and commands; how often, `drive/tally.py` decides."""
+"""Creates the events about modes, commanders and commands.
+
+`drive/tally.py` decides how often to log.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +11,18 @@ from acsard.drive.words import chosen, waiting
 from acsard.values import Event, Refusal
 
 MAX_SENDER = 124
-"""Characters of a sender's name. A public name has up to 57, and 67 with a certificate; a sender
+"""Characters of a sender's name. A public name has up to 57, and 67 with a certificate. A sender
 without an attachment is named after its key, which it may choose."""
 
 
 def missed(periods: int) -> Event:
-    """So many periods ended without a step."""
+    """Return the event for periods that ended without a step."""
     text = f"{periods} in a row"
     return Event("missed_periods", text, "warning", kind="missed", count=periods, news=False)
 
 
 def refused(refusal: Refusal) -> Event:
-    """A command does not count, or not yet."""
+    """Return the event for a command that does not count, or not yet."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
         return Event("first_contact", refusal.text, by=by, news=False)
@@ -27,15 +30,18 @@ def refused(refusal: Refusal) -> Event:
 
 
 class Told:
-    """The mode and the last commander, as far as the log has them."""
+    """The mode and the last commander that the log knows."""
 
     def __init__(self, mode: Mode) -> None:
         self._mode, self._commander = mode, ("", "")
         self._kept = ""
-        """Who sends speeds in vain, as far as that has been told."""
+        """The source whose speeds do not move the robot, as last logged."""
 
     def changes(self, mode: Mode, choice: Choice, why: str) -> list[Event]:
-        """Another mode, and `why`; another commander than the last, however long ago that was."""
+        """Return the events for a change of the mode (with `why`) and of the commander.
+
+        The last commander counts however long ago it commanded.
+        """
         drives, before, last = mode is Mode.DRIVING, self._mode, self._commander
         if drives:
             self._commander = (choice.source, choice.sender)
@@ -49,7 +55,7 @@ class Told:
         return events + self._kept_waiting(mode, choice)
 
     def _kept_waiting(self, mode: Mode, choice: Choice) -> list[Event]:
-        """Somebody sends speeds that do not move the robot, and that lasts: told once."""
+        """Return an event, once, if a source keeps sending speeds that do not move the robot."""
         wait, kept = choice.wait, ""
         if mode not in (Mode.READY, Mode.DRIVING) or wait.what not in ("neutral", "zeros"):
             self._kept = ""

@@ -1,15 +1,15 @@
-"""How far the twist of one report may be off.
+"""Computes the variances of the twist in one report.
 
     var(v) = quantum + (s_R v)2 + var(d) / T2
     var(w) = quantum + (s_R v)2 + (s_L w)2 + var(dyaw) / T2
 
-Every wheel speed is rounded to the line's quantum q and so has the variance q2 / 12, which the mean
-of a side's two wheels halves; s are the parameters' relative standard deviations (`noise.columns`),
-T is the period a report is the mean of, and var(d) and var(dyaw) are the noise of one period
-(`noise.py`), k |v| / T in all. Whoever integrates reports gets the noise of the pose back.
+Every wheel speed is rounded to the quantum q and so has the variance q2 / 12, which the mean of a
+side's two wheels halves. The s are the parameters' relative standard deviations (`noise.columns`).
+T is the period over which a report is the mean. var(d) and var(dyaw) are the noise of one period
+(`noise.py`), k |v| / T in all, so integrating the reports gives the noise of the pose.
 
-Of wheels that slip all of it is `SLIPPING` times as much. A robot at rest is known to be: only what
-an encoder could not have noticed in that time is left.
+If the wheels slip, all of it is multiplied by `SLIPPING`. A robot at rest is known to be at rest:
+only a motion that the encoders could not have noticed remains.
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ from acsard.drive.noise import SLIPPING, Column, Noise, columns, in_use
 from acsard.values import Twist, TwistVariances
 
 DECIMAL = 0.01
-"""rad/s; a line says a wheel's speed in two decimals."""
+"""rad/s. A line reports a wheel's speed in two decimals."""
 
 MOST = 1e9
-"""rad2/s2; so uncertain a turning says nothing."""
+"""rad2/s2. A greater variance of the turn rate carries no information."""
 
 LEAST = 1e-8
-"""m2/s2 and rad2/s2: 0.1 mm/s. Filters take less for an error."""
+"""m2/s2 and rad2/s2, for 0.1 mm/s. Filters treat a smaller variance as an error."""
 
 PERIOD = 0.01
-"""s, until the first period is known."""
+"""Period that is assumed before the first one is measured, s."""
 
 SMOOTHED = 0.05
-"""Share of a new period in the mean: lines that are read together seem to have none."""
+"""Weight of a new period in the mean. Lines that are read together seem to have no period."""
 
 
 class TwistUncertainty:
-    """The variances of each report's twist; remembers the mean period."""
+    """The variances of each report's twist, by the mean period of the reports."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
-        """`counts` of the encoders per wheel turn, 0 if unknown."""
+        """Start; `counts` are the encoders' counts per wheel turn, 0 if unknown."""
         self._track = kinematics.track
         self.use(odometry)
         self._effects = columns(odometry, kinematics, in_use(odometry))
         self._count = math.tau / counts if counts else 0.0
-        # Of four independent wheels' errors: each side is the mean of two.
+        # The errors of the four wheels are independent, and each side is the mean of two.
         self._to_linear = kinematics.radius**2 / 4 / 12
         self._radius = kinematics.radius
         self._turn_by(self._track)
         self._period = PERIOD
 
     def use(self, odometry: OdometryConfig) -> None:
-        """With this noise from now on."""
+        """Use these noise settings from now on."""
         self._odometry = odometry
         self._lateral = odometry.twist_covariance_diagonal[1]
         self._noise = Noise(odometry, self._track)
 
     def bent_by(self, parameters: tuple[Column, ...], track: float) -> None:
-        """By these columns from now on, and by wheels that are `track` m apart."""
+        """Use these columns and the track of `track` m from now on."""
         self._effects = parameters
         self._turn_by(track)
         self._noise = Noise(self._odometry, track)
@@ -69,12 +69,12 @@ class TwistUncertainty:
         self._to_angular = self._radius**2 / track**2 / 12
 
     def of(self, twist: Twist, dt: float, step: float = 0.0) -> TwistVariances:
-        """Of a report that came `dt` s after the one before; 0 if that is unknown.
+        """Return the variances of a report that came `dt` s after the one before, 0 if unknown.
 
-        `step` is what one count more makes of a wheel's speed, rad/s, where the lines show it.
+        `step` is the quantization step of a wheel's speed, rad/s, if the lines show it, else 0.
         """
         if dt > 0.0:
-            # What comes late, or behind lines that are missing, makes no longer period.
+            # A late line, or one behind missing lines, does not mean a longer period.
             self._period += SMOOTHED * (min(dt, 2 * self._period) - self._period)
         period, linear, angular = self._period, twist.linear, twist.angular
         quantum = max(DECIMAL, self._count / period, step) ** 2
@@ -86,7 +86,7 @@ class TwistUncertainty:
         along += self._to_linear * quantum
         yaw += self._to_angular * quantum
         lateral = self._lateral
-        # No `max`: three calls of it cost as much as half of the rest.
+        # Calls of `max` would be slow here: three of them cost half as much as the rest.
         return TwistVariances(
             along if along > LEAST else LEAST,
             lateral if lateral > LEAST else LEAST,
@@ -94,7 +94,10 @@ class TwistUncertainty:
         )
 
     def at_rest(self, seconds: float, step: float = 0.0) -> TwistVariances:
-        """Of a robot of which no wheel has reported any speed for so long; `step` as in `of`."""
+        """Return the variances of a robot whose wheels reported no speed for `seconds`.
+
+        `step` is the quantization step as in `of`.
+        """
         quantum = (max(self._count, step * self._period) / seconds) ** 2
         return TwistVariances(
             max(LEAST, self._to_linear * quantum),
@@ -103,7 +106,7 @@ class TwistUncertainty:
         )
 
     def slipping(self, variances: TwistVariances) -> TwistVariances:
-        """Of wheels that slip: aside too, which is where a robot skids."""
+        """Return the variances for wheels that slip, which also moves the robot sideways."""
         return TwistVariances(
             min(SLIPPING * variances.linear, MOST),
             min(SLIPPING * variances.lateral, MOST),
@@ -111,5 +114,5 @@ class TwistUncertainty:
         )
 
     def with_gyro(self, variances: TwistVariances, angular: float) -> TwistVariances:
-        """Where a gyro tells the turn with a variance of `angular` rad2/s2."""
+        """Return the variances with that of a gyro's turn rate, `angular` rad2/s2."""
         return TwistVariances(variances.linear, variances.lateral, min(max(LEAST, angular), MOST))

@@ -1,19 +1,19 @@
-"""How far the pose may be off: the covariance of its error, step by step.
+"""Computes the covariance of the pose's error, step by step.
 
-The error is log(estimate^-1 truth) in SE(2) (`se2.py`). A step sees it from the robot's new place
-and adds noise (`noise.py`): P <- F P F' + G Q G'. The parameters' errors stay the same all the way,
-so what each of them bends the pose by is summed as a column, J <- F J + G_p, and
+The error is log(estimate^-1 truth) in SE(2) (`se2.py`). A step transforms it to the robot's new
+place and adds noise (`noise.py`): P <- F P F' + G Q G'. The errors of the parameters stay the same
+all the way, so the effect of each on the pose is summed as a column, J <- F J + G_p, and
 
-    P_total = P + J J' + what is of second order (`second_order.py`)
+    P_total = P + J J' + terms of second order (`second_order.py`)
 
 In nav_msgs/Odometry the covariance is that of x and y along the axes of odom and of yaw. To first
-order the place's error is the twist's, so the same numbers are published: turned by -yaw they are
-those of the Lie algebra in base_link, which still hold when the heading is known badly, where an
-ellipse in x and y cannot be right.
+order the position error is that of the twist, so the same numbers are published. Turned by -yaw
+they are those of the Lie algebra in base_link. These still hold when the heading is badly known and
+an ellipse in x and y cannot be right.
 
-Turning counts as far as it exceeds what encoders feign. A count more on one side and then on the
-other is no turn, but |dyaw| taken line by line would make one of it, 2 to 4 times the yaw's
-variance on a straight. So the heading has play, a count wide, and only what goes beyond counts.
+A turn counts only as far as it exceeds encoder noise. A count more on one side and then on the
+other is not a turn, but |dyaw| per line would count it as one, 2 to 4 times the yaw's variance on a
+straight. Therefore the heading has a play of one count, and only the part beyond it counts.
 """
 
 from __future__ import annotations
@@ -38,31 +38,32 @@ from acsard.drive.second_order import SecondOrder
 from acsard.values import PoseCovariance
 
 MAX_VARIANCE = 1e9
-"""m2 or rad2; a pose this uncertain says nothing, and the numbers must stay finite for years."""
+"""m2 or rad2. A greater variance carries no information, and the numbers must stay finite for
+years."""
 
 COARSE_COUNTS = 400
-"""Per wheel turn, where the configuration does not tell: hardly an encoder has fewer."""
+"""Counts per wheel turn if none are configured. Hardly any encoder has fewer."""
 
 SAME_COUNT = 0.02
-"""Share by which the angle of a count seems another one for the rounding of two decimals."""
+"""Relative difference between two angles of a count that rounding to two decimals can cause."""
 
 NOWHERE = PoseCovariance(MAX_VARIANCE, 0.0, 0.0, MAX_VARIANCE, 0.0, MAX_VARIANCE)
 
 GYRO_SCALE = 0.004
-"""Standard deviation of a gyro's scale, as a share: 1.4 degrees after a turn, 29 after twenty to
-the same side, and none once they are turned back."""
+"""Relative standard deviation of a gyro's scale. It makes 1.4 degrees after a turn, 29 after twenty
+to the same side, and 0 once they are turned back."""
 
 NO_EFFECT: Column = (0.0, 0.0, 0.0, 0.0)
 
 STRETCH = 0.2
-"""m the wheels roll between two looks at what is of second order: it changes slowly."""
+"""Way of the wheels between two updates of the second-order terms, m. These change slowly."""
 
 
 class PoseUncertainty:
-    """The covariance of the pose, in pure floats for the 100 Hz path."""
+    """The covariance of the pose, in plain floats because it is updated at 100 Hz."""
 
     def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
-        """`counts` of the encoders per wheel turn, 0 if unknown."""
+        """Start; `counts` are the encoders' counts per wheel turn, 0 if unknown."""
         self._radius, self._track = kinematics.radius, kinematics.track
         self._half = self._track / 2
         self.use(odometry)
@@ -71,19 +72,24 @@ class PoseUncertainty:
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
         self._dx = self._dy = self._rolled = 0.0
-        """m in odom, and of the wheels' way, since the last look at what is of second order."""
+        """Motion in odom, and way of the wheels, since the last update of the second-order terms,
+        m."""
         self.set(0.0)
 
     def use(self, odometry: OdometryConfig) -> None:
-        """With this noise from now on, and so certain where the pose is set; the parameters and
-        how certain they are stay."""
+        """Use this noise, and this initial covariance for the next `set`, from now on.
+
+        The parameters and their uncertainty stay.
+        """
         self._start = odometry.pose_covariance_diagonal
         self._odometry = odometry
         self._noise = Noise(odometry, self._track)
 
     def bent_by(self, parameters: tuple[Column, ...], track: float) -> None:
-        """By these columns from now on, as many as before, and by wheels that are `track` m apart;
-        what they did until now stays."""
+        """Use these columns, as many as before, and the track of `track` m from now on.
+
+        Their effects until now stay.
+        """
         beside = self._effects[len(self._parameters) :]
         self._effects = (*parameters, *beside)
         self._parameters = parameters
@@ -92,13 +98,16 @@ class PoseUncertainty:
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
-        """A side is the mean of two wheels, each of which may stand anywhere within that, rad."""
+        """Set the angle of a count.
+
+        Each side is the mean of two wheels, which may stand anywhere in it.
+        """
         self._count, count = angle, self._radius * angle
         self._play = count / self._track
         self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / self._track**2, 0.0)
 
     def set(self, yaw: float) -> None:
-        """The pose is as certain as at the start, with its heading at `yaw`."""
+        """Reset the covariance to that of the start, with the heading `yaw`."""
         xx, yy, _, _, _, yawyaw = self._start
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
@@ -106,23 +115,25 @@ class PoseUncertainty:
             self._p = added(self._p, *self._phase, self._cos, self._sin)
         self._effects = self._parameters
         self._columns: list[Vector] = [ORIGIN for _ in self._effects]
-        """J, column by column; behind the parameters' come those that are only once they err."""
+        """J, column by column. Behind the parameters' columns come those that are added when they
+        first err."""
         self._of_gyro = self._of_gaps = -1
-        """Which of them has the turns that a gyro told, and which what went on in gaps."""
+        """Index of the column for turns by a gyro, and of that for motion in gaps; -1 without
+        one."""
         self._columns_before = self._columns
         self._turned = self._middle = 0.0
         self._second = SecondOrder(len(self._effects))
         self._begin_stretch()
         self._lost = False
         self.covariance = self._p
-        """As published: of x, y and yaw in odom."""
+        """The published covariance of x, y and yaw in odom."""
         self._publish()
 
     def show_count(self, angle: float) -> None:
-        """The lines show by themselves what a count of the encoders is, rad; what is configured
-        counts before that.
+        """Take the angle of an encoder count that the lines show, rad, unless one is configured.
 
-        So the pose is one of whole counts: from where in one the robot started is not known either.
+        From now on the pose consists of whole counts, and the start position within a count is
+        unknown too.
         """
         if self._configured or angle <= 0.0:
             return
@@ -137,11 +148,11 @@ class PoseUncertainty:
         self, distance: float, turn: float, dx: float, dy: float, heading: float,
         variance: float | None = None, slips: bool = False, scale: float = GYRO_SCALE,
     ) -> None:  # fmt: skip
-        """An arc of `distance` m through `turn` rad has moved the robot by `dx`, `dy` m in odom.
+        """Add an arc of `distance` m through `turn` rad; in odom it leads by `dx`, `dy` m.
 
-        `heading` is that of its chord. `variance` is that of the turn, rad2, where it is not the
-        wheels that tell it but a gyro: then their parameters bend the distance only, and its
-        `scale`, so uncertain, the turn. `slips` says that the wheels do.
+        `heading` is the direction of the chord. `variance` is that of the turn, rad2, if a gyro
+        measured it instead of the wheels. Then the wheels' parameters affect only the distance, and
+        the gyro's relative `scale` error affects the turn. `slips` means that the wheels slip.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -165,16 +176,17 @@ class PoseUncertainty:
         self._publish()
 
     def doubt(self, along: float, yaw: float) -> None:
-        """The last way may have been another one: m2 along it, rad2 of heading."""
+        """Add variances to the last way: `along` m2 in its direction, `yaw` rad2 of heading."""
         if not self._lost:
             self._p = added(self._p, along, yaw, 0.0, self._cos, self._sin)
             self._publish()
 
     def stand(self, distance: float, turn: float, along: float, yaw: float) -> None:
-        """It may have gone on unseen by `distance` and `turn`, or stood: the pose says it stood.
+        """Account for a gap in which the robot may have moved on by `distance` and `turn`, unseen.
 
-        So does every gap: such errors all point one way and do not average out, which makes them a
-        column like a parameter's. `along` m2 and `yaw` rad2 are how well that is known.
+        The pose stands still in a gap. Such errors all have one direction and do not average out,
+        so they form a column like a parameter. `along` m2 and `yaw` rad2 are the variances of the
+        unseen motion.
         """
         if self._lost:
             self._forget_where(distance, turn)
@@ -185,7 +197,7 @@ class PoseUncertainty:
         self._columns = [*self._columns]
         gone_on = plus(self._columns[self._of_gaps], (c * distance, s * distance, turn))
         self._columns[self._of_gaps] = gone_on
-        # An unknown arc leads to any side.
+        # An unknown arc may lead to either side.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
         way_along, way_yaw, both = self._noise.of(distance, turn, abs(turn))
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
@@ -193,7 +205,7 @@ class PoseUncertainty:
         self._publish()
 
     def _widen(self) -> int:
-        """One column more, of which nothing has come so far; which it is."""
+        """Add a column without effect so far; return its index."""
         self._effects = (*self._effects, NO_EFFECT)
         self._columns = [*self._columns, ORIGIN]
         self._columns_before = [*self._columns_before, ORIGIN]
@@ -201,12 +213,15 @@ class PoseUncertainty:
         return len(self._columns) - 1
 
     def _forget_where(self, distance: float, turn: float) -> None:
-        """Who moves without a known heading, or place, knows neither."""
+        """Give up the position.
+
+        A robot that moves without a known heading or position knows neither.
+        """
         if distance or turn:
             self.covariance = NOWHERE
 
     def _beyond_play(self, turn: float) -> float:
-        """rad of `turn` that are no encoder noise."""
+        """Return the part of `turn` that is not encoder noise, rad."""
         self._turned += turn
         off = self._turned - self._middle
         if abs(off) <= self._play:
@@ -218,13 +233,13 @@ class PoseUncertainty:
     def _bend(
         self, distance: float, turn: float, dx: float, dy: float, scale: float | None
     ) -> None:
-        """F J + G_p; half of what the step itself errs by in its turn has it as its lever.
+        """Apply F J + G_p. One half of the step's own heading error acts on its lever arm.
 
-        `scale` is the gyro's that tells the turn; None is that the wheels do.
+        `scale` is that of the gyro that measured the turn, None if the wheels did.
         """
         c, s, more = self._cos, self._sin, 0.0
         columns: list[Vector] = []
-        # Of four columns at 100 Hz: names cost less than places in a tuple.
+        # With four columns at 100 Hz, unpacking into names is faster than indexing tuples.
         for (x, y, yaw), effect in zip(self._columns, self._effects, strict=True):
             of_distance, of_turn, turn_of_distance, turn_of_turn = effect
             along = of_distance * distance + of_turn * turn
@@ -242,7 +257,7 @@ class PoseUncertainty:
         self._dx = self._dy = self._rolled = 0.0
 
     def _end_stretch(self) -> None:
-        """Look at what the way since the last look adds to second order."""
+        """Add the second-order terms of the way since the last update."""
         dx, dy, p = self._dx, self._dy, self._p
         before = carried(self._before, dx, dy)
         columns_before = [seen_from(column, dx, dy) for column in self._columns_before]
@@ -276,7 +291,7 @@ class PoseUncertainty:
 
 
 def _capped(p: PoseCovariance) -> PoseCovariance:
-    """No variance over the maximum, and the same correlations."""
+    """Return the covariance with capped variances and the same correlations."""
     x, y, yaw = (
         min(1.0, math.sqrt(MAX_VARIANCE / max(v, MAX_VARIANCE))) for v in (p.xx, p.yy, p.yawyaw)
     )

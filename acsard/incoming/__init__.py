@@ -1,1 +1,2 @@
-"""Pure: what comes in over the bus: samples -> commands, queries -> replies or requests."""
+"""Pure package for input from the bus: decodes samples into commands, and queries into replies or
+requests."""

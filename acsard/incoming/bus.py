@@ -1,4 +1,4 @@
-"""The bus as the control loop sees it; `bus/bus.py` is the real one."""
+"""The bus as the control loop sees it. `bus/bus.py` implements it with Zenoh."""
 
 from __future__ import annotations
 
@@ -14,52 +14,53 @@ from acsard.values import RoutersStatus
 
 
 class BusInput(Struct, frozen=True):
-    """What came over the bus since the last call."""
+    """Input from the bus since the last call."""
 
     arrivals: tuple[Arrival, ...] = ()
     queries: tuple[Query, ...] = ()
     overrun: int = 0
-    """Samples dropped because they came faster than they could be taken."""
+    """Number of samples that were dropped because they came faster than the control loop took
+    them."""
     dropped: int = 0
-    """Messages of ours dropped because the bus did not take them in time."""
+    """Number of published messages that were dropped because the bus did not take them in time."""
     stuck: bool = False
-    """The bus has just been found not to take them at all."""
+    """True once when the bus starts to block."""
     routers: RoutersStatus | None = None
-    """What is connected of `bus.connect`, if that has changed."""
+    """The connections of `bus.connect` if they have changed, else None."""
 
 
 NOTHING = BusInput()
-"""What nearly every step hears."""
+"""The input of nearly every step."""
 
 
 class Waker(Protocol):
-    """Whom the bus tells, from whatever thread, that something came in."""
+    """The receiver of wake-ups from the bus, called on any thread."""
 
     def command(self) -> None:
-        """What may be a command."""
+        """Report a sample that may be a command."""
 
     def stop(self) -> None:
-        """A stop."""
+        """Report a stop."""
 
 
 class Bus(Protocol):
-    """The bus as the loop sees it."""
+    """The methods of the bus that the control loop calls."""
 
     @property
     def wanted(self) -> AbstractSet[str]:
-        """Published keys that somebody listens to."""
+        """Published topics that have a listener."""
 
     def take(self, queries: int) -> BusInput:
-        """What came in since the last call, at most so many queries."""
+        """Return the input since the last call, with at most `queries` + 1 queries."""
 
     def publish(self, key: str, message: Message) -> None:
-        """Leave a message for its listeners, until `flush`."""
+        """Queue a message for its listeners. `flush` sends it."""
 
     def flush(self) -> None:
-        """Have what was published sent; never waits for it."""
+        """Send the queued messages. Never wait for it."""
 
     def reply(self, reply: Reply) -> None:
-        """Answer a query by its ticket."""
+        """Reply to the query that holds the ticket `reply.ticket`."""
 
     def retire(self, ticket: int) -> None:
-        """No more replies by this ticket."""
+        """End the query of this ticket: it gets no more replies."""

@@ -1,7 +1,8 @@
-"""A sample from the bus -> a `Command` or a `Request`, or the reason it is refused.
+"""Decodes a sample from the bus into a `Command` or a `Request`, or refuses it with a reason.
 
-Refused whole, never in part: a command that cannot be decoded, is too big, holds NaN or infinity
-in any field that is for us, or came by a wildcard key or a DELETE refreshes nothing.
+A command is refused as a whole, never in part, and a refused command does not refresh the motion.
+Reasons are a payload that cannot be decoded or is too big, NaN or infinity in any field that the
+daemon reads, a wildcard key, and a DELETE.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpe
 from acsard.values import Twist as BodyTwist
 
 MAX_COMMAND_BYTES = 4096
-"""A TwistStamped is under 300 bytes as JSON; more than this is not a command."""
+"""Limit of a payload. A TwistStamped takes less than 300 bytes as JSON."""
 
 REPLACED_NS = NS_PER_S // 2
-"""Zenoh replaces timestamps that are further ahead of our clock."""
+"""Zenoh replaces a timestamp that is further ahead of the daemon's clock than this."""
 
 Via = Literal["native"] | Transport
-"""The tree a sample or query came by."""
+"""The tree of keys on which a sample or query came."""
 
 
 class Arrival(Struct, frozen=True):
-    """A sample as the bus shell took it from Zenoh, key below `acsard/<id>/`.
+    """A sample as the bus shell took it from Zenoh, with the key below `acsard/<id>/`.
 
-    One that came on a ROS key has the native key it stands for.
+    A sample on a ROS key has the native key that it stands for.
     """
 
     key: str
@@ -55,17 +56,18 @@ class Arrival(Struct, frozen=True):
     encoding: str
     arrived_ns: int
     stamp_ns: int | None
-    """Zenoh's timestamp, when it is the sender's."""
+    """Zenoh's timestamp if the sender or a router set it, wall clock in ns."""
     sender: str
-    """Whose that is; "" without one, and of a router's."""
+    """The id of the Zenoh session that stamped the sample, "" if none did or if a router did."""
     via: Via = "native"
     attachment: bytes = b""
     received_ns: int | None = None
-    """Zenoh's timestamp, when it is our own: there was none, or one too far ahead of our clock."""
+    """Zenoh's timestamp if the daemon's own session set it, because the sample had none or one too
+    far ahead of the daemon's clock."""
 
 
 class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
-    """A Twist or a TwistStamped, told apart by the fields it has."""
+    """A Twist or a TwistStamped, distinguished by the fields that are set."""
 
     linear: Vector3 | UnsetType = UNSET
     angular: Vector3 | UnsetType = UNSET
@@ -74,11 +76,12 @@ class _TwistPayload(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 TWIST_CDR_BYTES, STAMPED_CDR_BYTES = 52, 68
-"""A Twist in CDR, and a TwistStamped at the least: often nothing else tells them apart."""
+"""Size of a Twist in CDR and the least size of a TwistStamped. Often only the size distinguishes
+the two."""
 
 TWISTS = ("geometry_msgs/msg/Twist", "acsard.Twist.v1")
 STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
-"""What an Encoding may call them."""
+"""Type names that an Encoding may carry for the two messages."""
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
@@ -95,11 +98,11 @@ EXAMPLES: dict[Verb, str] = {
 """An example payload of each service that takes one."""
 
 MAY_BE_PLAIN: tuple[Verb, ...] = ("clear", "activate")
-"""Services that may also come without their payload."""
+"""Services that may also be called without a payload."""
 
 
 class Receiver:
-    """Decodes what commanders send, by the key it came on."""
+    """The decoder of commands, by the key on which they came."""
 
     def __init__(self, joints: JointsConfig, kinematics: Kinematics) -> None:
         self._joints = joints.as_tuple()
@@ -107,7 +110,7 @@ class Receiver:
         self._bindings = Bindings()
 
     def command(self, arrival: Arrival) -> Command:
-        """The command in a sample on `cmd/…` or `wheel_cmd/…`; raises `DecodeError`."""
+        """Decode a sample on `cmd/…` or `wheel_cmd/…` into a command; raise `DecodeError`."""
         kind, source, certificate = parts(arrival.key)
         if "*" in arrival.key or "/" in certificate:
             raise DecodeError("wildcard", f"a command needs its exact key, not {arrival.key}")
@@ -122,7 +125,8 @@ class Receiver:
         else:
             twist, header, cancelled = self._wheel_speeds(arrival)
         if header is not None and header.stamp.to_ns() > 0 and not said.steady:
-            # The header has a clock of its own, with a name of its own.
+            # The header's stamp comes from another clock than the envelope's, so it gets a name of
+            # its own.
             stamp_ns = header.stamp.to_ns()
             clock = f"{clock}, header on {arrival.via}/{arrival.key}"
         if said.signed:
@@ -176,7 +180,7 @@ class Receiver:
                 "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}, once"
             )
         places = [got.name.index(joint) for joint in self._joints]
-        # What is told of other joints, say of an arm, is not for us.
+        # Values of other joints, for example of an arm, are not for this daemon.
         velocity, position, effort = (
             [told[place] for place in places] if len(told) == count else told
             for told in (got.velocity, got.position, got.effort)
@@ -192,7 +196,10 @@ class Receiver:
     def request(
         verb: Verb, ticket: int, encoding: str, payload: bytes, asked_ns: int | None = None
     ) -> Request:
-        """The request in a service query, to be answered by `ticket`; raises `DecodeError`."""
+        """Decode a service query into a request that is answered by `ticket`.
+
+        Raise `DecodeError` if it is not a valid request.
+        """
         if verb not in EXAMPLES or (verb in MAY_BE_PLAIN and not payload):
             return Request(verb, ticket, asked_ns=asked_ns)
         if len(payload) > MAX_COMMAND_BYTES:
@@ -220,11 +227,12 @@ class Voice(Struct, frozen=True):
     stamp_ns: int | None = None
     sequence: int | None = None
     shared: bool = False
-    """Several programs may share this identity."""
+    """Whether several programs may share this identity."""
     steady: bool = False
-    """Nobody adjusts the clock of its stamps."""
+    """Whether the clock of the stamps is steady, so that nobody adjusts it."""
     signed: str = ""
-    """The public name without the certificate, "" unless a native command has one of its own."""
+    """The public name without the certificate, "" unless a native command carries an id of its
+    own."""
 
 
 def parts(key: str) -> tuple[str, str, str]:
@@ -282,7 +290,7 @@ def sender(arrival: Arrival) -> str:
     """Return the sender's name, also if the attachment of an rmw cannot be read."""
     if arrival.via == "rmw":
         gid = arrival.attachment[-GID_BYTES:]
-        # A shorter one could look like the public name of a sender without a name.
+        # A shorter GID could look like the public name of a sender without a name.
         return _by_gid(gid) if len(gid) == GID_BYTES else ""
     return voice(arrival).sender
 
@@ -291,7 +299,7 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
     if detect(arrival.encoding, arrival.payload) != "cdr":
         return _twists.decode(arrival.encoding, arrival.payload)
     named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
-    # Without a name by the length; DDS pads to a multiple of four.
+    # Without a type name the size decides. DDS pads to a multiple of four.
     plain, told = named in TWISTS, named in TWISTS + STAMPED_TWISTS
     if plain or (not told and size < TWIST_CDR_BYTES + 4):
         twist = decode_cdr(Twist, arrival.payload)

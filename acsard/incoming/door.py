@@ -1,4 +1,4 @@
-"""What the door to the network says of itself -> what `state` counts of it."""
+"""Counts what the TLS gateway reports about itself, for the counters in `state`."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ _decoder = Decoder(DoorState)
 
 
 class DoorTold:
-    """Follows one door after the other."""
+    """Follower of the TLS gateway's reports, also across restarts of the gateway."""
 
     def __init__(self) -> None:
         self._last = DoorState(0, 0, 0)
 
     def hear(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
-        """Count what is new in it; when the certificate ends, if it tells."""
+        """Count the news in a report.
+
+        Return the wall time at which the certificate ends, if it is known.
+        """
         try:
             told = _decoder.decode(arrival.encoding, arrival.payload)
         except DecodeError:
-            return None  # only who is at the machine may write here: not worth more
+            return None  # only local programs may write on this key, so a bad report is ignored
         last = self._last
         if told.opened != last.opened:
             counters["door_opened"] += 1

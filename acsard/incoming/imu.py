@@ -1,8 +1,9 @@
-"""A sample on `imu` -> what the gyro says about base_link's z, or the reason it is refused.
+"""Decodes a sample on `imu` into the turn rate about base_link's z axis, or refuses it.
 
-A sensor_msgs/Imu in any encoding; of JSON and msgpack only `angular_velocity` is required. Its z
-points up: a turn to the left is positive. Of several that send the first is followed, and another
-one once that is silent: two gyros have two biases, so that its first sample is marked.
+The sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
+required. Its z axis points up, so a turn to the left is positive. If several gyros send, the daemon
+follows the first one and changes to another when that one is silent. Two gyros have two biases, so
+the first sample after a change is marked.
 """
 
 from __future__ import annotations
@@ -20,22 +21,22 @@ from acsard.messages.signature import public_name
 from acsard.values import NS_PER_S, Event, GyroSample
 
 MAX_RATE = 50.0
-"""rad/s; no base turns so fast, and no gyro on one measures it."""
+"""rad/s. No base turns so fast, and no gyro on a base measures it."""
 
 FOLLOWED_NS = NS_PER_S // 2
-"""How long who was heard last is waited for."""
+"""Silence after which the daemon may follow another gyro, ns."""
 
 OWN = "gyro of the simulator/own"
 """The sender id with which the simulator signs the samples of its gyro."""
 
 MOST_WHO = 64
-"""Characters of a sender's name that are told."""
+"""Characters of a sender's name that an error message shows."""
 
 UNTOLD = [0.0] * 9
 
 
 class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """An Imu of which only the turn rate must be there."""
+    """An Imu in which only the turn rate is required."""
 
     header: Header = Header()
     orientation: Quaternion = Quaternion()
@@ -50,10 +51,13 @@ _readings = Decoder(_Reading)
 
 
 class ImuTold:
-    """Follows the gyros on the bus, one at a time."""
+    """Follower of the gyros on the bus, one at a time."""
 
     def __init__(self, own: bool = False) -> None:
-        """`own`: the robot is the simulated one, which has a gyro and follows no other."""
+        """Start.
+
+        With `own` the robot is the simulated one, whose gyro is the only one that counts.
+        """
         self._own = own
         self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS
@@ -61,7 +65,7 @@ class ImuTold:
     def hear(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
-        """The sample; None for one that is refused, which is counted and told by its reason."""
+        """Decode a gyro sample. Count and log a refused one and return None."""
         try:
             sample = reading(arrival)
             anew = self._follow(sender(arrival), arrival.arrived_ns)
@@ -72,7 +76,7 @@ class ImuTold:
         return replace(sample, anew=True) if anew else sample
 
     def _follow(self, who: str, now_ns: int) -> bool:
-        """Whether another one was followed until now."""
+        """Follow this sender; return whether another one was followed before."""
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
             raise DecodeError("second_sender", f"{who[:MOST_WHO]} sends beside {self._followed}")
@@ -81,7 +85,7 @@ class ImuTold:
 
 
 def reading(arrival: Arrival) -> GyroSample:
-    """What one sample says; raises `DecodeError`. Orientation and acceleration do not matter."""
+    """Decode one sample; raise `DecodeError`. Orientation and acceleration are ignored."""
     if not arrival.put:
         raise DecodeError("not_a_put", "a DELETE is not a sample")
     if len(arrival.payload) > MAX_COMMAND_BYTES:
@@ -95,7 +99,8 @@ def reading(arrival: Arrival) -> GyroSample:
     said = (rate.x, rate.y, rate.z, variances[8])
     if not all(map(math.isfinite, said)):
         raise DecodeError("not_finite", "NaN or infinity in the angular velocity")
-    if variances[0] == -1.0:  # so sensor_msgs/Imu says that it has none
+    # sensor_msgs/Imu marks an absent measurement by -1 in the first variance.
+    if variances[0] == -1.0:
         raise DecodeError("no_rate", "this IMU measures no angular velocity")
     if variances[8] < 0.0:
         raise DecodeError("wrong_shape", f"a variance of {variances[8]:g}")

@@ -1,7 +1,7 @@
-"""A query -> its reply, or the `Request` it makes of the robot.
+"""Answers a query, or turns it into the `Request` to the robot that it stands for.
 
-Services run only when the query's key is exactly theirs: a get on `<id>/**` must never stop or
-clear anything. Everything else may also be asked by wildcard.
+A service runs only if the query's key is exactly its own, because a get on `<id>/**` must never
+stop or clear anything. All other keys may also be queried by wildcard.
 """
 
 from __future__ import annotations
@@ -56,16 +56,16 @@ BUSY = "busy: too many queries at once; ask again"
 
 
 class Query(Struct, frozen=True):
-    """A query as the bus shell took it from Zenoh, keys below `acsard/<id>/`."""
+    """A query as the bus shell took it from Zenoh, with keys below `acsard/<id>/`."""
 
     ticket: int
-    """What it is answered by."""
+    """The number by which replies name the query."""
     topic: str
-    """The row of the topic table it reached."""
+    """The row of the topic table that the query matched."""
     asked: str
-    """The key expression the client wrote."""
+    """The key expression that the client wrote."""
     fmt: str
-    """The `fmt` parameter, "" when there is none."""
+    """The `fmt` parameter, "" if it is absent."""
     payload: bytes
     encoding: str
     arrived_ns: int | None = None
@@ -74,10 +74,10 @@ class Query(Struct, frozen=True):
 
 
 class Reply(Struct, frozen=True):
-    """What goes back; `ok` False is an error reply."""
+    """A reply to a query; with `ok` False an error reply."""
 
     ticket: int
-    """Of the query it answers."""
+    """The ticket of the query."""
     key: str
     payload: bytes
     encoding: str
@@ -86,18 +86,19 @@ class Reply(Struct, frozen=True):
 
 
 class _Waiting(Struct, frozen=True):
-    """Who waits for the robot's answer: the key and encoding of the reply, and whom to echo."""
+    """The data needed to reply when the robot answers: key, encoding and the attachment to echo."""
 
     key: str
     form: Format
     asked: Attachment | None
     ros: bool = False
     wish: bytes = b""
-    """The request to set parameters that it is, which the reply has to fit."""
+    """The payload of a ROS request that sets parameters, "" for others. The reply must match its
+    form."""
 
 
 class Queries:
-    """Answers queries from what it was given at the start and the present values."""
+    """The answers to queries, from constant values and the present messages."""
 
     def __init__(self, config: Config, info: Info) -> None:
         self._config = config
@@ -108,10 +109,10 @@ class Queries:
         }
         self._parameters = Parameters(effective(config))
         self._waiting: dict[int, _Waiting] = {}
-        """By ticket."""
+        """Service calls that wait for the robot's answer, by ticket."""
 
     def use(self, config: Config) -> None:
-        """Tell of this configuration from now on."""
+        """Answer with this configuration from now on."""
         self._config = config
         self._fixed["config"] = effective(config)
         self._parameters = Parameters(effective(config))
@@ -119,9 +120,10 @@ class Queries:
     def serve(
         self, query: Query, current: Current, outputs: Outputs | None
     ) -> list[Reply] | Request:
-        """The replies to a query, none when it is not for us; a `Request` when it is a service.
+        """Answer a query: return its replies, or the `Request` of a service.
 
-        Raises `DecodeError` for a ROS request that cannot be served; `refused` has its reply.
+        The list is empty if the query is not for this daemon. Raises `DecodeError` for a ROS
+        request that cannot be served; `refused` builds the reply to it.
         """
         if query.via != "native":
             return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
@@ -138,7 +140,7 @@ class Queries:
             return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
 
     def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
-        """The reply that carries a robot's answer now; None when nobody waits for it."""
+        """Return the reply that carries the robot's answer, or None if no query waits for it."""
         waiting = self._waiting.pop(answer.id, None)
         if waiting is None:
             return None
@@ -154,7 +156,7 @@ class Queries:
         return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
 
     def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
-        """A std_srvs/Trigger, or one of the parameter services."""
+        """Serve a std_srvs/Trigger or a ROS parameter service."""
         asked = unpack(query.attachment) if query.via == "rmw" else None
         by = asker(query.via, query.attachment)
         verb = VERBS.get(query.topic)
@@ -218,9 +220,9 @@ class Queries:
 
 
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
-    """The reply to a query that is not served; None where no reply would find its caller.
+    """Return the refusal of a query, or None if no reply could find its caller.
 
-    ROS clients hear no errors: theirs is an answer that says no.
+    ROS clients do not receive error replies, so they get a normal response that reports a failure.
     """
     if query.via == "native":
         return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
@@ -237,17 +239,17 @@ def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
 
 
 def most_bytes(topic: str) -> int:
-    """How much of a query's payload is worth keeping."""
+    """Return how many bytes of a query's payload are worth keeping."""
     return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
 
 
 def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
-    """What rmw_zenoh finds the caller of a reply by: the request's sequence and GID."""
+    """Return the attachment by which rmw_zenoh matches a reply: the request's sequence and GID."""
     return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
 
 
 def _format(query: Query) -> Format:
-    """The encoding asked for: `?fmt=`, else a service's own payload's, else JSON for people."""
+    """Return the reply's encoding: `?fmt=`, else that of a service's payload, else JSON."""
     for form in FORMATS:
         if query.fmt == form:
             return form
@@ -259,12 +261,12 @@ def _format(query: Query) -> Format:
         try:
             return detect(query.encoding, query.payload)
         except DecodeError:
-            pass  # a service that takes no payload does not mind one
+            pass  # a service without a payload ignores one that cannot be decoded
     return "json"
 
 
 def topic_table(config: Config) -> Topics:
-    """The table with this robot's full keys."""
+    """Return the topic table with this robot's full keys."""
     robot = config.robot.id
     return Topics(
         [
@@ -275,7 +277,7 @@ def topic_table(config: Config) -> Topics:
 
 
 def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
-    """Command and state interfaces, named as ros2_control does."""
+    """Return the command and state interfaces, named as in ros2_control."""
     linked = outputs is not None and outputs.linked
     claimed = outputs is not None and outputs.mode == "driving"
     joints = config.joints.as_tuple()

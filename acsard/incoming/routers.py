@@ -1,4 +1,4 @@
-"""What is connected of `bus.connect` -> what the log and the counters are told."""
+"""Reports changes in the connections of `bus.connect` to the log and the counters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PEER = (
 
 
 class RoutersTold:
-    """Follows the routers that this daemon is to be connected to."""
+    """Follower of the endpoints that this daemon should be connected to."""
 
     def __init__(self) -> None:
         self.status = RoutersStatus()
@@ -22,7 +22,7 @@ class RoutersTold:
     def hear(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
-        """What is connected now; each that went or came is told."""
+        """Take the present status. Log and count each connection that was lost or made."""
         before, self.status = self.status, status
         gone = [one for one in status.missing if one not in before.missing]
         come = [one for one in status.connected if one not in before.connected]

@@ -1,1 +1,2 @@
-"""The microcontroller's serial line, pure: wire time, lines, frames and the session."""
+"""Pure package for the board's serial line: wire time, lines, frames, sample times and the
+session."""

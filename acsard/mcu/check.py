@@ -1,11 +1,12 @@
-"""The checked line: the plain one with a suffix that proves it whole and says what it answers.
+"""Encodes and decodes the checked line: the plain line with a sequence number and a CRC.
 
     command  ap12.50,bn08.75,cp15.00,dn10.25#07S*HHHH
     reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
 
-`#` and the sequence, two digits; then the letters of a command's requests, or the sample fields of
-a reply that was asked for them; `*` and the CRC-16/XMODEM of everything before it. All digits are
-hexadecimal and upper-case: a line has one right form. The plain part is `codec.py`'s.
+After `#` come two digits of the sequence. Then a command has the letters of its requests, and a
+reply has the sample fields if the command asked for them. After `*` comes the CRC-16/XMODEM of
+everything before it. All digits are upper-case hexadecimal, so each line has one correct form.
+`codec.py` handles the plain part.
 """
 
 from __future__ import annotations
@@ -18,24 +19,25 @@ from msgspec import Struct
 from acsard.mcu.codec import FrameError
 
 SEQUENCES = 256
-"""The sequence counts modulo this."""
+"""The sequence counts modulo this number."""
 
 ASK_SAMPLE = b"S"
 """The request letter that asks for the sample fields."""
 
 ASK_NOTHING = b"H"
-"""A request letter that asks for nothing, which an MCU ignores: a line that comes back with it is
-an echo, for no reply has one."""
+"""A request letter that asks for nothing and that the board ignores. No reply carries letters, so a
+line that comes back with it is an echo."""
 
-# The plain part's characters too: zero bytes in front of a line do not change an XMODEM check.
+# The pattern also restricts the characters of the plain part, because zero bytes in front of a line
+# do not change an XMODEM CRC.
 _REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
 
 
 class Reading(Struct, frozen=True):
-    """The sample fields: the MCU's milliseconds when it read its encoders, and what they showed.
+    """The sample fields of a reply, taken when the board read its encoders.
 
-    `counts` are those of the motors a to d, up when the motor turns in its `p` direction; all five
-    are modulo 65536.
+    `mcu_ms` is the board's clock in ms. `counts` are those of the motors a to d; they rise when the
+    motor turns in its `p` direction. All five numbers are modulo 65536.
     """
 
     mcu_ms: int
@@ -43,7 +45,7 @@ class Reading(Struct, frozen=True):
 
 
 class Checked(Struct, frozen=True):
-    """A reply whose check is right: its plain part, the sequence it answers and its sample."""
+    """A reply with a correct CRC: its plain part, the sequence that it answers and its sample."""
 
     plain: bytes
     sequence: int
@@ -51,13 +53,13 @@ class Checked(Struct, frozen=True):
 
 
 def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
-    """The command line (with its CR LF) with the suffix for this sequence and these requests."""
+    """Return a command line (ending in CR LF) with this sequence, these requests and the CRC."""
     body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
 def unseal(line: bytes) -> Checked:
-    """The parts of a reply without its end; raises `FrameError` unless all of it is right."""
+    """Return the parts of a reply without its line end; raise `FrameError` if any part is wrong."""
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line

@@ -1,10 +1,11 @@
-"""Which line of ours a reply answers, where the reply does not say: the lines that left in order.
+"""Assigns each reply of a prompted board to the command line that it answers.
 
-An MCU that answers each line makes its report then, so the lines that left are its clock: a reply
-is as far from the one before as the lines are apart that they answer, whenever they are read, and
-where no line left nothing is missing. Replies come in the order of the lines. One that comes later
-than usual by more than half of what its line is apart from the next belongs to that next one, and
-its own is lost.
+A plain reply does not name its line. But a board that answers each line samples at that moment, so
+the times at which the lines left are the sample times. Two replies are as far apart as their lines,
+whenever the host reads them, and where no line left no reply is missing.
+
+Replies come in the order of the lines. If a reply is later than usual by more than half the
+distance from its line to the next one, it answers that next line and the reply before it was lost.
 """
 
 from __future__ import annotations
@@ -16,50 +17,55 @@ from msgspec import Struct
 from acsard.values import NS_PER_S
 
 MEMORY = 64
-"""Lines whose answers may still come."""
+"""Lines that are remembered because their replies may still come."""
 
 GAIN = 0.05
-"""How quickly the usual delay and its spread follow."""
+"""Gain per reply or read of the filters for the usual delay, its spread and the batches."""
 
 SLOW = 0.0125
-"""How quickly it shows whose that spread is."""
+"""Gain per read of the slower filter that decides whether the spread is the board's."""
 
 LEAST = 0.002
-"""How quickly the least delay is forgotten: in 500 answers."""
+"""Gain per reply with which the least delay is forgotten: a time constant of 500 replies."""
 
 RARE = 0.002
-"""Share of answers lost, below which of two lines close to each other none is taken to be."""
+"""Share of lost replies. Below it, a line that another one follows closely does not count as
+lost."""
 
 JITTER_NS = 350_000
-"""What USB and the scheduler make of a constant delay: its mean deviation."""
+"""Mean deviation that USB and the scheduler add to a constant delay, ns."""
 
 THOUGHT_NS = 800_000
-"""A mean deviation that USB and the scheduler hardly make."""
+"""Mean deviation that USB and the scheduler rarely cause, ns. Above it, the board's delay
+varies."""
 
 RISE_NS = 20_000
-"""By which a batched link's least delay is forgotten, read by read."""
+"""Rise of a batched link's least delay per read, by which the link forgets it, ns."""
 
 LOSING = 0.005
-"""How quickly the share of lost answers follows: in 20 reads two lost ones would make it 3 %."""
+"""Gain per read of the share of lost replies. It is slow, because over 20 reads two lost replies
+would already make it 3 %."""
 
 MOST_LOST = 0.03
-"""Share of answers lost on a batched link, from which on any line may be without one."""
+"""Share of lost replies on a batched link. Above it, any line may lack its reply."""
 
 SEVERAL = 0.15
-"""Share of the reads that have several lines; more are an adapter's, and not of stalls alone."""
+"""Share of the reads that hold several lines. Above it, an adapter batches lines; host stalls alone
+cause fewer."""
 
 THINKS = 0.6
-"""Share of the late reads whose spread is that, from which on it is the MCU's own: an adapter that
-is filled line by line makes it too, for a quarter of a second."""
+"""Filtered share of the reads with a varying delay. Above it, the variation is the board's own. An
+adapter that is filled line by line causes it too, but only for a quarter of a second."""
 
 BATCH_NS = 2_000_000
-"""A mean deviation that no MCU makes: an adapter holds the lines back."""
+"""Mean deviation that no board causes, ns: an adapter holds the lines back."""
 
 
 class Answered(Struct, frozen=True, gc=False):
-    """How a reply's line is apart from that of the reply before it; None for a first one.
+    """The time between a reply's line and the line of the reply before it.
 
-    In s; `bridged` of it are without a reply. `due_ns` is when the reply should be complete.
+    `dt` is that time in s, None for a first reply. For `bridged` s of it no reply came. `due_ns` is
+    the monotonic time at which the reply should be complete.
     """
 
     dt: float | None
@@ -68,54 +74,61 @@ class Answered(Struct, frozen=True, gc=False):
 
 
 class Prompts:
-    """Remembers the lines that left; `read` and then `answer` for each of its lines."""
+    """The lines that left, matched with the replies.
+
+    Call `read` for each read and then `answer` or `skip` for each of its lines.
+    """
 
     def __init__(self, soonest_ns: int) -> None:
-        """`soonest_ns` is what a line and its answer take on the wire alone."""
+        """Start; `soonest_ns` is the wire time of a line and its reply."""
         self._soonest = soonest_ns
         self._left: deque[int] = deque(maxlen=MEMORY)
         self.forget()
 
     def forget(self) -> None:
-        """What was sent until now is answered, or nobody will."""
+        """Forget all lines: they are answered or will never be."""
         self._left.clear()
         self._delay: float | None = None
         self._spread = self._least = 0.0
-        """The usual delay's mean deviation; the least one, ns."""
+        """Mean deviation of the usual delay, and the least delay; both ns."""
         self._made: int | None = None
         self._apart = self._missing = 0.0
-        """When the last line left, how far two usually are apart, the share of answers lost."""
+        """Time at which the last line was made, usual distance of two lines, share of lost
+        replies."""
         self._last: int | None = None
-        """When the line left that was answered last, and what its answer took beyond the usual."""
+        """Time of the line that was answered last, plus the excess of its reply over the usual
+        delay, ns."""
         self._passed = self._line = 0
-        """The last line that is answered or given up, and the last that is answered."""
+        """Times of the last line that is answered or given up, and of the last that is answered."""
         self._lost = False
-        """The last lone answer made us give up the line before its own."""
+        """Whether the last lone reply made the code give up the line before its own."""
         self._at, self._alone = 0, False
         self._base, self._batch, self._losses = 0.0, 2e7, 0.0
-        """Of a batched link: the least delay, ns, between two reads, and the share of the lost."""
+        """For a batched link: least delay and usual distance of two reads, both ns, and share of
+        lost replies."""
         self._several = 0.0
-        """Share of the reads that have several lines."""
+        """Share of the reads that hold several lines."""
         self._thinking = 0.0
-        """Share of the reads in which the answers' delay varied as neither makes it."""
+        """Filtered share of the reads in which the delay varied more than a scheduler or an adapter
+        causes."""
 
     @property
     def thinks(self) -> bool:
-        """The answers' delay varies as no scheduler makes it, nor an adapter: it is the MCU's."""
+        """Whether the board's own delay varies, more than a scheduler or an adapter causes."""
         return self._thinking > THINKS and not self._batched
 
     @property
     def lossy(self) -> bool:
-        """Answers get lost on a batched link, where no clock of slots is to be found."""
+        """Whether replies get lost on a batched link. There no clock of slots can be found."""
         return self._batched and self._losses > MOST_LOST
 
     @property
     def _batched(self) -> bool:
-        """An adapter holds answers back, so that several come in one read."""
+        """Whether an adapter holds replies back, so that one read brings several."""
         return self._several > SEVERAL
 
     def left(self, made_ns: int) -> None:
-        """A line has left that was made then."""
+        """Note that a line left that was made at `made_ns`."""
         if self._made is not None:
             apart, usual = made_ns - self._made, self._apart
             self._apart = usual + GAIN * (min(apart, 2 * usual) - usual) if usual else apart
@@ -123,10 +136,10 @@ class Prompts:
         self._left.append(made_ns)
 
     def read(self, at_ns: int, lines: int) -> None:
-        """A read of so many lines, the last of them complete then.
+        """Take a read of `lines` lines, of which the last was complete at `at_ns`.
 
-        A lone one tells which line of ours it answers; so do several, where an adapter holds
-        them back and that one came later than it ever does.
+        The delay of a lone reply shows which line it answers. So does the delay of a batch if it is
+        longer than the adapter ever holds a reply back.
         """
         alone, since = lines == 1, at_ns - self._at
         self._at, self._alone = at_ns, alone
@@ -139,7 +152,10 @@ class Prompts:
             self._base, self._losses = self._delay, 0.0
 
     def answer(self, asked_ns: int | None = None) -> Answered | None:
-        """The next reply's line; made `asked_ns` if the reply says so. None if no line waits."""
+        """Return the time of the next reply's line, or None if no line waits for a reply.
+
+        `asked_ns` is when the line was made, if the reply names its line.
+        """
         left = self._left
         if asked_ns is not None:
             while left and left[0] < asked_ns:
@@ -169,12 +185,15 @@ class Prompts:
         return Answered(dt / NS_PER_S, bridged / NS_PER_S, due_ns)
 
     def skip(self) -> None:
-        """The next reply came damaged."""
+        """Note that the next reply was damaged."""
         if self._left:
             self._passed = self._left.popleft()
 
     def _begin(self) -> None:
-        """Of a first reply only what the wire takes is known: it answers the newest it can."""
+        """Assign the first reply to the newest line that it can answer.
+
+        Only the wire time of a reply is known yet.
+        """
         left = self._left
         while len(left) > 1 and left[1] + self._soonest <= self._at:
             self._passed = left.popleft()
@@ -182,9 +201,11 @@ class Prompts:
             self._delay = self._least = float(self._at - left[0])
 
     def _weigh(self, lines: int, since: int) -> None:
-        """Give up lines that a batch's last answer is too late for, `since` the read before.
+        """Give up lines for which the last reply of a batch is too late.
 
-        Where many are lost, its first answer too: it came with the batch after it was made.
+        `since` is the time since the read before, ns.
+        If many replies are lost, the first reply of the batch decides instead, because it was made
+        after the batch before.
         """
         left, at = self._left, self._at
         judged, soonest = lines - 1, float(self._soonest)
@@ -194,7 +215,7 @@ class Prompts:
             self._batch += GAIN * (since - self._batch)
         if len(left) < lines or self._delay is None:
             return
-        if at - left[lines - 1] < self._soonest:  # no answer is so soon: it is the one before's
+        if at - left[lines - 1] < self._soonest:  # too soon for a reply: it answers the line before
             left.appendleft(self._passed)
             self._base = float(at - left[lines - 1])
         lost = 0
@@ -204,23 +225,28 @@ class Prompts:
                 break
             self._passed, lost = left.popleft(), lost + 1
         self._losses += LOSING * (lost / (lines + lost) - self._losses)
-        # A line that is given up too late makes an answer later, none makes it earlier.
+        # Giving up a line too late makes a reply look late, but nothing makes one look early. The
+        # base is therefore the least delay, and it rises slowly.
         self._base = min(self._base + RISE_NS, at - left[lines - 1])
         self._delay = self._base
 
     def _given_up_too_early(self, delay: float) -> bool:
-        """The line that was given up last was not lost; else gives up those that are now."""
+        """Return whether the line given up last was not lost.
+
+        If it was, give up the lines lost now.
+        """
         left, at, wide = self._left, self._at, 4 * self._spread
         lost, self._lost = self._lost, False
         self._missing -= LOSING * self._missing
-        # No answer comes sooner than any ever does: then it is a late one of the line before.
+        # No reply comes sooner than the least delay. One that seems to is a late reply to the line
+        # before.
         soonest = max(self._soonest, self._least)
         while len(left) > 1:
             apart = left[1] - left[0]
             if at - left[0] - delay <= max(apart / 2, wide) or at - left[1] < soonest:
                 break
-            # Behind a stall two lines leave at once, and the first one's answer is late; but not so
-            # late that the second one's ought to be read by then.
+            # After a host stall two lines leave at once and the reply to the first one is late, but
+            # not so late that the reply to the second one should have been read too.
             overdue = at - left[1] - delay > max(self._apart / 2, wide)
             close = apart < self._apart / 2 and not overdue
             if close and self._missing < RARE:
@@ -232,17 +258,17 @@ class Prompts:
         return at - left[0] - delay <= -max((left[0] - self._passed) / 2, wide)
 
     def _shift(self, line: int) -> int:
-        """How much beyond the usual the MCU took over a lone answer, ns; follows the usual too.
+        """Return the excess of a lone reply's delay over the usual, ns, and update the usual.
 
-        Of a delay that varies no more than a read's time does by itself nothing is the MCU's, and
-        of one that an adapter makes neither.
+        Return 0 if the delay varies no more than the time of a read does by itself, or if an
+        adapter causes the variation.
         """
         delay, spread = self._delay, self._spread
         if delay is None or self._batched:
             return 0
         error = self._at - line - delay
         if abs(error) >= max(delay, 4 * spread):
-            return 0  # a stall
+            return 0  # a host stall
         self._delay = delay + GAIN * error
         self._least = min(self._least + LEAST * (delay - self._least), delay + error)
         self._spread += GAIN * (abs(error) - spread)

@@ -1,21 +1,22 @@
-"""The clock of an MCU that reports by itself, found from when its lines were read.
+"""Estimates the sample times of a free-running board from the times at which its lines were read.
 
-It makes one line every T; which of these slots a line belongs to, the time of its read does not
-tell by itself: an adapter holds lines back, and while the host stalls they lie in the kernel. With
-a the time of a read, k the lines until then and c the time of slot 0,
+The board makes one line every T. The time of a read alone does not show to which of these slots a
+line belongs: an adapter holds lines back, and during a host stall they wait in the kernel. Let a be
+the time of a read, k the slot of its last line and c the time of slot 0. Then
 
     (1)  x = (a - c) / T - k        slots that the clock is ahead of the lines
 
-is how late the read's last line is, and lines that are missing make it larger by whole numbers.
-Read one by one as they come, x is about 0: a lone line shows at once how many are missing before
-it. An adapter that hands lines over in batches makes x anything from 0 to 1: then a read counts
-that came no later after the one before it than usual. What a backlog is short of for certain is
-spread over its lines. A line that comes before its slot takes a slot back that was counted too
-many. Twice a second the least x moves c and T, a second-order loop:
+is how late the read's last line is, and each missing line adds 1 to it.
+
+If lines are read one by one, x is about 0, and a lone line shows at once how many are missing
+before it. If an adapter batches lines, x lies between 0 and 1; then only a read counts that came no
+later after the one before it than usual. Lines that a backlog certainly lacks are spread over its
+lines. A line that comes before its slot takes back a slot that was counted in excess. Twice a
+second the least x corrects c and T in a second-order loop:
 
     (2)  c += g x T                 (3)  T += g^2 / 2 x T / slots
 
-Lines that keep no period are refused, and a clock that they contradict is given up.
+Lines without a period are refused, and a clock that the lines contradict is given up.
 """
 
 from __future__ import annotations
@@ -28,76 +29,80 @@ from statistics import fmean, median
 from acsard.values import NS_PER_S
 
 Read = tuple[int, int]
-"""When the last line of a read was complete, ns, and how many lines it had."""
+"""The time at which the last line of a read was complete, ns, and the number of its lines."""
 
 WINDOW_NS, WINDOW_READS = NS_PER_S // 2, 12
-"""What a clock is found from, and followed by."""
+"""Least duration and number of reads of a window from which a clock is found or corrected."""
 
 GAIN = 0.2
-"""Of the loop when it has settled: x of a window is known to a few hundredths."""
+"""Gain g of the settled loop. A window determines x to a few hundredths."""
 
 DRIFT = 0.01
-"""By which share an MCU's clock may be off; a ceramic resonator has half of it."""
+"""Relative error that a board's clock may have. A ceramic resonator has half of it."""
 
 EXACT = 0.001
-"""As DRIFT, for periods that nobody has configured: a quartz, and what the fit is off."""
+"""As DRIFT for periods that nobody has configured: a quartz's error and that of the fit."""
 
 LONE = 0.7
-"""Share of the reads that have one line, from which on they are read one by one."""
+"""Share of the reads with one line at which lines count as read one by one."""
 
 LATE_ALONE, LATE_BATCHED = 0.6, 1.3
-"""How late in slots any line may be of those a clock is found from: read one by one, or not."""
+"""Largest lateness of a line in slots when a clock is found: for lines read one by one, for
+batches."""
 
 JUMP = 1.4
-"""Slots since the last line, from which on a lone one can have lost another before it."""
+"""Slots since the last line. Below this a lone line cannot have another one missing before it."""
 
 SURE = 0.15
-"""Slots beyond the latest that a line can be, from which on one is missing for certain."""
+"""Slots beyond the greatest possible lateness at which a line is certainly missing."""
 
 EARLY = 0.25
-"""Slots by which no line of a window may be ahead of a clock that is right."""
+"""Slots by which no line of a window may be early if the clock is right."""
 
 MOST_LOST = 0.45
-"""Share of two windows' reads that lines are missing before; more, and it is another period."""
+"""Share of the reads of two windows before which lines are missing. Above it the period is
+wrong."""
 
 
 class Slots:
-    """Counts slots read by read; `period` is None while no clock is known."""
+    """The slots of a free-running board, counted read by read."""
 
     def __init__(self, known: tuple[float, ...]) -> None:
-        """`known` are the periods in s that the configuration speaks of."""
+        """Start; `known` are the configured periods, s."""
         self._known = known
         self.usual = 0.0
-        """T in ns as last found, 0 before."""
+        """T in ns as last found, 0 before the first time."""
         self.found = 0
-        """Which of all clocks it is that is known."""
+        """Number of the present clock. It rises whenever a clock is given up."""
         self._stretch = 1.0
-        """Slots that each line of the last read has, its share of the missing ones with it."""
+        """Slots per line of the last read, including its share of the missing lines."""
         self._before = 0
         self._first, self._slot = 0.0, 0
         """c in ns, and k of the last line."""
         self._given = 0
-        """Slots counted of late that no line came for: one of them may be taken back."""
+        """Slots counted lately without a line. One of them may be taken back."""
         self._lag = self._batch = self._gain = self._share = 0.0
-        """Usual x of a read and its distance from the last, in slots; g; the lossy reads' share."""
+        """Usual x of a read, usual distance of two reads in slots, gain g, share of reads with
+        missing lines."""
         self._batched: bool = False
         self._alone: bool = False
-        """Lines come several in a read; the last one came alone."""
+        """Whether an adapter batches lines, and whether the last line came alone."""
         self._least: float
         self._begin(0)
         self.forget()
 
     def forget(self) -> None:
-        """The clock is another one now, or none."""
+        """Give up the clock, because the board has changed or keeps another period."""
         self.found += 1
         self.period: float | None = None
-        """T in s as the MCU means it: it divides its counts by that, whatever its clock does."""
+        """T in s as the firmware means it, None while unknown. The firmware divides its counts by
+        this nominal period, whatever its clock does."""
         self._reads: list[Read] = []
 
     def read(self, at_ns: int, lines: int, drained: bool) -> int:
-        """The slots that nothing came of before this read's last line, -1 for one too many.
+        """Return the number of missing lines before this read's last line, -1 for one too many.
 
-        `at_ns` is when that line was complete, `drained` that no more lay in the kernel.
+        `at_ns` is when that line was complete. `drained` means that the kernel held no more data.
         """
         self._stretch = 1.0
         since, self._before = at_ns - self._before, at_ns
@@ -108,7 +113,7 @@ class Slots:
         ahead = (at_ns - self._first) / self.usual - self._slot
         lost = self._missing(ahead, since / self.usual, lines, drained)
         if lost < 0 and (self._given <= 0 or ahead > 0):
-            self.forget()  # no line comes before its time, or ever later: it is not this clock's
+            self.forget()  # the lines come too early or ever later, so they follow another clock
             return 0
         self._slot += lost
         self._stretch = 1.0 + lost / lines
@@ -129,21 +134,21 @@ class Slots:
 
     @property
     def late_ns(self) -> float:
-        """How long after its line was complete a read comes, in the mean."""
+        """Mean delay from the time at which a line is complete to its read, ns."""
         return self._lag * self.usual
 
     def time_ns(self, behind: int) -> int:
-        """When the line was complete that lies so many lines before the read's last one."""
+        """Return when a line was complete, ns, that lies `behind` lines before the last one."""
         return int(self._first + (self._slot - behind) * self.usual)
 
     def place(self, behind: int) -> float:
-        """The slot of that line; those that are missing are spread over the lines of the read."""
+        """Return the slot of that line. Missing slots are spread over the lines of the read."""
         return self._slot - behind * self._stretch
 
     def _missing(self, ahead: float, since: float, lines: int, drained: bool) -> int:
-        """How many slots are missing, as far as this read can tell, `since` slots after the last.
+        """Return how many slots this read proves missing, `since` slots after the last read.
 
-        -1 where the clock contradicts it.
+        Return -1 if the read contradicts the clock.
         """
         lag = min(self._lag, 0.5)
         if ahead < -0.5 + 0.6 * lag:
@@ -153,15 +158,15 @@ class Slots:
         alone, self._alone = self._alone, lines == 1
         if self._batched:
             prompt = since < 1.1 * self._batch and lines - 1 < since
-            held = self._batch + 1.0  # an adapter goes on holding the last line of a backlog
+            held = self._batch + 1.0  # an adapter holds the last line of a backlog back too
         else:
             held, prompt = 0.0, lines == 1
             if prompt and alone and since < JUMP:
-                return -1 if ahead > 1 else 0  # it only grew later, line by line
+                return -1 if ahead > 1 else 0  # the delay grew line by line, so no line is missing
         seen = ahead + 0.5 - 1.4 * lag if prompt else ahead - SURE - held
         return max(0, math.floor(seen))
 
-    # finding the clock, and following it
+    # Finding the clock and following it.
 
     def _seek(self, at_ns: int, lines: int) -> None:
         reads = self._reads
@@ -187,18 +192,22 @@ class Slots:
     def _clocks(
         self, reads: list[Read], gaps: list[int]
     ) -> Iterator[tuple[list[int], float, float]]:
-        """What may be the clock, the likelier ones first: the slot of each read's last line, how
-        late in slots one may be, and the period in ns.
+        """Yield candidate clocks, the likelier ones first.
 
-        Of jittery lines a configured period says more than half a second of them. An adapter hands
-        lines over one by one too, where they fill its packets: so before lines are missing for a
-        period that nobody has configured, none is for one that somebody has. And half a second of
-        batches tells no period from one that it is hardly off.
+        A candidate is the slot of each read's last line, the largest allowed lateness in slots, and
+        the period in ns. The order has three reasons:
+
+        - For jittery lines a configured period is more reliable than half a second of data.
+        - An adapter hands lines over one by one too if they fill its packets. So the configured
+          periods are tried without missing lines before any other period is tried with missing
+          lines.
+        - Half a second of batches cannot distinguish two periods that hardly differ.
         """
         plain, known = _slots(reads), [period * NS_PER_S for period in self._known]
         alone = [gap for gap, (_, lines) in zip(gaps, reads[1:], strict=True) if lines == 1]
         own = plain
-        # Bytes that come faster than the wire can carry them have times that are one and the same.
+        # Bytes that come faster than the wire can carry them have equal times, so the median may be
+        # 0.
         if len(alone) >= LONE * len(gaps) and (usual := median(alone)) > 0:
             own = _slots(reads, usual)
             yield from ((own, LATE_ALONE, period) for period in known)
@@ -212,7 +221,7 @@ class Slots:
             yield own, LATE_BATCHED, slope
 
     def _begin(self, at_ns: int) -> None:
-        """A new window: its least x, its reads, their slots, and how many of them were lossy."""
+        """Start a window: its least x, its reads, their slots and the reads with missing lines."""
         self._window_ns: int = at_ns
         self._least = math.inf
         self._count: int = 0
@@ -220,7 +229,10 @@ class Slots:
         self._lossy: int = 0
 
     def _follow(self, at_ns: int) -> None:
-        """Equations (2) and (3), with what the window showed."""
+        """Correct c and T by equations (2) and (3).
+
+        If the window contradicts the clock, give the clock up instead.
+        """
         least, slots = self._least, self._passed
         lossy, self._share = self._share, self._lossy / self._count
         if (lossy + self._share) / 2 > MOST_LOST or least < -EARLY or least == math.inf:
@@ -229,14 +241,18 @@ class Slots:
         self._gain = max(GAIN, self._gain / (1 + self._gain))
         self._first += self._gain * least * self.usual
         usual = self.usual * (1 + self._gain**2 / 2 * least / slots)
-        self._first -= (usual - self.usual) * self._slot  # the line now stays where it is
+        # The time of the present line stays unchanged.
+        self._first -= (usual - self.usual) * self._slot
         self.usual = usual
         self.period = self._nominal()
         self._given = self._given if self._lossy else 0
         self._begin(at_ns)
 
     def _nominal(self) -> float:
-        """The period the firmware means: a configured one, whole milliseconds, or as measured."""
+        """Return the period that the firmware means.
+
+        It is a configured period, a whole number of milliseconds, or the measured period.
+        """
         seconds = self.usual / NS_PER_S
         for known in self._known:
             if abs(seconds / known - 1) < DRIFT:
@@ -246,7 +262,10 @@ class Slots:
 
 
 def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
-    """The slot of each read's last line, with those that are missing if it were this period, ns."""
+    """Return the slot of each read's last line.
+
+    A gap between reads adds missing lines if lines are `period` ns apart.
+    """
     slots = [0]
     for (before, _), (at, lines) in pairwise(reads):
         slots.append(slots[-1] + max(lines, round((at - before) / period)))
@@ -254,7 +273,7 @@ def _slots(reads: list[Read], period: float = math.inf) -> list[int]:
 
 
 def _slope(reads: list[Read], slots: list[int]) -> float:
-    """The period by least squares, ns."""
+    """Return the period by least squares, ns."""
     origin = reads[0][0]
     times = [at - origin for at, _ in reads]
     middle, centre = fmean(slots), fmean(times)
@@ -264,7 +283,10 @@ def _slope(reads: list[Read], slots: list[int]) -> float:
 
 
 def _latest(reads: list[Read], slots: list[int], period: float) -> tuple[float, list[float]]:
-    """The time of slot 0, ns, with no line early; and by how many slots each is late."""
+    """Return the latest time of slot 0, ns, and each line's lateness in slots.
+
+    The time is such that no line is early.
+    """
     offsets = [at - slot * period for (at, _), slot in zip(reads, slots, strict=True)]
     first = min(offsets)
     return first, [(offset - first) / period for offset in offsets]

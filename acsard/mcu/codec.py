@@ -1,9 +1,9 @@
-"""One line <-> four wheel speeds: the MCU's plain protocol and its dialects.
+"""Encodes four wheel speeds as one line of the board's plain protocol, and decodes such a line.
 
-`ap12.50,bn08.75,cp15.00,dn10.25`: motor letter, `p` or `n` for the direction, rad/s. Writing is
-exact to the byte; reading is strict about meaning and lenient about form (spaces after commas, a
-trailing comma, one or two integer digits, one to three decimals). A line counts whole or not at
-all. The letters' wheels and signs are applied here and nowhere else.
+`ap12.50,bn08.75,cp15.00,dn10.25`: motor letter, `p` or `n` for the direction, rad/s. Encoding is
+exact to the byte. Decoding is strict about meaning and lenient about form (spaces after commas, a
+trailing comma, one or two integer digits, one to three decimals). A line counts as a whole or not
+at all. Only this module maps motor letters and signs to wheels.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LETTERS = "abcd"
 Motors = tuple[float, float, float, float]
 
 MAX_SPEED = 99.99
-"""rad/s; what two integer digits and two decimals can say."""
+"""rad/s, the largest number with two integer digits and two decimals."""
 
 Reason = Literal[
     "malformed", "wheel_twice", "over_range", "unchecked", "wrong_check", "stale_sequence"
@@ -28,25 +28,28 @@ Reason = Literal[
 
 _TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
 TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3
-"""The four values of a line, as an expression."""
+"""The four values of a line, as a regular expression."""
 _LINE = re.compile(TOKENS + rb"(?:, *)?")
 
 
 class FrameError(AcsardError):
-    """A line is not a frame; `reason` is the name it is counted under."""
+    """A line that is not a valid frame; `reason` is the name under which it is counted."""
 
     def __init__(self, reason: Reason, line: bytes) -> None:
         super().__init__(reason, line)
         self.reason = reason
 
     def __str__(self) -> str:
-        # Formatted only when it is shown: a noisy wire raises hundreds of these in one step.
+        # Format only when the message is shown: a noisy wire raises hundreds of these in one step.
         reason, line = self.args
         return f"{reason}: {line[:60]!r}"
 
 
 class Codec:
-    """Encodes and decodes lines for one wiring and one dialect."""
+    """An encoder and decoder of lines for one wiring and one dialect."""
+
+    _last_read: tuple[bytes | None, WheelSpeeds] = (None, STILL)
+    """The last line that was decoded, and its speeds."""
 
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
@@ -62,16 +65,16 @@ class Codec:
         }
         self._end = b",\r\n" if trailing_comma else b"\r\n"
         self.stop = self._written(STILL)
-        """The line that says zero on all wheels."""
+        """The line with speed zero for all wheels."""
         self._last = (STILL, self.stop)
 
     def encode(self, speeds: WheelSpeeds) -> bytes:
-        """The command line for these speeds, magnitudes clamped to 99.99 and rounded to 0.01.
+        """Return the command line for these speeds, clamped to 99.99 rad/s and rounded to 0.01.
 
-        Raises ValueError for a speed that is not finite: the caller has a bug.
+        Raises ValueError for a speed that is not finite, because that is a bug of the caller.
         """
         last, line = self._last
-        if speeds != last:  # a steady command says the same in each period
+        if speeds != last:  # a steady command repeats its line in each period
             line = self._written(speeds)
             self._last = (speeds, line)
         return line
@@ -82,7 +85,7 @@ class Codec:
         return ",".join(tokens).encode() + self._end
 
     def wheels(self, motors: Motors) -> Motors:
-        """What the motors a to d did, as what the wheels did: in `WHEELS` order, forward is +."""
+        """Map values of the motors a to d to wheels in `WHEELS` order, forward positive."""
         wheel = [0.0] * 4
         for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
             wheel[index] = motor * sign
@@ -90,7 +93,13 @@ class Codec:
         return front_right, front_left, rear_left, rear_right
 
     def decode(self, line: bytes) -> WheelSpeeds:
-        """The speeds a line without its end says; raises `FrameError` unless all of it is right."""
+        """Return the speeds in a line without its end.
+
+        Raise `FrameError` unless all of it is valid.
+        """
+        last, speeds = self._last_read
+        if line == last:  # A robot at rest reports the same in each period.
+            return speeds
         match = _LINE.fullmatch(line)
         if match is None:
             raise FrameError("malformed", line)
@@ -106,12 +115,14 @@ class Codec:
         front_right, front_left, rear_left, rear_right = wheel
         if front_right is None or front_left is None or rear_left is None or rear_right is None:
             raise FrameError("wheel_twice", line)
-        return WheelSpeeds(front_right, front_left, rear_left, rear_right)
+        speeds = WheelSpeeds(front_right, front_left, rear_left, rear_right)
+        self._last_read = line, speeds
+        return speeds
 
 
 def _token(letter: str, speed: float) -> str:
-    # Rounding in whole hundredths first: 9.999 must become 10.00, never 010.00, and a speed that
-    # rounds to nothing is p00.00, never n00.00.
+    # Round in whole hundredths first: 9.999 must become 10.00 and never 010.00, and a speed that
+    # rounds to zero becomes p00.00 and never n00.00.
     if not math.isfinite(speed):
         raise ValueError(f"wheel speed {speed} is not finite")
     hundredths = int(min(abs(speed), MAX_SPEED) * 100 + 0.5)

@@ -1,6 +1,6 @@
-"""What the contract with the microcontroller says beyond the lines themselves."""
+"""Constants of the contract with the microcontroller, apart from the form of its lines."""
 
 from __future__ import annotations
 
 WATCHDOG_S = 0.3
-"""It stops the motors by itself so long after the last valid line, s."""
+"""Seconds after the last valid line at which the board stops the motors by itself."""

@@ -1,9 +1,9 @@
-"""Encoder counts -> how far each motor has turned since the reading before.
+"""Converts encoder counts into the angle that each motor turned since the reading before.
 
-The counts are cumulative, so a lost line loses no distance, and the MCU's own milliseconds are not
-bent by when the host read the line. Both are modulo 65536: a difference counts only if it could
-not have wrapped and is what the motors can have done. Where it cannot be told, the caller falls
-back to speed times time; what looks like an MCU that has restarted is said.
+The counts are cumulative, so a lost line loses no distance, and the board's own milliseconds do not
+depend on when the host read the line. Both are modulo 65536: a difference is used only if it cannot
+have wrapped and the motors can have turned so far. Otherwise the caller falls back to speed times
+time. The result also reports a probable restart of the board.
 """
 
 from __future__ import annotations
@@ -20,53 +20,60 @@ from acsard.mcu.promptest import Promptest
 from acsard.values import NS_PER_S
 
 SLACK_COUNTS = 4
-"""Beyond the fastest wheel: a count at each end, and play in the gears."""
+"""Counts that are allowed beyond the fastest wheel: one at each end, and play in the gears."""
 
 ROUNDING_MS = 2
-"""What two readings rounded to whole milliseconds may be off."""
+"""Error of the difference of two readings that are rounded to whole milliseconds, ms."""
 
 LATEST_MS = 1000.0
-"""A line that waited longer comes after a gap that starts the session over anyway."""
+"""Delay of a line in ms above which the delay is not tracked. The session starts over after such a
+gap anyway."""
 
 DRIFT = 0.01
-"""By which share the two clocks may go apart; a ceramic resonator has half of it."""
+"""Relative drift between the two clocks that is allowed. A ceramic resonator has half of it."""
 
 Unknown = Literal["unknown", "leap", "restarted"]
-"""Why a difference says nothing: nothing to compare with or too long ago, further than a motor can
-have turned, another power-on of the MCU."""
+"""The reason why a difference is unusable. "unknown": there is no earlier reading, or it is too
+old. "leap": no motor can have turned so far. "restarted": the board has been powered on again."""
 
 
 class Turned(Struct, frozen=True):
-    """Angles in rad of motors a to d since the reading before, `dt` s ago by the MCU's clock."""
+    """Angles in rad that the motors a to d turned in the last `dt` s of the board's clock."""
 
     motors: Motors
     dt: float
 
 
 class Encoders:
-    """Compares each reading with the one before."""
+    """A comparison of each reading with the one before."""
 
     def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
-        """`counts` per turn; `wheel_speed` rad/s is the fastest a wheel can turn.
+        """Start.
 
-        No reading is read before it was made: by the MCU's clock no more time can have passed than
-        by the host's, but for how late the last one was read. That is known to `quiet_ns`.
+        A reading is never read before it is made. Between two readings the board's clock can
+        therefore gain on the host's only by the delay of the first one. A larger gain than
+        `quiet_ns` means that the board has restarted.
+
+        Args:
+            counts: Encoder counts per turn, 0 if unknown.
+            wheel_speed: The highest speed of a wheel, rad/s.
+            quiet_ns: The duration of silence that ends a link, ns.
         """
         self._angle = math.tau / counts if counts else 0.0
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
         self._promptest = Promptest(DRIFT, LATEST_MS)
-        """In ms: which reading was read soonest after it was made."""
+        """The least delay of a reading, in ms."""
 
     def forget(self) -> None:
-        """The next reading is a first one: what came before is of another run or accounted for."""
+        """Forget the last reading, which belongs to another session or is accounted for."""
         self._last = None
 
     def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
-        """How far the motors turned since the last reading, or why that cannot be told.
+        """Return how far the motors turned since the last reading, or why that is unknown.
 
-        `at_ns` is the host's time of the reading, only to tell a restart and a wrap.
+        `at_ns` is the host's time of the reading. It serves only to detect a restart or a wrap.
         """
         last, self._last = self._last, (reading, at_ns)
         if last is None:
@@ -86,10 +93,10 @@ class Encoders:
         return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
 
     def _most(self, ms: float) -> float:
-        """Counts that no wheel exceeds in so many milliseconds."""
+        """Return a bound on the counts that a wheel makes in `ms` milliseconds."""
         return self._fastest * (ms + ROUNDING_MS) + SLACK_COUNTS
 
 
 def _signed(difference: int) -> int:
-    """The difference of two counters modulo 65536, nearest to 0."""
+    """Return the difference of two counters modulo 65536 that is nearest to 0."""
     return (difference + FIELD // 2) % FIELD - FIELD // 2

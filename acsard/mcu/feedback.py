@@ -1,10 +1,14 @@
-"""A good line -> feedback: when its sample was made, and what the wheels did since the one before.
+"""Turns a good line into feedback: the time of its sample and the motion since the last line.
 
-Whose clock says how far two lines are apart: the MCU's own where it sends it with its counts; the
-lines that left where each is answered (`clock_of_answers.py`); the period of an MCU that reports by
-itself (`clock_of_reports.py`, and which of the two it is: `habit.py`); else the reads, evenly over
-the lines of one.
-Whether the link can be trusted is `session.py`'s, by arrival alone.
+The time between two samples comes from the best clock that is available:
+
+- the board's own clock, if the board sends it with its counts;
+- the lines that left, if the board answers each one (`clock_of_answers.py`);
+- the period of a free-running board (`clock_of_reports.py`), where `habit.py` detects which of the
+  two kinds the board is;
+- otherwise the times of the reads, spread evenly over the lines of a read.
+
+`session.py` decides by arrival times alone whether the link can be trusted.
 """
 
 from __future__ import annotations
@@ -25,24 +29,25 @@ from acsard.mcu.habit import Habit
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
 
 BRIDGED_S = 1.0
-"""s; what is missing for longer is not guessed: the MCU may have been reset."""
+"""Longest gap that is filled, s. After a longer one the board may have been reset."""
 
 APART_NS = 1000
-"""Between the stamps of two lines at least: what has the time of the one before is taken for it."""
+"""Least distance between the stamps of two lines, ns. A line with an equal stamp would be taken for
+the one before."""
 
 LATER = 0.05
-"""How quickly it follows by how much one clock is later than another."""
+"""Gain of the filter for the mean offset between two clocks."""
 
 FULL_READ = 1024
-"""Bytes that the port reads at once: behind so many there may be more."""
+"""Bytes of a full read of the port. After a full read more data may wait."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
-    """One good line: its sample was made at `at`, `dt` s after the previous one's.
+    """A good line: its sample was taken at `at`, `dt` s after the previous one.
 
-    After a gap `dt` is 0 (how the robot moved in it is unknown) and `gap` is its length in s.
-    `turned` is how far the wheels turned since the previous line by their encoders' counts, in rad
-    and `WHEELS` order, where it is known; it also holds over a gap.
+    After a gap `dt` is 0, because nobody knows how the robot moved in it, and `gap` is its length
+    in s. `turned` is how far the wheels turned since the previous line by their encoders' counts,
+    in rad and `WHEELS` order, or None if unknown. It is also valid after a gap.
     """
 
     at: Instant
@@ -51,47 +56,57 @@ class Feedback(Struct, frozen=True, gc=False):
     gap: float = 0.0
     turned: Motors | None = None
     bridged: float = 0.0
-    """s: the first part of `dt`, that no line reported: the speeds of its neighbours stand in."""
+    """Seconds at the start of `dt` that no line reported. The speeds of the lines around it stand
+    in."""
     asked_ns: int | None = None
-    """When the line it answers was made, monotonic, where the reply tells which one that is."""
+    """Monotonic time at which the answered line was made, None if that line is unknown."""
     since: float = 0.0
-    """s since the previous line came, 0 after a silence: what it is judged by."""
+    """Seconds since the previous line arrived, 0 after a silence. The plausibility checks use
+    it."""
     heard_ns: int = 0
-    """When it was complete here, monotonic."""
+    """Monotonic time at which the line was complete here."""
     counted: Motors | None = None
-    """rad in `WHEELS` order that the wheels turned in all of `dt` but `bridged`, where the speeds
-    show whole counts (`snapping.py`)."""
+    """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
+    the speeds show whole counts (`snapping.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
-    """rad/s by which each wheel's speed steps for its encoder's sake; `math.inf` is not known."""
+    """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
 
 
 class Told(Struct, frozen=True, gc=False):
-    """Where a line belongs by one of the clocks, ns of when it was due to be complete here."""
+    """The place of a line on one of the clocks; `due_ns` is when it was due to be complete here."""
 
     clock: Literal["slots", "prompts", "reads"]
     due_ns: int
     dt: float | None = None
-    """s since the last line by the same clock, None for its first."""
+    """Seconds since the last line by the same clock, None for the first line."""
     bridged: float = 0.0
-    """s of `dt` that no line reported."""
+    """Seconds of `dt` that no line reported."""
     place: float = 0.0
-    """Its slot, of the clock found as the `found`th."""
+    """Slot of the line on the clock with the number `found`."""
     found: int = 0
     early: bool = False
-    """It came before it was due: `due_ns` is when it came, and the next one is as far from that as
-    it is due later."""
+    """Whether the line came before it was due. Then `due_ns` is its arrival, and the time to the
+    next line is the difference of their `due_ns`."""
 
 
 class Timeline:
-    """Puts one good line after the other; remembers the last one's time and counts.
+    """The times of the good lines in order.
 
-    `read` for each read, then for each of its lines `place` or, if it is none, `spoilt`.
+    Call `read` for each read, then for each of its lines `place`, or `spoilt` if the line is bad.
     """
 
     def __init__(
         self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
     ) -> None:
-        """`wheel_speed` rad/s is the fastest a wheel can turn; `quiet_ns` makes a link stale."""
+        """Start.
+
+        Args:
+            mcu: The table `[mcu]`.
+            codec: The codec for the board's wiring.
+            wheel_speed: The highest speed that a wheel can have, rad/s.
+            quiet_ns: The duration of silence after which the link is stale, ns.
+            rate_hz: Control rate.
+        """
         self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
         self._counts = mcu.encoder_counts
@@ -104,28 +119,31 @@ class Timeline:
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
         self._told = Told("reads", 0)
-        """The last good line's."""
+        """The place of the last good line."""
         self._later = 0.0
-        """How much later answers are due by their lines than by the slots, ns, in the mean."""
+        """How much later a reply is due by its line than by the slots, mean in ns."""
         self.leaps = 0
-        """Readings whose counts no wheel can have made; the speeds stood in for them."""
+        """Number of readings with impossible counts. The speeds replaced them."""
         self.restarted = False
-        """The last line's clock says that the MCU has started again."""
+        """Whether the last line's clock shows that the board has restarted."""
 
     def forget(self) -> None:
-        """A new session: the next line has nothing to do with the last one."""
+        """Start a new session: the next line does not follow the last one."""
         self._encoders.forget()
         self._slots.forget()
         self._prompts.forget()
         self._forgotten = True
 
     def left(self, made_ns: int) -> None:
-        """A line of ours has left that was made then."""
+        """Note that a command line left that was made at `made_ns`."""
         self._prompts.left(made_ns)
         self._habit.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
-        """So many lines come of a read of `size` bytes, `following` of them behind the last."""
+        """Take a read of `size` bytes that completes `lines` lines.
+
+        Behind the last line `following` bytes came.
+        """
         before, end_ns = self._end_ns, at.mono_ns
         if following:
             end_ns -= wire_ns(following, self._baud_rate)
@@ -141,7 +159,10 @@ class Timeline:
         self._prompts.read(end_ns, lines)
 
     def spoilt(self) -> None:
-        """The read's next line is none; where the MCU made it, it was one."""
+        """Note that the next line of the read is bad.
+
+        A prompted board still made it as a reply.
+        """
         self._rest -= 1
         if not self._habit.speaks:
             self._prompts.skip()
@@ -155,9 +176,15 @@ class Timeline:
         silent: bool,
         asked_ns: int | None = None,
     ) -> Feedback:
-        """The feedback of the read's next line, of `length` bytes; `following` came behind it.
+        """Return the feedback of the read's next line.
 
-        `silent` says that the link was so before it, `asked_ns` when the line it answers was made.
+        Args:
+            speeds: The speeds in the line.
+            reading: The sample fields of a checked reply, if it has them.
+            following: Bytes of the read that came behind the line.
+            length: Bytes of the line.
+            silent: Whether the link was silent before it.
+            asked_ns: When the line was made that this reply answers, if it is known.
         """
         self._rest -= 1
         # Bytes that followed in the same read were on the wire after this line was complete.
@@ -170,7 +197,8 @@ class Timeline:
         dt, bridged = self._since_last(told)
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
-        # Who answers makes no line that we do not ask for: none is missing for that we were silent.
+        # A prompted board makes no line unless it is asked, so a silence of the host leaves no line
+        # missing.
         clocked = told.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
@@ -188,7 +216,7 @@ class Timeline:
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
     def _told_by(self, asked_ns: int | None, came_ns: int) -> Told:
-        """Where the next line belongs by the best clock there is."""
+        """Return the place of the next line on the best available clock."""
         speaks, slots = self._habit.speaks, self._slots
         if asked_ns is not None or not speaks:
             answered = self._prompts.answer(asked_ns)
@@ -196,8 +224,9 @@ class Timeline:
             ours = asked_ns is not None or speaks is False or prompts.thinks
             if ours and answered is not None:
                 if answered.due_ns - came_ns > self._usual_ns / 2:
-                    # The usual delay is that of a first answer read late, in a stall that the
-                    # line before has counted: this one is no further from it than it came.
+                    # The usual delay comes from a first reply that was read late, during a stall
+                    # that the line before has already counted. This line's time is therefore its
+                    # arrival.
                     return Told("prompts", came_ns, early=True)
                 return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
         else:
@@ -219,10 +248,10 @@ class Timeline:
         return Told("reads", int(self._end_ns - self._share_ns * self._rest))
 
     def _since_last(self, told: Told) -> tuple[float, float]:
-        """How long after the last good line this one was made, how much of it no line reported, s.
+        """Return the time since the last good line, and the part of it that no line reported, s.
 
-        Where another clock tells than told the last one, by what both say of the host's time: so
-        no change of clocks adds up.
+        If different clocks placed the two lines, the host times of both decide, so changes of the
+        clock do not add up.
         """
         last = self._told
         back = told.due_ns < last.due_ns
@@ -239,13 +268,13 @@ class Timeline:
         return dt, dt - period if missing else 0.0
 
     def _compare(self, later_ns: int) -> None:
-        """By their lines, answers are due so much later than by the slots."""
+        """Update the mean by which replies are due later by their lines than by the slots."""
         if self._told.found != self._slots.found:
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 
     def _late_ns(self, clock: str) -> float:
-        """How much later than by the slots a line is due by this clock, in the mean."""
+        """Return how much later a line is due by this clock than by the slots, mean in ns."""
         if clock == "reads":
             return self._slots.late_ns
         return self._later if clock == "prompts" else 0.0
@@ -255,7 +284,7 @@ class Timeline:
         return self._slots.usual or self._period_ns
 
     def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
-        """When the sample of a line was made: its own bytes were on the wire after that."""
+        """Return when the sample of a line was taken: before its own bytes were on the wire."""
         mono_ns = min(came_ns, told.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
@@ -266,7 +295,7 @@ class Timeline:
         return self._last
 
     def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
-        """How far the motors turned since the line before, if its counts tell."""
+        """Return how far the motors turned since the line before, None if unknown."""
         self.restarted = False
         if reading is None or not self._counts:
             self._encoders.forget()

@@ -1,49 +1,51 @@
-"""Does the MCU report by its own clock, or does it answer our lines? Seen when the two differ.
+"""Detects whether the board reports by its own clock or answers the daemon's lines.
 
-While we send a line every period, both look alike. When we send more or fewer (the host stood
-still, a command's line went at once) the lines that come are as many as periods have passed or as
-lines have left: whichever it is, it is told by the sums over the reads in which they differ, and
-the few after them, which bring what an adapter still held.
+While the daemon sends one line per period, both look alike. Sometimes it sends more or fewer lines:
+the host stood still, or a command's line went at once. Then the number of lines received follows
+either the periods that passed or the lines that left. The decision compares both sums with the
+lines received, over the reads in which they differ and over the next few, which bring the lines
+that an adapter still held.
 """
 
 from __future__ import annotations
 
 APART = 1.5
-"""Periods and lines that left since the last read: more apart than what a scheduler does."""
+"""Difference between periods and lines sent since the last read that scheduling does not cause."""
 
 TELLING = 2.5
-"""How far apart the two sums must be to tell."""
+"""Difference between the two sums that is needed for a decision."""
 
 LATEST = 100.0
-"""Periods since the last read; after more, nothing is expected of anybody."""
+"""Periods since the last read. After more, the read is ignored."""
 
 CLEAR = 0.5
-"""By which share of what the sums are apart one must be nearer to what came than the other."""
+"""Share of the sums' difference by which one sum must be nearer to the received lines."""
 
 AFTER = 3
-"""Reads after one in which they differ that belong to it."""
+"""Number of reads after a differing one that belong to it."""
 
 NEAR = 0.35
-"""How far from what came the better one may be, as a share of it: lines are lost too."""
+"""Largest distance of the nearer sum from the received lines, as a share of these: lines are lost
+too."""
 
 
 class Habit:
-    """Compares what comes with both clocks, read by read."""
+    """A comparison of the received lines with the periods and with the lines sent."""
 
     def __init__(self, speaks: bool) -> None:
-        """`speaks` when it is configured to report by its own clock; else that shows."""
+        """Start. With `speaks` the configuration says that the board reports by its own clock."""
         self.speaks: bool | None = speaks or None
-        """It reports by its own clock, it answers; None while nobody can tell."""
+        """True if the board reports by its own clock, False if it answers, None while unknown."""
         self._known = speaks
         self._left = self._after = 0
         self._came = self._periods = self._asked = 0.0
 
     def left(self) -> None:
-        """A line of ours has left."""
+        """Note that a command line left."""
         self._left += 1
 
     def read(self, lines: int, periods: float) -> None:
-        """So many lines came, so many of its periods after the last read."""
+        """Take a read of `lines` lines, `periods` reply periods after the last read."""
         left, self._left = self._left, 0
         if self._known or periods > LATEST:
             return

@@ -1,7 +1,7 @@
-"""What came from the microcontroller while the link carried nothing, and what that looks like.
+"""Diagnoses a silent link from the bytes that the port received while the link was not up.
 
-For the person who has to find out why: decides nothing. Shared by the daemon, whose `state` and log
-say it after `PATIENCE_NS`, and by `acsard mcu check`.
+The diagnosis is for the operator and decides nothing. The daemon, which shows it in `state` and the
+log after `PATIENCE_NS`, shares it with `acsard mcu check`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,21 @@ from acsard.mcu.whose_silence import BUSY, HOST
 from acsard.values import NS_PER_S
 
 PATIENCE_NS = 3 * NS_PER_S
-"""A board that boots has answered by then."""
+"""Time before the first diagnosis. A board that boots has answered by then."""
 
 SHOWN = 64
-"""Characters of them that people are shown: a whole line, and noise on it."""
+"""Most characters that are shown: a whole line and some noise on it."""
 
 Look = Literal["nothing", "cut", "foreign", "garbage", "few", "sparse"]
-"""No byte at all; pieces of right lines, or lines without an end; right lines with other bytes on
-them; nothing that looks like a line; good lines among others; good lines only, but too
-seldom."""
+"""The look of the received bytes.
+
+- nothing: no byte at all
+- cut: pieces of valid lines, or lines without an end
+- foreign: valid lines with other bytes on them
+- garbage: nothing that resembles a line
+- few: good lines among others
+- sparse: only good lines, but too seldom
+"""
 
 MENDS: dict[Look, str] = {
     "nothing": "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed?",
@@ -37,28 +43,31 @@ MENDS: dict[Look, str] = {
 
 _RIGHT = re.compile(TOKENS)
 _PIECE = re.compile(rb"[abcdpn0-9A-F., #@*\r\n]+")
-"""All that a reply is written with."""
+"""All characters that a reply can contain."""
 
 
 class Heard(Struct):
-    """What was heard within some time; `last` are the last bytes that were no good line."""
+    """The bytes and lines received in an interval.
+
+    `last` is the last line, or bytes, that was bad.
+    """
 
     size: int = 0
-    """Bytes."""
+    """Number of bytes."""
     lines: int = 0
     good: int = 0
     last: bytes = b""
     late_s: float = 0.0
-    """This computer did not run for so long within that time, and heard nothing then."""
+    """Longest time in the interval in which this computer did not run and received nothing, s."""
 
     def take(self, data: bytes) -> None:
-        """Bytes as they came, before their lines."""
+        """Take received bytes, before their lines."""
         self.size += len(data)
         if not self.lines:
             self.last = (self.last + data)[-SHOWN:]
 
     def line(self, line: bytes, good: bool) -> None:
-        """One line of them without its end."""
+        """Take one line of them without its end."""
         self.lines += 1
         self.good += good
         if not good:
@@ -66,7 +75,7 @@ class Heard(Struct):
 
     @property
     def looks(self) -> Look:
-        """What it looks like."""
+        """The look of the bytes."""
         if not self.size:
             return "nothing"
         if self.good:
@@ -77,7 +86,7 @@ class Heard(Struct):
 
     @property
     def counted(self) -> str:
-        """How much it was, and the last of it."""
+        """The number of bytes or lines and the last bad one, as text."""
         if not self.size:
             return "nothing at all heard"
         if not self.lines:
@@ -93,7 +102,7 @@ class Heard(Struct):
 
     @property
     def words(self) -> str:
-        """All of it, for `state`."""
+        """The whole diagnosis as a sentence for `state`."""
         if self.looks == "sparse" and self.late_s:
             return f"{HOST} {self.late_s:.2f} s, and heard too little for a link: {BUSY}"
         mend = f"{MENDS[self.looks]} `acsard mcu check` looks closer"
@@ -101,7 +110,7 @@ class Heard(Struct):
 
 
 def printable(data: bytes, last: bool = False) -> str:
-    """Bytes for people: the first of them, or the last, what cannot be printed as `\\x00`."""
+    r"""Return the first or `last` bytes as text. An unprintable byte looks like `\x00`."""
     shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
     room = 0
     for count, text in enumerate(shown):
@@ -113,22 +122,23 @@ def printable(data: bytes, last: bool = False) -> str:
 
 
 class Hearing:
-    """Listens while the link is not up; `heard` is what it said of the time before now."""
+    """The diagnosis while the link is not up; `heard` is its last complete interval."""
 
     def __init__(self) -> None:
         self.heard: Heard | None = None
-        """Of the last `PATIENCE_NS` that were waited for; None before that, and when linked."""
+        """The last interval of `PATIENCE_NS`; None before the first one ends, and while the link is
+        up."""
         self.now = Heard()
-        """What comes now."""
+        """The interval under way."""
         self._since_ns: int | None = None
 
     def forget(self) -> None:
-        """The link is up, or the port has been opened anew."""
+        """Start over: the link is up, or the port has been opened again."""
         if self._since_ns is not None:
             self.heard, self.now, self._since_ns = None, Heard(), None
 
     def judge(self, now_ns: int) -> bool:
-        """The link is still not up; True when what is heard looks other than it was told."""
+        """Note that the link is still not up. Return whether the diagnosis has changed."""
         if self._since_ns is None:
             self._since_ns = now_ns
         if now_ns - self._since_ns < PATIENCE_NS:

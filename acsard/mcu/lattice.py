@@ -1,13 +1,13 @@
-"""Are speeds whole counts per period? The lattice they lie on, found in a bounded search.
+"""Finds the quantization step of a wheel's reported speeds, in a bounded search.
 
 A firmware that divides counts by its period reports only multiples of q = 2 pi / (counts T), in two
-decimals. The largest q counts of which nearly all speeds are multiples; one that chance could have
-made of them is none, and what a filter makes of counts lies anywhere. (A mean of M periods has a
-lattice M times as fine: it counts in M-ths.)
+decimals. The search finds the largest q of which nearly all speeds are multiples. It rejects a q
+that chance could have produced. Speeds that a filter has smoothed lie on no lattice of this kind.
+(A mean over M periods has a step that is M times as fine, as if it counted in M-ths.)
 
-One speed V of them is j q for some whole j, so V / j for j = 1, 2 ... are all that q can be. Most
-are refused by the first speed they are tried on. The search stops after a few trials and goes on
-when it is asked again, so that no step waits for it.
+Some speed V is j q for a whole j, so the candidates are V / j for j = 1, 2 and so on. The first
+speeds that are tried reject most of them. The search pauses after a few trials and continues when
+it is called again, so no control step waits for it.
 """
 
 from __future__ import annotations
@@ -18,41 +18,46 @@ from collections.abc import Mapping
 from msgspec import Struct
 
 ROUNDING = 0.0052
-"""rad/s a speed in two decimals is off at the most."""
+"""Largest rounding error of a speed in two decimals, rad/s."""
 
 FINEST = 4 * ROUNDING
-"""rad/s; of a finer lattice half of all speeds lie on it by chance."""
+"""Finest step that is searched, rad/s. Half of all speeds lie on a finer lattice by chance."""
 
 DEVIATION = 0.01 / math.sqrt(12)
-"""rad/s, of rounding to two decimals."""
+"""Standard deviation of the rounding to two decimals, rad/s."""
 
 STRAYS = 0.005
-"""Share of the speeds that may lie elsewhere: damaged lines."""
+"""Share of the speeds that may lie off the lattice, because of damaged lines."""
 
 BY_CHANCE = 1e-5
-"""How likely a lattice may be that is none."""
+"""Highest probability that chance has produced an accepted lattice."""
 
 STEEP = 1.0
-"""rad/s; no wheel steps to and fro by so much from line to line but for its encoder's sake."""
+"""rad/s. A wheel's speed alternates by this much from line to line only because of its encoder, so
+no test against chance is needed."""
 
 TRIALS = 16
-"""Speeds tried before the search lets the step go on."""
+"""Speeds that are tried before the search pauses."""
 
 NOT_ONE_OF_THEM = 0.4
-"""How well, in counts a turn, their number must be known to be a whole one."""
+"""Largest uncertainty, in counts per turn, at which a number of counts can be recognized as
+whole."""
 
 LEAST_DOUBT = 0.02
-"""Counts a turn by which a whole number may seem off: of a period in whole milliseconds."""
+"""Least uncertainty in counts per turn, for a period that is rounded to whole milliseconds."""
 
 
 class Lattice(Struct, frozen=True):
-    """All speeds are multiples of `quantum`, which is known to `deviation`; both rad/s."""
+    """A lattice of speeds that are multiples of `quantum`.
+
+    The standard deviation of `quantum` is `deviation`. Both are in rad/s.
+    """
 
     quantum: float
     deviation: float
 
     def counts(self, period: float) -> int:
-        """Counts per turn by which a firmware divides `period` s; 0 if that is no whole number."""
+        """Return the counts per turn of a firmware that divides by `period` s, 0 if not whole."""
         exact = math.tau / (self.quantum * period)
         doubt = max(LEAST_DOUBT, 3 * exact * self.deviation / self.quantum)
         near = doubt <= NOT_ONE_OF_THEM and abs(exact - round(exact)) <= doubt
@@ -60,29 +65,30 @@ class Lattice(Struct, frozen=True):
 
 
 class Search:
-    """For the lattice of these speeds, in slices.
+    """The search for the lattice of some speeds, in slices.
 
-    No generator: what a robot has in hand must be bytes at any moment (`record/state.py`).
+    It is not a generator, because a robot's whole state must be serializable at any moment
+    (`record/state.py`).
     """
 
     def __init__(self, seen: Mapping[float, int]) -> None:
-        """`seen`: speeds, rad/s above 0, and how often each was."""
+        """Start; `seen` maps speeds above 0, rad/s, to the number of their occurrences."""
         self.found: Lattice | None = None
-        """Once it is over: the lattice, None if there is none."""
+        """The result when the search is over: the lattice, or None if there is none."""
         self._seen = seen
         self._speeds: list[float] = []
         self._spare = self._part = self._tried = 0
         self._anchor = 0.0
         self._fits = False
-        """All speeds lie on the lattice at hand: the next slice takes a closer look."""
+        """Whether all speeds lie on the present candidate. The next slice fits it."""
 
     def go_on(self) -> bool:
-        """Do a slice of the work; whether it is over."""
+        """Do a slice of the work; return whether the search is over."""
         if not self._speeds:
             self._speeds = sorted(self._seen)
             self._spare = max(1, int(STRAYS * sum(self._seen.values())))
             self._anchor = _anchor(self._speeds, self._seen, self._spare)
-        for _ in range(2 * TRIALS):  # never so often, unless a stranger has made it
+        for _ in range(2 * TRIALS):  # a bound that only a forged state could reach
             if self._fits:
                 self._fits = False
                 quantum = self._anchor / self._part
@@ -102,12 +108,12 @@ class Search:
         return False
 
     def _all_on(self, quantum: float) -> bool:
-        """All speeds but a few are multiples of it, roughly."""
+        """Return whether all speeds except a few are roughly multiples of `quantum`."""
         strays, slope = 0, ROUNDING / self._anchor
         for speed in self._speeds:
             self._tried += 1
             off = abs(speed - quantum * round(speed / quantum))
-            # The anchor is rounded too, and speeds are off by their share of that.
+            # The anchor is rounded too, and each speed is off by its share of that.
             if off > ROUNDING + slope * speed:
                 strays += self._seen[speed]
                 if strays > self._spare:
@@ -116,7 +122,7 @@ class Search:
 
 
 def _anchor(speeds: list[float], seen: Mapping[float, int], spare: int) -> float:
-    """The largest speed that is not one of the few that may lie elsewhere."""
+    """Return the largest speed that is not one of the few that may lie off the lattice."""
     above = 0
     for speed in reversed(speeds):
         above += seen[speed]
@@ -126,7 +132,7 @@ def _anchor(speeds: list[float], seen: Mapping[float, int], spare: int) -> float
 
 
 def _fitted(seen: Mapping[float, int], rough: float, spare: int, tries: int) -> Lattice | None:
-    """The lattice near `rough` by least squares, if it stands a closer look."""
+    """Return the lattice near `rough` by least squares, or None if it fails the closer tests."""
     squares = products = 0.0
     points = set()
     for speed in seen:
@@ -140,7 +146,7 @@ def _fitted(seen: Mapping[float, int], rough: float, spare: int, tries: int) -> 
     quantum, deviation = products / squares, DEVIATION / math.sqrt(squares)
     if quantum < FINEST:
         return None
-    # A multiple is off by as many times what the quantum is.
+    # A multiple is off by the quantum's error times the factor.
     off = (n for speed, n in seen.items() if not on(speed, quantum, 4 * deviation / quantum))
     if sum(off) > spare:
         return None
@@ -151,5 +157,8 @@ def _fitted(seen: Mapping[float, int], rough: float, spare: int, tries: int) -> 
 
 
 def on(speed: float, quantum: float, doubt: float = 0.0) -> bool:
-    """A speed in two decimals is a multiple of `quantum`, of which a share of `doubt` is unsure."""
+    """Return whether a speed in two decimals is a multiple of `quantum`.
+
+    `doubt` is the relative error of `quantum`.
+    """
     return abs(speed - quantum * round(speed / quantum)) <= ROUNDING + doubt * abs(speed)

@@ -1,34 +1,35 @@
-"""Serial bytes -> lines. Bounded memory; the next newline always resynchronises.
+"""Splits the serial bytes into lines, with bounded memory. Every newline resynchronizes.
 
-Knows nothing of what a line means. Lines end with LF or CR LF; empty ones are dropped silently
-(we start every session with a bare end of line, and an echoing MCU may send it back).
+This module knows nothing about the meaning of a line. Lines end with LF or CR LF. Empty ones are
+dropped silently, because the daemon starts every session with a bare end of line and an echoing
+board may send it back.
 """
 
 from __future__ import annotations
 
 MAX_LINE = 128
-"""Bytes of a line with its end; the longest frame has 62, so more is noise without newline."""
+"""Bytes of a line with its end. The longest frame has 62, so more is noise without a newline."""
 
 
 class LineReader:
-    """Cuts a byte stream into lines, fed in any pieces."""
+    """A splitter of a byte stream into lines. The stream may come in any pieces."""
 
     def __init__(self) -> None:
         self._held = b""
         self._discarding = False
         self.too_long = 0
-        """How many over-long lines have been thrown away."""
+        """Number of over-long lines that were discarded."""
 
     def clear(self) -> None:
-        """Forget a half-received line (the port has been reopened)."""
+        """Forget a half-received line, because the port has been reopened."""
         self._held = b""
         self._discarding = False
 
     def feed(self, data: bytes) -> list[tuple[bytes, int]]:
-        """The lines that `data` completes, without their ends, in order.
+        """Return the lines that `data` completes, without their ends, in order.
 
-        With each comes the number of bytes of `data` that followed it: those were on the wire
-        after the line was complete, so they tell how long ago that was.
+        Each line comes with the number of bytes of `data` that followed it. Those bytes were on the
+        wire after the line was complete, so their number tells how long ago that was.
         """
         lines = []
         ends = data.split(b"\n")

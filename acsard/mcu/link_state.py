@@ -1,11 +1,11 @@
-"""Can the link carry motion? What came, and how long nothing came, move it along a table.
+"""Decides whether the link can carry motion: received lines and silences move it through a table.
 
-down     the port is closed
-booting  the port is open, or the MCU has restarted: fewer than GOOD_LINES good lines since
-up       lines come in time, and right if they are checked
-stale    it was up, then no good line for `quiet`, or BAD_LINES bad checked ones in a row, or
-         no line of ours left for the board's watchdog time although the port is open, or
-         the lines that came turned out to be our own
+- down: the port is closed.
+- booting: the port is open or the board has restarted, and fewer than GOOD_LINES good lines came.
+- up: lines come in time, and correct if they are checked.
+- stale: the link was up. Then no good line came for `quiet`, or BAD_LINES bad checked lines came in
+  a row, or no line left for the board's watchdog time although the port is open, or the received
+  lines were the daemon's own.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("stale", "opened"): "booting",
     ("stale", "trusted"): "up",
 }
-"""Where a sign leads; without an entry it changes nothing."""
+"""Maps (state, sign) to the next state. Without an entry the state stays."""
 
 WORDS: dict[State, str] = {
     "down": "the serial port is closed; it is being reopened",
@@ -43,32 +43,33 @@ WORDS: dict[State, str] = {
 }
 
 GOOD_LINES = 3
-"""Good lines before the link is trusted: a board that just reset prints anything for a while."""
+"""Good lines before the link is trusted. A board that just reset may print anything for a while."""
 
 BAD_LINES = 5
-"""Bad lines in a row after which a checked link is asked anew."""
+"""Bad lines in a row after which a checked link asks for the check again."""
 
 
 SPARSE = 2
-"""Silences in a row between single good lines; one alone is a link that was lost for a moment."""
+"""Silences in a row, each ended by one good line, that make the lines sparse. A single one is a
+link that was lost for a moment."""
 
 
 class Link:
-    """Counts good and bad lines; `sign` alone moves the state."""
+    """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
 
     def __init__(self, quiet_ns: int) -> None:
-        """`quiet_ns` of silence make the link stale."""
+        """Start; after `quiet_ns` of silence the link is stale."""
         self.quiet_ns = quiet_ns
         self.state: State = "down"
         self.sparse_s = 0.0
-        """Time between the last two good lines when again it was too long for the link, else 0."""
+        """Seconds between the last two good lines if they repeatedly are too far apart, else 0."""
         self._silences = 0
-        """So many in a row, each ended by one good line."""
+        """Silences in a row, each ended by one good line."""
         self._good_in_row = self._bad_in_row = 0
         self._heard_ns: int | None = None
 
     def sign(self, sign: Sign) -> None:
-        """Go where the table says; but for trust itself, trust has to be earned anew."""
+        """Apply a sign by the table. Every sign except "trusted" resets the count of good lines."""
         self.state = TABLE.get((self.state, sign), self.state)
         if sign == "trusted":
             return
@@ -80,11 +81,14 @@ class Link:
             self.excuse()
 
     def silent(self, now_ns: int) -> bool:
-        """No good line within `quiet`, or none at all in this session."""
+        """Return whether no good line came within `quiet_ns`, or none at all in this session."""
         return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
 
     def good(self, at_ns: int) -> int | None:
-        """Count a good line; the time since the one before, None for the first of a session."""
+        """Count a good line.
+
+        Return the ns since the one before, None for the first of a session.
+        """
         since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
         if not self.silent(at_ns):
             self.excuse()
@@ -99,27 +103,36 @@ class Link:
         return since_ns
 
     def excuse(self) -> None:
-        """The last good lines were no sparse ones: in time, or it was not the board that waited."""
+        """Reset the count of silences: the last line came in time, or the host was late."""
         self._silences, self.sparse_s = 0, 0.0
 
     def missed(self) -> None:
-        """What came, or did not, is no reason to trust the link; a link that is up stays so."""
+        """Note a bad line or a silence.
+
+        Unless the link is up, this resets the count of good lines.
+        """
         if self.state != "up":
             self._good_in_row = 0
 
     def bad(self) -> bool:
-        """Count a line that is none; True when so many came in a row that it is time to ask."""
+        """Count a bad line.
+
+        Return True if it is the last of BAD_LINES in a row, so that the check must be asked for.
+        """
         self.missed()
         self._bad_in_row += 1
         return self._bad_in_row == BAD_LINES
 
     @property
     def damaged(self) -> bool:
-        """The last lines that came were bad ones."""
+        """Whether the last BAD_LINES lines were bad."""
         return self._bad_in_row >= BAD_LINES
 
     def judge(self, now_ns: int, may_rise: bool) -> None:
-        """Bring it up to date; `may_rise` unless there is a reason against trust just now."""
+        """Update the state for silence or trust.
+
+        `may_rise` is False if the link must not come up now.
+        """
         silent = self.silent(now_ns)
         if self.state == "up":
             if silent:

@@ -1,5 +1,4 @@
-"""How the link is and which check is in force, for people: what `state.reason`, the log and the
-page say while nothing may drive."""
+"""Messages about the link and the check in force, for `state.reason`, the log and the web page."""
 
 from __future__ import annotations
 
@@ -10,18 +9,21 @@ from acsard.mcu.whose_silence import Lateness
 from acsard.values import Event
 
 BLOCKED = "the serial port sends nothing: its driver accepts no bytes; replug the adapter"
-"""The reason while the output is blocked."""
+"""The reason while the driver takes no bytes."""
 
 
 def damaged(link: Link, check: Negotiation) -> bool:
-    """The check is asked for because replies came damaged."""
+    """Return whether the check is being asked for because replies came damaged."""
     return link.damaged and check.asking
 
 
 def words(
     link: Link, check: Negotiation, hearing: Hearing, lateness: Lateness, longest_reply: float
 ) -> str:
-    """Of a port that is open; `longest_reply` s is the most that mcu.reply_period may be."""
+    """Return a sentence about the link of an open port.
+
+    `longest_reply` is the largest value of mcu.reply_period, s.
+    """
     if link.state in ("booting", "stale"):
         heard = hearing.heard
         if check.trouble:
@@ -49,7 +51,7 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
 
 
 def check_event(check: Negotiation, wants_samples: bool) -> Event:
-    """Which check has come into force; a warning where it is less than was asked for."""
+    """Return the event for a newly agreed check, as a warning if it is less than was asked for."""
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"
     if check.state == "plain":

@@ -1,15 +1,16 @@
-"""Which check is in force on this line: asked at every opening and after every gap, with stops.
+"""Negotiates the check of the serial line, with stops only, at every opening and after every gap.
 
-    off      mcu.link_check says so: plain lines, nothing is asked
-    waking   only stops leave. The MCU has said nothing yet: every other question is a plain stop,
-             for it may know no other, and silence is no answer
-    asking   only stops leave. The MCU is there, so silence is an answer too
-    plain    "auto" only: it answers, but without the check; asked again after the next gap
-    checked  a right reply to a line of ours has come; from now on only such count
-    sampled  checked, and its replies bring the encoder counts they are asked for
+- off: mcu.link_check is "off". Lines are plain and the daemon asks for nothing.
+- waking: only stops leave. The board has not answered yet. Every second question is a plain stop,
+  because the board may know no other line, and its silence proves nothing.
+- asking: only stops leave. The board has answered, so its silence to a question is an answer.
+- plain: with "auto" only. The board answers, but without the check. The daemon asks again after the
+  next gap.
+- checked: a correct reply to a line has come. From now on only correct replies count.
+- sampled: checked, and the replies bring the encoder counts that the lines ask for.
 
-Knows sequences and questions, nothing of speeds. An MCU that has answered with the check once is
-never believed without it until the port is opened anew: noise must not talk us out of the check.
+This module knows sequences and questions, but not speeds. A board that has once answered with the
+check is not believed without it until the port is reopened, because noise must not end the check.
 """
 
 from __future__ import annotations
@@ -27,8 +28,15 @@ from acsard.values import NS_PER_S
 
 State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
 Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
-"""What moves it: the link begins anew; a plain line while asking; a right answer to a question,
-without or with a sample; no answer to any question; replies that bring no samples any more."""
+"""The inputs of the state machine.
+
+- gap: the link starts over
+- heard: a plain line came while asking
+- answer: a correct answer to a question, without a sample
+- sample: a correct answer to a question, with a sample
+- refusal: no question was answered
+- samples_end: the replies bring no more samples
+"""
 
 TABLE: dict[tuple[State, Sign], State] = {
     ("waking", "gap"): "waking",
@@ -44,7 +52,7 @@ TABLE: dict[tuple[State, Sign], State] = {
     ("sampled", "gap"): "waking",
     ("sampled", "samples_end"): "checked",
 }
-"""Where a sign leads; without an entry it changes nothing."""
+"""Maps (state, sign) to the next state. Without an entry the state stays."""
 
 IN_FORCE: dict[State, str] = {
     "off": "plain",
@@ -56,8 +64,12 @@ IN_FORCE: dict[State, str] = {
 }
 
 Trouble = Literal["", "echo", "forgotten", "unknown"]
-"""Why nothing drives however long it is asked: what is sent comes back; the MCU knew the check and
-does not answer with it now; it does not know it, and it is required."""
+"""The reason why asking never ends, so that nothing drives.
+
+- echo: the lines that the daemon sends come back
+- forgotten: the board answered with the check before and does not now
+- unknown: the board does not know the check, and the configuration requires it
+"""
 
 MENDS: dict[Trouble, str] = {
     "": "",
@@ -73,66 +85,72 @@ MENDS: dict[Trouble, str] = {
 }
 
 TRIES = 3
-"""Questions of a kind that go unanswered before the MCU is said not to know it."""
+"""Unanswered questions of a kind after which the board does not know that kind."""
 
 WINDOW = 64
-"""Lines whose answers may still come; far fewer than the sequence can tell apart."""
+"""Lines whose answers may still come, far fewer than the sequence can distinguish."""
 
 LATE_NS = round(WATCHDOG_S * NS_PER_S)
-"""An answer later than this is to a line that the MCU's own watchdog has outlived."""
+"""Largest delay of an answer. Before a later one the board's own watchdog has stopped the
+motors."""
 
 BLIND_PERIOD_NS = NS_PER_S // 10
-"""Zero lines go out at 10 Hz while nothing comes back: enough to wake the MCU, little to queue."""
+"""Distance of the stop lines while nothing comes back: 10 Hz is enough to wake the board and leaves
+little in a queue."""
 
 THINKING_NS = 30_000_000
-"""What an MCU and the drivers may take to answer, besides the wire."""
+"""Time that the board and the drivers may take to answer besides the wire time."""
 
 FEW_SAMPLES = 5
-"""Right replies in a row without the sample they were asked for: it is not coming back."""
+"""Correct replies in a row without the requested sample, after which samples no longer come."""
 
 
 class Negotiation:
-    """Asks, seals what leaves, and says whether a reply answers a line of ours."""
+    """The negotiation of the check. It asks, seals lines, and matches replies with lines."""
 
     def __init__(self, mcu: McuConfig, stop: bytes) -> None:
-        """`stop` is the plain stop line."""
+        """Start; `stop` is the plain stop line."""
         self._stop, self._wanted = stop, mcu.link_check
         self.state: State = "off" if mcu.link_check == "off" else "waking"
         self.trouble: Trouble = ""
         self.settled_ns = 0
-        """When asking last ended."""
+        """Monotonic time at which asking last ended."""
         first = (ASK_SAMPLE,) * TRIES if mcu.wants_samples else (ASK_NOTHING,)
         self._letters = (*first, *(b"",) * TRIES)
         self._question = b""
-        """The last one, if an echo of it can be told from an answer."""
+        """The last question if its echo can be distinguished from an answer, else b""."""
         longest = line_bytes(mcu.trailing_comma, check=True, sample=mcu.wants_samples)
         self._answer_ns = THINKING_NS + 4 * wire_ns(longest, mcu.baud_rate)
         self._sequence = 0
         self._made: tuple[int, int] | None = None
-        """Sequence and time of the sealed line just made; what became of it is not known yet."""
+        """Sequence and time of the sealed line just made, until `settle` reports whether it
+        left."""
         self._pending: deque[tuple[int, int]] = deque(maxlen=WINDOW)
-        """Those of the lines that left and are not answered."""
+        """Sequences and times of the lines that left and are not answered."""
         self._knows = False
         self._without = 0
         self._begin(fresh=True)
 
     @property
     def asking(self) -> bool:
-        """Only `question` leaves."""
+        """Whether only questions leave."""
         return self.state in ("waking", "asking")
 
     @property
     def checked(self) -> bool:
-        """Only replies with a right check count."""
+        """Whether only replies with a correct check count."""
         return self.state in ("checked", "sampled")
 
     @property
     def in_force(self) -> str:
-        """The check in force, for people."""
+        """The check in force, as text."""
         return IN_FORCE[self.state]
 
     def begin(self, fresh: bool = False) -> None:
-        """Ask from the start: nothing said before counts. `fresh` when the port has been opened."""
+        """Ask from the start and forget all earlier answers.
+
+        `fresh` means that the port has been opened.
+        """
         self._sign("gap")
         self._begin(fresh)
         if fresh:
@@ -143,22 +161,22 @@ class Negotiation:
         self._made = None
         self._asked, self._just_asked = Throttle(), False
         self._unanswered, self._open = 0, False
-        # The port makes the first line after an opening a plain stop, whatever it is given.
+        # The port replaces the first line after an opening by a plain stop.
         self._plain_turn = 0 if fresh else 1
 
     def _sign(self, sign: Sign) -> None:
         self.state = TABLE.get((self.state, sign), self.state)
 
-    # what leaves
+    # Lines that leave.
 
     def seal(self, line: bytes, now_ns: int) -> bytes:
-        """The line as it leaves under the check in force."""
+        """Return the line in the form in force."""
         if not self.checked:
             return line
         return self._sealed(line, ASK_SAMPLE if self.state == "sampled" else b"", now_ns)
 
     def question(self, now_ns: int) -> bytes | None:
-        """While asking: the stop that is due now, or None."""
+        """Return the stop line to send while asking, or None if none is due."""
         waking = self.state == "waking"
         wait_ns = max(BLIND_PERIOD_NS, self._answer_ns) if waking else self._answer_ns
         if not self._asked.lets(now_ns, wait_ns):
@@ -173,7 +191,7 @@ class Negotiation:
         return line
 
     def settle(self, went: bool) -> None:
-        """What became of the last line: nobody can answer one that did not go."""
+        """Note whether the last line left. No answer can come to a line that did not."""
         if self._made is not None and went:
             self._pending.append(self._made)
             self._open = self.asking
@@ -187,37 +205,43 @@ class Negotiation:
         self._made = (self._sequence, now_ns)
         return seal(line, self._sequence, letters)
 
-    # what comes back
+    # Lines that come back.
 
     def echoed(self, line: bytes) -> bool:
-        """Is this our own question? Then nothing that comes back can be believed: it never is."""
+        """Return whether the line is, or earlier lines were, an echo of a question.
+
+        After an echo no received line is believed until the port is reopened.
+        """
         if self._question and line == self._question:
             self.trouble = "echo"
         return self.echoes
 
     @property
     def echoes(self) -> bool:
-        """Whatever comes is an echo, until the port is opened again."""
+        """Whether every received line counts as an echo, until the port is reopened."""
         return self.trouble == "echo"
 
     def found_echo(self) -> None:
-        """Plain lines were found to be an echo."""
+        """Note that plain lines were found to be an echo."""
         self.trouble = "echo"
 
     def heard_plain(self) -> None:
-        """A whole plain line came while asking: the MCU is awake, so silence is an answer too."""
+        """Note a whole plain line while asking.
+
+        The board is awake, so from now on its silence is an answer too.
+        """
         self._sign("heard")
 
     def answered(self, reply: Checked, at_ns: int) -> int:
-        """Take a right reply; when the line it answers was made.
+        """Take a correct reply; return when the line that it answers was made.
 
-        Raises `FrameError` unless it answers a line sent and unanswered.
+        Raises `FrameError` unless the reply answers a line that was sent and is unanswered.
         """
         while self._pending and at_ns - self._pending[0][1] > LATE_NS:
             self._pending.popleft()
         if reply.sequence not in [sequence for sequence, _ in self._pending]:
             raise FrameError("stale_sequence", reply.plain)
-        # Lines are answered in order: those before this one will not be any more.
+        # The board answers lines in order, so the lines before this one get no more answers.
         sequence, made_ns = self._pending.popleft()
         while sequence != reply.sequence:
             sequence, made_ns = self._pending.popleft()
@@ -233,12 +257,15 @@ class Negotiation:
         return made_ns
 
     def judge(self, now_ns: int) -> None:
-        """Count a question that goes unanswered; after the last one settle for what there is."""
+        """Count a question without an answer.
+
+        After the last one accept the plain form or report trouble.
+        """
         asked_ns = self._asked.last_ns
         if self.state != "asking" or not self._open or asked_ns is None:
             return
         if self.echoes:
-            self._unanswered = 0  # it goes on asking, and nothing drives
+            self._unanswered = 0  # keep asking, so that nothing drives
             return
         if now_ns - asked_ns < self._answer_ns:
             return

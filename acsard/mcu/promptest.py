@@ -1,8 +1,9 @@
-"""How late a thing comes, by two clocks that were never compared: against the promptest so far.
+"""Measures how late events are by two unrelated clocks, relative to the minimum delay so far.
 
-Arrival by our clock less departure by theirs holds the delay and how far the clocks are apart.
-That nobody knows, but how much longer than the shortest delay this one is, it tells. Clocks drift:
-the promptest counts for less as time goes by.
+The arrival time by our clock minus the departure time by theirs is the delay plus an unknown offset
+between the clocks. The offset cancels out in the comparison with the smallest value so far, so the
+result is the delay in excess of the minimum. Clocks drift, so the minimum counts for less as time
+passes.
 """
 
 from __future__ import annotations
@@ -11,18 +12,22 @@ import math
 
 
 class Promptest:
-    """Remembers how late the last one came; in one unit of time, the caller's."""
+    """The lateness of the last event, in the caller's unit of time."""
 
     def __init__(self, drift: float, most: float = math.inf) -> None:
-        """By which share the clocks may go apart; what is later than `most` counts as that late."""
+        """Start.
+
+        `drift` is the relative drift of the clocks, and a lateness above `most` counts as `most`.
+        """
         self._drift, self._most = drift, most
         self.late = 0.0
-        """How much later than the promptest the last one came."""
+        """Lateness of the last event over the minimum delay."""
 
     def add(self, ours: float, theirs: float) -> float:
-        """One more, so long after the last by our clock and by theirs; drift is forgiven after it.
+        """Take an event, `ours` after the last one by our clock and `theirs` by the other.
 
-        How much later than the promptest so far: below 0 it is the promptest now.
+        Return its lateness over the minimum so far. A negative result makes it the new minimum.
+        Drift is subtracted afterwards.
         """
         later = self.late + ours - theirs
         self.measure(ours, theirs)
@@ -30,10 +35,13 @@ class Promptest:
         return later
 
     def measure(self, ours: float, theirs: float) -> float:
-        """`late` of one more, drift forgiven; below 0, it is prompter than whom we believe."""
+        """Return the lateness of an event, less drift.
+
+        A negative result is below the accepted minimum.
+        """
         self.late = self.late + ours - theirs - self._drift * ours
         return self.late
 
     def believe(self) -> None:
-        """The last one measured is the promptest, if none was prompter."""
+        """Accept the last measured event as the minimum if its lateness is negative."""
         self.late = min(max(0.0, self.late), self._most)

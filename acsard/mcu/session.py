@@ -35,7 +35,7 @@ NAMES: dict[LinkState, EventName] = {
     "up": "link_up",
     "stale": "link_stale",
 }
-"""The event that a state of the link is when it comes about."""
+"""The event that reports each state of the link."""
 
 LONG_GAP_NS = 1 * NS_PER_S
 """A gap this long in either direction means the MCU may have been reset: commanders start over."""

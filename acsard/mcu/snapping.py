@@ -1,12 +1,13 @@
-"""What coarse encoders do to the reported speeds, and whole counts where these show them.
+"""Detects the quantization of the reported speeds and recovers whole encoder counts from them.
 
-Where a wheel's speeds lie on a lattice (`lattice.py`) each is a whole number of counts, and by the
-firmware's period an angle without rounding: a line says exactly how far the wheel turned in it. The
-period that a firmware divides by is a round one near that of its lines; that it makes whole counts
-a turn proves it. Each wheel has an encoder of its own (`wheel_counter.py`).
+If a wheel's speeds lie on a lattice (`lattice.py`), each speed is a whole number of counts. With
+the firmware's period it is then an exact angle, so a line tells exactly how far the wheel turned.
+The period by which a firmware divides is a round number near the mean period of its lines. It is
+proven if it makes the counts per turn whole. Each wheel has an encoder of its own
+(`wheel_counter.py`).
 
-The counts are trusted as long as they and the lines' times say the same: a firmware that reports
-otherwise than it did is learned anew, and so is one behind a port opened again.
+The counts are trusted while they agree with the times of the lines. If the firmware starts to
+report in another way, or the port is reopened, learning starts over.
 """
 
 from __future__ import annotations
@@ -18,62 +19,64 @@ from acsard.mcu.feedback import Feedback
 from acsard.mcu.wheel_counter import WheelCounter
 
 LOOK = 50
-"""Lines from one look at what was found, and what still holds, to the next."""
+"""Lines from one check of the findings to the next."""
 
 LONG = 100
-"""Looks over which the mean period is taken."""
+"""Checks over which the mean period is taken."""
 
 STRAYS = 4
-"""Speeds off the lattice that end it, of which each look forgets one: 2 % may be damaged."""
+"""Speeds off the lattice that end it. Each check forgives one, because 2 % may be damaged."""
 
 ROUND_PERIOD = 0.006
-"""By which share a period may be off its round number: a ceramic resonator has 0.5 %."""
+"""Relative error of a period against its round number. A ceramic resonator has 0.5 %."""
 
 APART_S, MOST_APART = 0.1, 5.0
-"""s, and periods where that is more, by which counts and the lines' times may say otherwise."""
+"""Largest difference between the counts and the times of the lines: in s, or in periods if that is
+more."""
 
 KEPT = 0.98
-"""Share of that kept with each line: two clocks go apart for ever."""
+"""Share of that difference that is kept with each line, because two clocks drift apart for ever."""
 
 GLANCE, MISSING = 10, 0.6
-"""Lines all of which came so many periods late: one is missing that nobody has bridged."""
+"""Lines, and periods by which all of them were late. Then a line is missing that gap filling has
+not counted."""
 
 ALIKE = 3.0
-"""How much further than the second coarsest of four encoders one may step by what it reports: what
-jumps at random shows steps too, and only proven counts may be so much coarser."""
+"""Bound on a wheel's reported step, as a multiple of the second largest of the four. Random jumps
+look like steps too, and only proven counts may be coarser than this."""
 
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
 class Snapping:
-    """Looks at every good line of one port."""
+    """The quantization of all wheels, learned from every good line of one port."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Another MCU may be there, or the same one may report otherwise."""
+        """Start over: the board may be another one, or it reports in another way."""
         self._wheels = [WheelCounter() for _ in NOTHING]
         self._owing: list[int] = []
         self._reported, self._steps = NOTHING, NOTHING
-        """rad/s; how far each wheel's reports step, and what is made of that."""
+        """rad/s. The step that each wheel reports, and the bounded step that is passed on."""
         self._time, self._lines = 0.0, 0
         self._period = self._apart = self._least = 0.0
-        """s; what the firmware divides by, 0 while unknown; how much more the lines' times say,
-        and the least of that in this glance."""
+        """Seconds. The period by which the firmware divides, 0 while unknown; the excess of the
+        lines' times over the counts; the least excess in the present group of `GLANCE` lines."""
 
     def forgive(self) -> None:
-        """What rounding has cost until now is of a pose that counts no more."""
+        """Drop the corrections for past rounding, because the pose was reset."""
         for wheel in self._wheels:
             wheel.forgive()
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Counts per turn found of each wheel's encoder, in `WHEELS` order; 0 is not found."""
+        """Counts per turn found for each wheel's encoder, in `WHEELS` order; 0 if unknown."""
         return tuple([wheel.counts for wheel in self._wheels])
 
     def look(self, line: Feedback) -> Feedback:
-        """The line with what its counts are, where it shows them, and how far they make it step."""
+        """Return the line with its counted angles, if its speeds show any, and its steps."""
         own, speeds, counted = line.dt - line.bridged, line.speeds.as_tuple(), None
         if line.turned is None and own > 0.0:
             counted = self._counted(speeds, own)
@@ -89,7 +92,7 @@ class Snapping:
         return replace(line, counted=counted, steps=self._steps)
 
     def _bounded(self, reported: Motors) -> Motors:
-        """How far the wheels' speeds step, of what they report and what is proven, rad/s."""
+        """Return the step of each wheel's speed, from its reports or its proven counts, rad/s."""
         most = ALIKE * sorted(reported)[2]
         a, b, c, d = (
             wheel.quantum or min(step, most)
@@ -98,7 +101,7 @@ class Snapping:
         return a, b, c, d
 
     def _counted(self, speeds: Motors, own: float) -> Motors | None:
-        """How far each wheel turned in the `own` s of this line, rad; None: nothing is known."""
+        """Return how far each wheel turned in the `own` s of this line, rad, or None if unknown."""
         self._lines, self._time = self._lines + 1, self._time + own
         if not self._lines % LOOK and not self._take_a_look():
             return None
@@ -111,7 +114,7 @@ class Snapping:
             return None
         missing = self._missing(own)
         if missing is None:
-            # What the counts have said too much or too little is settled by the lines' times.
+            # The times of the lines correct the excess or shortfall of the counts.
             settled = self._apart + period
             self.forget()
             front_right, front_left, rear_left, rear_right = (s * settled for s in speeds)
@@ -126,8 +129,10 @@ class Snapping:
         return self._made_good(counted) if self._owing else counted
 
     def _missing(self, own: float) -> float | None:
-        """s of lines that nobody has bridged, which are missing before this one; None: the lines'
-        times say otherwise than the counts."""
+        """Return the duration of missing lines before this one that no gap filling has counted, s.
+
+        Return None if the times of the lines contradict the counts.
+        """
         period = self._period
         apart = self._apart = self._apart * KEPT + own - period
         if abs(apart) > max(APART_S, MOST_APART * period):
@@ -142,14 +147,14 @@ class Snapping:
         return missing
 
     def _made_good(self, counted: Motors) -> Motors:
-        """These angles and what one wheel is owed: one a line, so that none takes long."""
+        """Add the correction owed to one wheel. One wheel per line keeps every step short."""
         wheel, angles = self._owing.pop(), list(counted)
         angles[wheel] += self._wheels[wheel].owed(self._period)
         a, b, c, d = angles
         return a, b, c, d
 
     def _take_a_look(self) -> bool:
-        """Whether the wheels still report as they did."""
+        """Return whether the wheels still report as before. If not, start over."""
         wheels = self._wheels
         if any(wheel.off > STRAYS for wheel in wheels):
             self.forget()
@@ -162,7 +167,7 @@ class Snapping:
         return True
 
     def _settle(self) -> None:
-        """Find what counts, and what period, the lattices are made of."""
+        """Find the counts per turn and the period that explain the lattices."""
         found = [i for i, w in enumerate(self._wheels) if w.lattice and not w.counts]
         if not found or self._lines < LOOK:
             return
@@ -175,6 +180,6 @@ class Snapping:
 
 
 def _round(mean: float) -> list[float]:
-    """The periods in s that a firmware may divide by whose lines are `mean` s apart."""
+    """Return the periods, s, by which a firmware may divide if its lines are `mean` s apart."""
     near = (round(mean * 1000) / 1000, 1 / max(1, round(1 / mean)))
     return [period for period in near if abs(mean - period) <= ROUND_PERIOD * mean]

@@ -1,9 +1,10 @@
-"""How far a wheel's reports step from line to line: what its encoder's counts make of its speed.
+"""Learns how far a wheel's reported speed steps from line to line because of its encoder.
 
-One count more or less in a period is a step of 2 pi / (counts T), 31 rad/s at 20 counts a turn and
-100 Hz, and no acceleration. How large these steps are is learned from the reports themselves, of
-any firmware: counts by its nominal period, by the time measured, or filtered. Steps so large must
-recur, and do where they are counts; a damaged line makes two, one there and one back.
+One count more or less in a period is a step of 2 pi / (counts T): 31 rad/s at 20 counts a turn and
+100 Hz. It is not an acceleration. The size of these steps is learned from the reports themselves.
+That works for any firmware, whether it divides counts by its nominal period or by the measured
+time, or filters them. Steps that come from counts recur. A damaged line makes only two, one there
+and one back.
 """
 
 from __future__ import annotations
@@ -11,20 +12,23 @@ from __future__ import annotations
 import math
 
 FLICKER = 0.0105
-"""rad/s; no more than rounding."""
+"""rad/s. A smaller step is only rounding."""
 
 BLOCK = 64
-"""Steps that are looked at together: with a filter behind few counts, three counts' worth."""
+"""Steps that are examined together: enough for three counts even if a filter smooths few counts."""
 
 FIRST = 24
-"""Steps of a first block after which it says something: its own largest, which may still grow."""
+"""Steps of the first block after which `size` has a first value, which may still grow."""
 
 RECUR = 3
-"""The largest step counts that so many of a block reach: one damaged line makes two."""
+"""Number of steps of a block that must reach a size. One damaged line makes two."""
 
 
 class Steps:
-    """Those of one wheel; `size` of them in rad/s, `math.inf` until enough of them were seen."""
+    """The step of one wheel's speed.
+
+    `size` is in rad/s, `math.inf` until enough steps were seen.
+    """
 
     def __init__(self) -> None:
         self.size = math.inf
@@ -34,7 +38,7 @@ class Steps:
         self._count = 0
 
     def add(self, speed: float) -> None:
-        """The next report, rad/s."""
+        """Take the next reported speed, rad/s."""
         step = abs(speed - self._last)
         if step < FLICKER:
             return
@@ -49,6 +53,7 @@ class Steps:
         if self._count == FIRST and self.size == math.inf:
             self.size = largest[0]
         if self._count == BLOCK:
-            # A block's own and the one before it: at its start it has seen too little.
+            # At its start a block has seen too little, so the size of the block before still
+            # counts.
             self._before, self._count = largest[0], 0
             self.size, self._largest = self._before, [0.0] * RECUR

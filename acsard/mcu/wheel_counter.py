@@ -1,8 +1,8 @@
-"""One wheel's encoder as its reported speeds show it: counts a turn, and how it makes them step.
+"""Learns the counts per turn of one wheel's encoder from its reported speeds.
 
-Learns from changes of the speed, for a steady one says the same again and again. Once the counts
-are known each speed is an angle of whole counts, without rounding; and what rounding has cost until
-then is made good, since of each speed it is known how often it was told.
+It learns from changes of the speed, because a steady speed repeats one value. When the counts are
+known, each speed is an angle of whole counts, without a rounding error. The error until then is
+corrected afterwards, from the number of times that each speed was reported.
 """
 
 from __future__ import annotations
@@ -13,49 +13,52 @@ from acsard.mcu.lattice import FINEST, ROUNDING, Lattice, Search, on
 from acsard.mcu.steps import FLICKER, Steps
 
 LEARNED_FROM = 100
-"""Changes of a wheel's speed after which a lattice is looked for."""
+"""Changes of a wheel's speed before a lattice is searched."""
 
 MOST_SEEN = 256
-"""Different speeds remembered: what bounds a search."""
+"""Different speeds remembered, which bounds a search."""
 
 MOST_TOLD = 512
-"""Different speeds whose rounding is made good later: those of 10 000 counts a turn."""
+"""Different speeds whose rounding is corrected later: as many as 10 000 counts a turn make."""
 
 OWED_FOR = 3000
-"""Lines whose rounding is made good; what was owed before these belongs to another place."""
+"""Lines after which the owed correction is dropped, because it belongs to another place."""
 
 LONGEST_WAIT = 128 * LEARNED_FROM
-"""Changes until a stream without a lattice is looked at again: minutes of driving."""
+"""Largest number of changes between two searches of speeds without a lattice: minutes of
+driving."""
 
 
 class WheelCounter:
-    """One wheel: `counts` a turn of its encoder once they are known, else 0."""
+    """The encoder of one wheel; `counts` per turn, 0 until they are known."""
 
     def __init__(self) -> None:
         self.counts = self.off = 0
         self.quantum = self.angle = 0.0
-        """rad/s and rad, of one count in a period."""
+        """One count in a period, as a speed in rad/s and as an angle in rad."""
         self.steps = Steps()
         self.lattice: Lattice | None = None
         self._search: Search | None = None
         self._told: dict[float, int] | None = {}
-        """How often each speed was told before the counts were known, forward less backward;"""
+        """How often each speed was reported before the counts were known, forward minus backward.
+        None if there were too many different speeds."""
         self._owing = 0
-        """in so many lines."""
+        """Number of lines in `_told`."""
         self._last = 0.0
         self._seen: dict[float, int] = {}
         self._missing = self._patience = LEARNED_FROM
-        """Changes until it is searched, and how many more if that does not help."""
+        """Changes until the next search, and changes to the one after it."""
 
     def learn(self, speed: float) -> None:
-        """The next report of a wheel whose counts are unknown."""
+        """Take the next report of a wheel whose counts are unknown."""
         self._owing += 1
         if self._owing > OWED_FOR:
             self.forgive()
-        if speed and self._told is not None:
-            size, way = abs(speed), 1 if speed > 0 else -1
-            self._told[size] = self._told.get(size, 0) + way
-            if len(self._told) > MOST_TOLD:
+        told = self._told
+        if speed and told is not None:
+            size, way = (speed, 1) if speed > 0 else (-speed, -1)
+            told[size] = told.get(size, 0) + way
+            if len(told) > MOST_TOLD:
                 self._told = None
         if self._search is None and abs(speed - self._last) >= FLICKER:
             self._last, size = speed, abs(speed)
@@ -68,7 +71,7 @@ class WheelCounter:
                 self._search = Search(self._seen)
 
     def go_on(self) -> bool:
-        """Search a little further, if it does; whether it has just found a lattice."""
+        """Continue the search, if one runs; return whether it has just found a lattice."""
         if self._search is None:
             return False
         if not self._search.go_on():
@@ -81,7 +84,10 @@ class WheelCounter:
         return self.lattice is not None
 
     def turned(self, speed: float, own: float, missing: float) -> float:
-        """rad in the `own` s of this line; `missing` s more went by that no line reported."""
+        """Return the angle that the wheel turned in the `own` s of this line, rad.
+
+        The result includes `missing` s of lines that were lost before it.
+        """
         if not self.counts:
             self.steps.add(speed)
             self.learn(speed)
@@ -93,7 +99,7 @@ class WheelCounter:
         return whole * self.angle + speed * missing
 
     def owed(self, period: float) -> float:
-        """rad that rounding has cost while the counts were unknown; asked for once."""
+        """Return the rounding error until the counts were known, rad. Call it once."""
         told, self._told = self._told or {}, None
         return math.fsum(
             times * (round(speed / self.quantum) * self.angle - speed * period)
@@ -102,13 +108,16 @@ class WheelCounter:
         )
 
     def forgive(self) -> None:
-        """Nothing is owed for what was until now."""
+        """Drop the correction for everything until now."""
         self._owing = 0
         if self._told is not None:
             self._told = None if self.counts else {}
 
     def show(self, period: float) -> bool:
-        """Whether it shows how many counts a turn it has, if its firmware divides by `period` s."""
+        """Return whether `period` s, as the firmware's divisor, makes the counts per turn whole.
+
+        If it does, adopt these counts.
+        """
         counts = self.lattice.counts(period) if self.lattice and not self.counts else 0
         if counts:
             self.counts, self.angle = counts, math.tau / counts

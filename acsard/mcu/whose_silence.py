@@ -1,5 +1,7 @@
-"""Whether a silence is the board's, or of this computer, which did not run and so neither asked nor
-heard it. For the person who has to find out why: the link is judged by the silence alone.
+"""Distinguishes a silence of the board from a stall of this computer.
+
+A computer that stalls neither sends nor receives. The result is a hint for the operator. The link
+is judged by the silence alone.
 """
 
 from __future__ import annotations
@@ -9,10 +11,10 @@ from acsard.mcu.link_state import State as LinkState
 from acsard.values import NS_PER_S
 
 SHARE = 0.5
-"""Of the silence that ends a link: steps so far apart are what made it."""
+"""Share of the silence that ends a link. Two steps this far apart have caused the silence."""
 
 BUSY = "what else runs here? (`top`; as a service it goes first)"
-"""The mend of a computer that is late."""
+"""The advice for a computer that is late."""
 
 HOST = "this computer did not run for"
 
@@ -20,25 +22,32 @@ SIMULATOR = "the built-in simulator, a part of this program, is late"
 
 
 def is_ours(words: str) -> bool:
-    """These are `Lateness.words` of a silence that is of this computer."""
+    """Return whether `Lateness.words` blames this computer for the silence."""
     return HOST in words or SIMULATOR in words
 
 
 class Lateness:
-    """Looks at the times of the steps."""
+    """The lateness of the control steps."""
 
     def __init__(self, simulated: bool, quiet_ns: int) -> None:
-        """`simulated`: the board is a part of this process; `quiet_ns` of silence end the link."""
+        """Start.
+
+        Args:
+            simulated: Whether the board is a part of this process.
+            quiet_ns: The duration of silence that ends a link, ns.
+        """
         self._simulated, self._least_ns = simulated, SHARE * quiet_ns
         self._looked_ns: int | None = None
         self.late_s = 0.0
-        """The longest time since the last good line in which there was no step; 0 for none."""
+        """Longest time without a step since the last good line, s; 0 if no step was late."""
         self.step_s = 0.0
-        """The time between the last two steps when that was so long, else 0."""
+        """Time between the last two steps if it was too long, else 0; s."""
 
     def look(self, now_ns: int, good: bool) -> bool:
-        """A step, and whether a good line came with it; True when the silence that this one ends
-        was ours."""
+        """Note a step, and whether a good line came with it.
+
+        Return True if this line ends a silence that this computer caused.
+        """
         before_ns, self._looked_ns = self._looked_ns, now_ns
         passed_ns = 0 if before_ns is None else now_ns - before_ns
         self.step_s = passed_ns / NS_PER_S if passed_ns >= self._least_ns else 0.0
@@ -47,7 +56,7 @@ class Lateness:
         return good and (late_s > 0.0 or self._simulated)
 
     def words(self, link: LinkState) -> str:
-        """How the link is, for people."""
+        """Return a sentence about the link."""
         if link == "stale" and self.late_s:
             return f"{HOST} {self.late_s:.2f} s, and heard nothing of the microcontroller: {BUSY}"
         if link == "stale" and self._simulated:

@@ -1,1 +1,2 @@
-"""Shell: the control loop and the daemon around it; `daemon.py` reads top to bottom."""
+"""Shell package with the control loop and the daemon around it. `daemon.py` reads from top to
+bottom."""

@@ -1,56 +1,61 @@
-"""When a line may go: every period, and at once for what is new.
+"""Decides when a line may go: in every period, and at once for a new command or mode.
 
-A line that went at once takes the place of the next period's, so that a flood of commands makes no
-more lines than the clock alone; and it keeps a distance to the line before it: what that takes on
-the wire and a little more. Each period has one try.
+A line that goes at once replaces the line of the next period, so a flood of commands does not add
+lines. It keeps a distance to the line before it: the wire time of that line and a margin. Each
+period has one attempt.
 """
 
 from __future__ import annotations
 
 BREATH_NS = 1_000_000
-"""Beyond its time on the wire, what a line leaves the MCU to take it in and answer."""
+"""Time that a line leaves the board for its answer, besides the wire time, ns."""
 
 IDLE_WAKES = 3
-"""Steps a period that commands may cause without one of them counting: a stranger's flood costs no
-more than this, and the command that counts still has a chance in each period to go at once."""
+"""Steps per period that commands without effect may cause. This bounds the cost of a stranger's
+flood, and a command that counts can still go at once in each period."""
 
 
 class Pace:
-    """Remembers whether a line has already taken the next period's place.
+    """A record of whether a line has already replaced the line of the next period.
 
-    When the last line went is the port's to know; it is an argument here.
+    The port knows when the last line went, so the methods take that time as an argument.
     """
 
     def __init__(self, line_ns: int, period_ns: int) -> None:
         self._gap_ns = line_ns + BREATH_NS
         self._possible = self._gap_ns < period_ns
-        """Else the next period always comes before a line may go."""
+        """Whether a line can go between two periods at all."""
         self._ahead = False
-        """A line has gone in the place of the next period's."""
+        """Whether a line has gone in place of the next period's line."""
         self._tried = False
-        """This period's line has been offered, whether or not it went."""
+        """Whether this period's attempt has been made, successful or not."""
         self._waiting = False
-        """There was something new to say, too soon after a line."""
+        """Whether a new command came too soon after a line and waits."""
         self._idle = 0
 
     def period_ended(self, missed: int) -> bool:
-        """Does the clock's line go (`Inputs.tick`), or did one go in its place?
+        """Note the end of a period. Return whether its line goes (`Inputs.tick`).
 
-        After `missed` periods it goes in any case: the one before it is long ago.
+        It does not go if a line went in its place. After `missed` periods it goes in any case,
+        because the line before it left long ago.
         """
         ahead, self._ahead, self._tried = self._ahead, False, False
         self._idle = 0
         return missed > 0 or not ahead
 
     def at_once(self, now_ns: int, sent_ns: int) -> bool:
-        """May a line go now, beside the clock, if there is something new to say?"""
+        """Return whether a new command may go now, between two periods."""
         return self._possible and not self._tried and now_ns - sent_ns >= self._gap_ns
 
     def note(self, tick: bool, due: bool, went: bool, news: bool, heard: bool) -> None:
-        """After a step: was its line the clock's, was one `due`, did it go?
+        """Note the result of a step.
 
-        `news` is what the next line has to say that the last did not; `heard` that the bus had
-        something for this step.
+        Args:
+            tick: Whether its line was the period's.
+            due: Whether it had a line to send.
+            went: Whether the line left.
+            news: Whether the next line differs from the last one.
+            heard: Whether the bus had input for this step.
         """
         self._waiting = news and not due
         self._idle += heard and not news
@@ -59,10 +64,10 @@ class Pace:
 
     @property
     def listens(self) -> bool:
-        """Worth waking for a command: none is in hand; a line could go before the next period."""
+        """Whether a command that arrives now is worth a step of its own."""
         return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
     def retry_ns(self, sent_ns: int) -> int | None:
-        """When the line for what is new may go, if before the next period; None for never."""
+        """Return the monotonic time at which a waiting command may go, or None if none waits."""
         ahead = self._waiting and self._possible and not self._tried
         return sent_ns + self._gap_ns if ahead else None

@@ -159,7 +159,7 @@ class ControlLoop:
         port, pace = self._port, self._pace
         # Take the bytes first: `take` closes the port when the computer was suspended.
         received = port.take(now if missed else None)
-        # By position: a struct takes three times as long by sixteen names.
+        # Pass by position: with sixteen names a struct takes three times as long.
         inputs = Inputs(
             now,
             ended and pace.period_ended(missed),
@@ -317,7 +317,7 @@ class ControlLoop:
             return line
         self._superseded = True
         if offered == "superseded" and tick:
-            # A line that could not go at once is no loss: its period's line follows.
+            # A line that could not go at once is not counted: its period's line follows.
             self.robot.counters["lines_superseded"] += 1
         return None
 

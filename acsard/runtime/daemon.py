@@ -1,7 +1,8 @@
-"""The daemon from start to end; reads top to bottom.
+"""Runs the daemon from its start to its end; reads from top to bottom.
 
-Entering order is simulator, bus, port, control; leaving in reverse is the shutdown: ramp to zero,
-STOP, port closed, bus closed. A bug in any task ends the process the same way.
+The daemon enters the simulator, the bus, the port and the control loop in this order. Leaving them
+in reverse order is the shutdown: ramp to zero, STOP, close the port, close the bus. A bug in any
+task ends the process in the same way.
 """
 
 from __future__ import annotations
@@ -40,13 +41,15 @@ from acsard.serial.port import SerialPort
 from acsard.values import NS_PER_S, Event, Latches
 
 SWITCH_INTERVAL_S = 0.0005
-"""How long another Python thread may hold up the loop; by default 5 ms, half a period."""
+"""Longest time that another Python thread may hold the interpreter, s. The default is 5 ms, which
+is half a control period."""
 
 LATCHED_PERIOD_S = 5.0
-"""How often latched messages are sent again, for subscribers that cannot ask for history."""
+"""Interval at which latched messages are repeated for subscribers that cannot ask for history,
+s."""
 
 Announce = Callable[[str, str], None]
-"""Called once when everything is up, with the serial device and what is wrong with it, if it is."""
+"""A callback for the end of the start, with the serial device and its trouble, "" if it is open."""
 
 
 async def run(
@@ -56,10 +59,14 @@ async def run(
     door: Sequence[str] | None = None,
     page: Sequence[str] | None = None,
 ) -> None:
-    """Run until a signal; raises a `MendableError` when it cannot start.
+    """Run until a signal; raise a `MendableError` if the daemon cannot start.
 
-    `door` are the words for an `acsard door` of ours, None where it is a service of its own; `page`
-    those for an `acsard web`.
+    Args:
+        config: The configuration.
+        log: The log.
+        announce: Called once when everything runs.
+        door: Arguments of the `acsard door` process to run, None if it is a service of its own.
+        page: Arguments of the `acsard web` process to run, None for no page.
     """
     wake = Wakeup()
     manager = Systemd(os.environ, os.getpid())
@@ -67,7 +74,8 @@ async def run(
     departure.watch()
     log_from_environment()
     sys.setswitchinterval(SWITCH_INTERVAL_S)
-    # Before the first thread: those the bus starts are not to inherit it.
+    # Ask before the first thread starts, because the threads of the bus must not inherit the
+    # priority.
     refused = real_time.ask() if config.control.real_time else ""
     if refused:
         log.info("real_time", text=refused)
@@ -92,7 +100,7 @@ async def _run(
 ) -> None:
     async with AsyncExitStack() as stack:
         totals: dict[str, object] = {}
-        stack.callback(lambda: log.info("ended", **totals))  # first in, last out
+        stack.callback(lambda: log.info("ended", **totals))  # entered first, so it runs last
         events, start = list[Event](), clock.now()
         recorder = _recorder(config, events.append, start.wall_ns, stack)
         simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
@@ -101,7 +109,7 @@ async def _run(
         after = stack.enter_context(ExitStack())
         bus, port = _bus(config, wake), _port(config, path, wake, events.append)
         ends_ns = _certificates(config, door is not None)
-        # The bus first: an id or address in use must end us before the first byte to the MCU.
+        # The bus comes first: an id or address in use must end the daemon before the port opens.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
         if simulated is not None:
@@ -140,7 +148,7 @@ async def _run(
 def _recorder(
     config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
 ) -> Recorder | None:
-    """The black box, where one is wanted; it closes with the stack."""
+    """Return the black box, or None if the configuration has none. It closes with the stack."""
     if not config.record.directory:
         return None
     recorder = Recorder(config, log, wall_ns)
@@ -161,7 +169,7 @@ def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
 
 
 def _bus(config: Config, wake: Wakeup) -> ZenohBus:
-    """Not open yet."""
+    """Return the bus, not yet open."""
     return ZenohBus(
         config.bus,
         config.ros,
@@ -176,14 +184,14 @@ def _bus(config: Config, wake: Wakeup) -> ZenohBus:
 
 
 def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
-    """Not open yet."""
+    """Return the port, not yet open."""
     stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
     return SerialPort(path, config.mcu.baud_rate, stop, period_ns, wake, tell)
 
 
 @asynccontextmanager
 async def _beside(helpers: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator[None]:
-    """These run beside what is done within, and end with it."""
+    """Run the helpers as tasks beside the block, and cancel them when it ends."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(helper) for helper in helpers]
         yield
@@ -192,7 +200,10 @@ async def _beside(helpers: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator
 
 
 def _certificates(config: Config, ours: bool) -> int | None:
-    """When they end, of what is opened with them here; raises a `MendableError`."""
+    """Return when the certificates used by this process end, None without any.
+
+    Raises a `MendableError` if they cannot be used.
+    """
     bus = config.bus
     if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
         return None
@@ -207,10 +218,11 @@ async def _control(
     wake: Wakeup,
     manager: Systemd,
 ) -> None:
-    """The control task: a step every period, and one for feedback in hand."""
-    await asyncio.sleep(0)  # the other tasks' first, slow round is over before the first period
+    """Run the control task: a step in every period, and one when feedback arrives."""
+    # Let the slow first round of the other tasks end before the first period.
+    await asyncio.sleep(0)
     gc.collect()
-    gc.freeze()  # what lives now lives to the end; later collections need not look at it
+    gc.freeze()  # the present objects live to the end, so later collections skip them
     with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
 
         def step() -> Next | None:
@@ -228,7 +240,7 @@ async def _control(
 
 @asynccontextmanager
 async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
-    """A client has nothing to do before its router is there, and says so while it waits."""
+    """In client mode, report to the log and to systemd while the block waits for the router."""
     if config.bus.mode == "peer":
         yield
         return

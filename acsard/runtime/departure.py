@@ -1,4 +1,4 @@
-"""The way down: signals begin it, a second one cuts the ramp."""
+"""The shutdown on a signal: the first signal ramps to zero, a second one cuts the ramp short."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from acsard.host.systemd import Systemd
 from acsard.values import NS_PER_S
 
 EXIT_RAMP_S = 0.6
-"""Bound on the ramp to zero on the way down; then STOP whatever the speed."""
+"""Bound on the ramp to zero, s. After it the daemon sends STOP at any speed."""
 
 
 class Departure:
-    """Signals -> the way down: the first begins it, a second cuts the ramp."""
+    """The shutdown, begun by the first signal and hurried by the second."""
 
     def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
         self._log, self._wake, self._manager = log, wake, manager
@@ -25,13 +25,19 @@ class Departure:
         self.hurried = False
 
     def watch(self) -> None:
-        """Take over the signals; those of a closed terminal must not leave the wheels turning."""
+        """Handle the signals.
+
+        Those of a closed terminal are included, because it must not leave the wheels turning.
+        """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
             loop.add_signal_handler(number, self._signal, number)
 
     def started(self) -> None:
-        """From now on there is a robot to ramp down; until now a signal just ended the start."""
+        """Note that the start is complete.
+
+        Before this a signal cancels the start; now it begins the ramp.
+        """
         self._starting = None
 
     def _signal(self, number: signal.Signals) -> None:
@@ -45,7 +51,7 @@ class Departure:
         self._wake()
 
     def over(self, now_ns: int, at_rest: bool) -> bool:
-        """The ramp has ended, been cut, or had its time."""
+        """Return whether the ramp has ended, was cut short or has taken too long."""
         if self.begun_ns is None:
             return False
         return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S

@@ -1,8 +1,8 @@
-"""Keeps the door to the network, a fleet's router or the page open: a process of its own each.
+"""Supervises the TLS gateway, a fleet's router or the web page, each a process of its own.
 
-It says all the time that it is alive; one that does not (stopped, or hung as a whole) is ended. As
-a service the door is a unit of its own (`acsard-door.service`), where systemd does that, with
-limits that only it can set.
+The process sends a sign of life all the time. The supervisor ends a process that is silent, because
+it was stopped or hangs, and starts it again. If the gateway is a service, systemd does this for its
+own unit (`acsard-door.service`), with limits that only systemd can set.
 """
 
 from __future__ import annotations
@@ -24,35 +24,36 @@ from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S, Event, EventName
 
 AGAIN_S = 0.1
-"""Before a door is opened anew that had to be."""
+"""Seconds before a process that ended is started again."""
 
 LATER_S = 2.0
-"""Before one is tried again that could not be opened."""
+"""Seconds before a process that could not start is started again."""
 
 BEAT_S = 0.5
-"""How often to look whether it has said something; it does so twice in that time."""
+"""Seconds between two looks for a sign of life. The process sends two in that time."""
 
 SILENT_NS = 3 * NS_PER_S
-"""It judges itself after a second (`door/watch.py`), and waits for nobody longer than that; this is
-for one that cannot even do that."""
+"""Silence after which the process is killed. It ends itself after a second without progress
+(`door/watch.py`); this limit is for a process that cannot even do that."""
 
 START_NS = 15 * NS_PER_S
-"""How long it may take to say something for the first time: Python's start, on a busy machine."""
+"""Time for the first sign of life: the start of Python on a busy machine."""
 
 
 class Kind(Struct, frozen=True):
-    """What is kept open."""
+    """A kind of supervised process."""
 
     name: str
     ended: EventName
     final: frozenset[int] = frozenset()
-    """Exit codes after which it is not tried again."""
+    """Exit codes after which it is not started again."""
     again_s: float = AGAIN_S
-    """Before it is opened anew."""
+    """Seconds before it is started again."""
 
 
 DOOR = Kind("the door to the network", "door_ended")
-"""Tried for ever: the robot drives on, and its files may be mended meanwhile."""
+"""The gateway is always started again: the robot drives on, and an operator may fix its files
+meanwhile."""
 
 ROUTER = Kind("the router", "router_ended", frozenset({Exit.USAGE, Exit.BAD_CONFIG}))
 
@@ -62,13 +63,13 @@ PAGE = Kind(
     frozenset({Exit.OK, Exit.USAGE, Exit.IN_USE, Exit.NO_PERMISSION, Exit.BAD_CONFIG}),
     LATER_S,
 )
-"""A page that fails again and again takes no time from the robot; it says itself why it ends."""
+"""A page that keeps failing must take no time from the robot. It reports itself why it ends."""
 
 
 async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Kind = DOOR) -> int:
-    """`acsard` with these words ("door", ...), again whenever it ends, until cancelled.
+    """Run `acsard` with these arguments ("door", ...), again whenever it ends, until cancelled.
 
-    Returns an exit code that is final.
+    Return an exit code after which it must not be started again.
     """
     while True:
         door = _Door(words)
@@ -77,7 +78,7 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Ki
             why = door.silent or (
                 f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
             )
-        except (OSError, RuntimeError) as error:  # no room for a process, or for a thread
+        except (OSError, RuntimeError) as error:  # no room for a process or a thread
             code, why = Exit.USAGE, f"could not be started ({error})"
         else:
             if code in kind.final:
@@ -89,39 +90,40 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Ki
 
 
 class _Door:
-    """One life of the process."""
+    """One run of the process."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        # -P: what is installed, and not what lies in the directory that we were started in.
+        # With -P Python ignores the working directory, so it runs the installed package.
         self._command = [sys.executable, "-P", "-m", "acsard", *words, "--held"]
         self._ours: socket.socket | None = None
         self._over = False
         self.silent = ""
-        """Why it was ended, if we did that."""
+        """Why the supervisor killed the process, "" if it did not."""
 
     def run(self) -> int:
-        """Start it and wait for its end, in one thread: the process ends with its thread at last.
+        """Start the process, wait for its end and return its exit code; raise `OSError`.
 
-        Raises `OSError`.
+        All of this runs in one thread, so the thread ends together with the process.
         """
         hidden = ("NOTIFY_SOCKET", "INVOCATION_ID")
         env = {key: value for key, value in os.environ.items() if key not in hidden}
         ours, its = socket.socketpair()
         with ours:
-            # A session of its own: what is typed at the terminal is for the daemon, which ends it.
+            # The process gets a session of its own: terminal signals go to the daemon, which then
+            # ends it.
             with its:
                 process: subprocess.Popen[bytes] = subprocess.Popen(
                     self._command, stdin=its.fileno(), stdout=2, start_new_session=True, env=env
                 )
             self._ours = ours
-            if self._over:  # let go of while it was started
+            if self._over:  # released while it was being started
                 self.let_go()
             if self._falls_silent(ours):
                 process.kill()
             return process.wait()
 
     def _falls_silent(self, ours: socket.socket) -> bool:
-        """Listen to it; False when it has ended, or been let go of."""
+        """Wait for signs of life; return False when the process has ended or was released."""
         silence, before_ns, heard = Silence(START_NS), clock.mono_ns(), False
         while True:
             said = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
@@ -136,10 +138,10 @@ class _Door:
             before_ns = now_ns
 
     def let_go(self) -> None:
-        """End its standard input, which ends it."""
+        """Close the process's standard input, which makes it end."""
         self._over = True
         if self._ours is not None:
             try:
                 self._ours.shutdown(socket.SHUT_RDWR)
             except OSError:
-                pass  # it has ended, or nobody holds it any more
+                pass  # it has ended, or its end of the socket is closed

@@ -1,7 +1,7 @@
-"""What the daemon measures of itself all the time: fixed memory, no clock of its own.
+"""Measures the daemon's own latencies, in fixed memory and without a clock of its own.
 
-Each figure is a duration in us, told as median, 99th percentile and maximum since the start and
-over the last minute. They go out in `state` and `diagnostics`.
+Each figure is a duration in us, published as median, 99th percentile and maximum, since the start
+and over the last minute. The messages `state` and `diagnostics` carry them.
 """
 
 from __future__ import annotations
@@ -20,34 +20,35 @@ Name = Literal[
     "feedback_to_bus",
     "mcu_round_trip",
 ]
-"""The figures, in the order of the way a command goes:
+"""The figures, in the order in which a command passes them.
 
-period_lateness  from when a period was due to its step; of several missed ones, the first
-step_time        from the start of a step to the end of its work
-command_age      from a command's arrival here to each line that follows it
-command_to_wire  from a command's arrival here to the line that first follows it, handed to the
-                 port; one that first waited for its source's turn is not counted
-feedback_to_bus  from the read of a feedback line's end to its messages left for the bus; before
-                 that it may have waited in the kernel, for no longer than the loop stood still
-mcu_round_trip   from a line to the end of its answer, where a checked reply tells which line it
-                 answers; lines are pipelined, and nothing else does
+- period_lateness: from the time at which a period was due to its step; of several missed periods,
+  the first one counts
+- step_time: from the start of a step to the end of its work
+- command_age: from a command's arrival to each line that carries it
+- command_to_wire: from a command's arrival to the moment when the port took the first line that
+  carries it; a command that first waited for its source's turn is not counted
+- feedback_to_bus: from the read of a feedback line's end to its messages in the queue of the bus;
+  before the read the line may have waited in the kernel while the loop stood still
+- mcu_round_trip: from a line to the end of its answer, only for checked replies, because only these
+  tell which of the pipelined lines they answer
 """
 
 NAMES: tuple[Name, ...] = get_args(Name)
 
 SLOT_NS = 10 * NS_PER_S
-"""The last minute is kept in pieces of this length; the oldest makes room for the newest."""
+"""Length of a slot of the last minute. The newest slot replaces the oldest."""
 
 SLOTS = 6
 
 FRESH_NS = NS_PER_S
-"""How old the cached values may be: adding up the minute costs more than a step."""
+"""Longest age of the cached values. Adding up a minute costs more than a control step."""
 
 
 class _Figure:
     def __init__(self) -> None:
         self._past = Histogram()
-        """All that is older than the last minute."""
+        """All measurements older than the last minute."""
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
 
@@ -74,26 +75,26 @@ class _Figure:
 
 
 class LastMinute:
-    """How often something happened in the last minute, by the same pieces."""
+    """A counter of events in the last minute, in the same slots."""
 
     def __init__(self) -> None:
         self._slots: deque[tuple[int, int]] = deque(maxlen=SLOTS)
 
     def add(self, now_ns: int, count: int) -> None:
-        """It happened so often at monotonic `now_ns`."""
+        """Count `count` events at monotonic `now_ns`."""
         number, before = now_ns // SLOT_NS, 0
         if self._slots and self._slots[-1][0] == number:
             _, before = self._slots.pop()
         self._slots.append((number, before + count))
 
     def count(self, now_ns: int) -> int:
-        """How often until monotonic `now_ns`."""
+        """Return the number of events in the minute before monotonic `now_ns`."""
         oldest = now_ns // SLOT_NS - SLOTS
         return sum(count for number, count in self._slots if number > oldest)
 
 
 class Figures:
-    """All of them."""
+    """All figures of one daemon."""
 
     def __init__(self) -> None:
         self._figures = {name: _Figure() for name in NAMES}
@@ -101,11 +102,11 @@ class Figures:
         self._cached_ns = -FRESH_NS
 
     def add(self, name: Name, now_ns: int, duration_ns: int) -> None:
-        """Count one measurement made at monotonic `now_ns`."""
+        """Record a duration that was measured at monotonic `now_ns`."""
         self._figures[name].add(now_ns, duration_ns / 1000)
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
-        """Every figure by its name; at most a second old."""
+        """Return all figures by name, at most a second old."""
         if now_ns - self._cached_ns >= FRESH_NS:
             self._cached_ns = now_ns
             self._cached = {name: figure.measured(now_ns) for name, figure in self._figures.items()}

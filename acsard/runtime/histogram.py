@@ -1,4 +1,4 @@
-"""Percentiles of an endless stream in fixed memory: logarithmic buckets, no growth, no numpy."""
+"""Percentiles of an endless stream in fixed memory, by logarithmic buckets."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from operator import add
 from acsard.values import Spread
 
 PER_DECADE = 20
-"""Buckets per factor of ten: a percentile is right to 12 %."""
+"""Buckets per factor of ten. A percentile is accurate to 12 %."""
 
 DECADES = 7
-"""From 1 to 10^7 of the unit; what is smaller or larger falls into the end buckets."""
+"""Range from 1 to 10^7 of the unit. Values outside it fall into the end buckets."""
 
 LAST = PER_DECADE * DECADES
-"""The end bucket."""
+"""Index of the end bucket."""
 
 
 ENDS = [math.pow(10.0, index / PER_DECADE) for index in range(LAST)]
-"""The upper end of each bucket but the last, which has none."""
+"""The upper end of each bucket except the last, which is open."""
 
 
 class Histogram:
-    """Counts measurements of one quantity."""
+    """Measurements of one quantity, counted in buckets."""
 
     def __init__(self) -> None:
         self._buckets = [0] * (LAST + 1)
@@ -32,14 +32,14 @@ class Histogram:
         self._max = 0.0
 
     def add(self, value: float) -> None:
-        """Count one measurement."""
+        """Count a measurement."""
         self._buckets[bisect_left(ENDS, value)] += 1
         self._count += 1
         if value > self._max:
             self._max = value
 
     def merge(self, other: Histogram) -> None:
-        """Count all that the other has counted."""
+        """Add all measurements of another histogram."""
         if other._count == 0:
             return
         self._buckets[:] = map(add, self._buckets, other._buckets)
@@ -47,7 +47,10 @@ class Histogram:
         self._max = max(self._max, other._max)
 
     def spread(self) -> Spread:
-        """Median, 99th percentile and maximum so far; a percentile is its bucket's upper end."""
+        """Return median, 99th percentile and maximum.
+
+        A percentile is the upper end of its bucket.
+        """
         return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)
 
     def _percentile(self, share: float) -> float:

@@ -1,4 +1,4 @@
-"""The control period as a value: what its timer tells and the control loop hears."""
+"""The control period as a value, passed from the timer to the control loop."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from msgspec import Struct
 
 
 class Period(Struct, frozen=True):
-    """`expired` periods ended since the last look (0: none), the first of them due at `due_ns`."""
+    """The periods that ended since the last step, 0 if none.
+
+    The first of them was due at `due_ns`.
+    """
 
     expired: int
     due_ns: int
 
 
 NO_PERIOD = Period(0, 0)
-"""None has ended: something else was the reason to look."""
+"""The value for a step that another event than the timer caused."""

@@ -1,6 +1,6 @@
-"""The built-in simulator beside the daemon: a serial device, and on the bus what is true of it.
+"""The built-in simulator beside the daemon: a serial device, and its true state on the bus.
 
-The control loop reads the device as any other and knows nothing of the rest.
+The control loop reads the device like any other and knows nothing about the rest.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ POSE = "sim/pose"
 
 
 class Simulated:
-    """Enter it to get the device at `path`; `tell` a bus of what is seen."""
+    """The simulator.
+
+    Entering it creates the device at `path`; `tell` sets the bus to publish on.
+    """
 
     def __init__(self, config: Config) -> None:
         self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))
@@ -33,15 +36,15 @@ class Simulated:
 
     @property
     def path(self) -> str:
-        """The serial device."""
+        """The path of the serial device."""
         return self._pty.path
 
     def tell(self, bus: Bus) -> None:
-        """Publish from now on."""
+        """Publish on this bus from now on."""
         self._bus = bus
 
     def current(self, key: str) -> Message | None:
-        """The present value of a key that is published here."""
+        """Return the present value of a key that the simulator publishes, else None."""
         return true_pose(*self._last) if key == POSE and self._last is not None else None
 
     def __enter__(self) -> Simulated:
@@ -64,7 +67,8 @@ class Simulated:
             return
         if POSE in bus.wanted:
             bus.publish(POSE, true_pose(sight, wall_ns))
-        if self._gyro:  # heard by our own subscriber too, as a gyro on the robot would be
+        # The daemon receives its own sample from the bus, like one of a gyro on a real robot.
+        if self._gyro:
             measured_ns = wall_ns - self._delay_ns
             bus.publish(IMU, turn_rate(sight, self._frame, self._noise, measured_ns))
         bus.flush()

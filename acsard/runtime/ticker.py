@@ -1,4 +1,4 @@
-"""The control period and its lateness. Missed periods are counted, never run in a burst."""
+"""The control period and its lateness. Missed periods are counted and never run in a burst."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acsard.runtime.period import Period
 
 
 class _Timer:
-    """A kernel timer that the event loop waits on while entered."""
+    """A kernel timer that the event loop waits on while the context is entered."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         self._wake = wake
@@ -32,7 +32,8 @@ class _Timer:
         self._timer.close()
 
     def _expire(self) -> None:
-        if self._timer.expirations():  # else it has been set anew since it went off
+        # Without an expiration the timer was set again after it went off.
+        if self._timer.expirations():
             self._ring()
 
     def _ring(self) -> None:
@@ -40,25 +41,31 @@ class _Timer:
 
 
 class Alarm(_Timer):
-    """Calls `wake` once, at a time that may be set again and again."""
+    """A timer that calls `wake` once, at a time that may be set again and again."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
         super().__init__(wake)
         self._at_ns: int | None = None
 
     def set(self, at_ns: int | None) -> None:
-        """Wake at monotonic `at_ns`; None: not at all (one already set still comes)."""
+        """Wake at monotonic `at_ns`.
+
+        With None nothing is set, but an earlier setting still goes off.
+        """
         if at_ns is not None and at_ns != self._at_ns:
             self._timer.set(at_ns)
         self._at_ns = at_ns
 
     def _ring(self) -> None:
-        self._at_ns = None  # it may have gone off too early, and is wanted again for the same time
+        self._at_ns = None  # it may have gone off early and be set again for the same time
         super()._ring()
 
 
 class Ticker(_Timer):
-    """Calls `wake` every period while entered; `take` says what the wake-up means."""
+    """A timer that calls `wake` every period while entered.
+
+    `take` tells which periods have ended.
+    """
 
     def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
         super().__init__(wake)
@@ -67,13 +74,14 @@ class Ticker(_Timer):
         self._due_ns = 0
 
     def start(self, now_ns: int) -> None:
-        """Begin; the first period ends one period from now."""
+        """Start; the first period ends one period from now."""
         self._due_ns = now_ns + self._period_ns
         self._timer.set(self._due_ns)
 
     def take(self, now_ns: int) -> Period:
-        """The periods that have ended by `now_ns` since the last call, whatever woke us."""
-        # By our clock: while NTP slews the timer's, it goes off up to a tenth too early.
+        """Return the periods that have ended by `now_ns` since the last call."""
+        # This uses the daemon's clock. While NTP slews the timer's clock, the timer goes off up to
+        # a tenth of a period early.
         early_ns = self._period_ns // 10 if self._rang else 0
         expired = max(0, (now_ns - self._due_ns + early_ns) // self._period_ns + 1)
         due_ns = self._due_ns

@@ -1,14 +1,15 @@
-"""When a step happens: whatever happens runs it, right where the event loop learns of it.
+"""Runs a control step for each of these events, directly where the event loop learns of it.
 
-    period   one has ended (`ticker.py`)
-    bytes    the port has read something, or was lost
-    retry    a line with something new may go now (`at_once.py`)
-    command  the bus has what may be a command, if its line could go at once (`at_once.py`); else
-             the next period has it
-    stop     the bus has a stop: whatever the pace, but not every one of a flood of them
-    signal   the way down begins
+- period: a period has ended (`ticker.py`).
+- bytes: the port has read data or was lost.
+- retry: a line with a new command may go now (`at_once.py`).
+- command: the bus has a sample that may be a command, and its line could go at once (`at_once.py`).
+  Otherwise the next period takes it.
+- stop: the bus has a stop. It gets a step whatever the pace, but a flood of stops does not get a
+  step for each.
+- signal: the shutdown begins.
 
-To wake a task instead would cost another round of the event loop each time.
+Waking a task instead would cost another round of the event loop each time.
 """
 
 from __future__ import annotations
@@ -22,18 +23,21 @@ from acsard.runtime.ticker import Alarm
 
 
 class Next(Struct, frozen=True):
-    """What a step leaves to wait for, beside period, bytes, stop and signal."""
+    """The events to wait for after a step, besides period, bytes, stop and signal."""
 
     listens: bool
-    """A command is worth a step of its own."""
+    """Whether a command is worth a step of its own."""
     retry_ns: int | None
-    """When to step again, monotonic; None for no need."""
+    """Monotonic time of the next step for a waiting command, None if none waits."""
     period_ended: bool = True
-    """A stop may wake the loop again."""
+    """Whether a stop may cause a step again."""
 
 
 class Wakeup:
-    """Call it to have a step; what calls it from within a step gets one right after."""
+    """The wake-up of the control loop.
+
+    A call runs a step; a call during a step runs one afterwards.
+    """
 
     def __init__(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -50,14 +54,17 @@ class Wakeup:
             self._run(self._step, self._over)
 
     def command(self) -> None:
-        """From any thread: the bus has something. Once until a step listens again."""
+        """Report a possible command, from any thread.
+
+        It wakes the loop once until a step listens again.
+        """
         self._heard = True
         if self._listens:
             self._listens = False
             self._from_thread()
 
     def stop(self) -> None:
-        """From any thread: the bus has a stop."""
+        """Report a stop, from any thread."""
         if not self._stop_told:
             self._stop_told = True
             self._from_thread()
@@ -66,10 +73,10 @@ class Wakeup:
         try:
             self._loop.call_soon_threadsafe(self)
         except RuntimeError:
-            pass  # the loop has closed: nobody is left to wake
+            pass  # the event loop has closed, so nothing is left to wake
 
     async def run(self, step: Callable[[], Next | None]) -> None:
-        """Let `step` run until it returns None; what it raises is raised here."""
+        """Run `step` on every event until it returns None; raise the exceptions that it raises."""
         self._over = self._loop.create_future()
         with self._alarm:
             self._step = step
@@ -87,7 +94,8 @@ class Wakeup:
             else:
                 self._arm(then)
         except BaseException as error:  # noqa: BLE001
-            # The event loop would log it and go on: a bug in a step ends the process.
+            # The event loop would log the exception and go on, but a bug in a step must end the
+            # process.
             over.set_exception(error)
         finally:
             self._stepping = False
@@ -99,5 +107,5 @@ class Wakeup:
         self._listens = then.listens
         if then.listens or then.period_ended:
             self._stop_told = False
-        if then.listens and self._heard:  # while the step ran, and perhaps too late for it
+        if then.listens and self._heard:  # a command came during the step, perhaps too late for it
             self._listens, self._again = False, True

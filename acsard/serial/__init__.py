@@ -1,1 +1,2 @@
-"""Shell: owns the serial port; opened raw and locked, never queued on, ended with STOP."""
+"""Shell package that owns the serial port: raw and locked, without a queue, with a STOP at the
+end."""

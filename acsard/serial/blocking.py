@@ -1,4 +1,4 @@
-"""A real serial port as `acsard mcu check` speaks through it: locked, blocking, bounded in time."""
+"""The serial port of `acsard mcu check`: locked and blocking, with a bound on every wait."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from acsard.serial.device import close, draining, open_raw, refusal
 from acsard.values import NS_PER_S
 
 SEND_S = 0.5
-"""A driver that takes no byte for so long has hung: a line takes 50 ms on the slowest wire."""
+"""Seconds after which a driver that takes no byte has hung. A line takes 50 ms on the slowest
+wire."""
 
 DRAIN_S = 0.5
-"""How long the last zeros may take to leave."""
+"""Seconds that the last stop lines may take to leave."""
 
 CLOSE_S = 1.0
-"""How long a close is waited for; some drivers drain for 30 s."""
+"""Seconds to wait for a close. Some drivers drain for 30 s."""
 
 
 class BlockingPort:
-    """One device, opened with the first `open`; see `checkup.outside.Wire`."""
+    """One serial device that implements `checkup.outside.Wire`. The first `open` opens it."""
 
     def __init__(self, path: str) -> None:
         self._path = path
         self._device: serial.Serial | None = None
         self._program: Holder | None = None
-        """At the other end, where that is a pty."""
+        """The program at the other end if the device is a pty, else None."""
         self._waited_ns = 0
 
     def open(self, baud_rate: int) -> None:
-        """Open and lock the port, or go on at another rate."""
+        """Open and lock the port, or change the baud rate of the open port."""
         if self._device is None:
             try:
                 self._device = open_raw(self._path, baud_rate)
@@ -55,7 +56,7 @@ class BlockingPort:
             raise WireLostError(f"{self._path}: {error}") from error
 
     def close(self) -> None:
-        """Let the last bytes out, unlock and close; nothing can hold it up for long."""
+        """Drain the last bytes, unlock and close. No driver can block this for long."""
         device, self._device = self._device, None
         if device is None:
             return
@@ -65,19 +66,24 @@ class BlockingPort:
         device.close()
 
     def now_ns(self) -> int:
-        """The monotonic clock."""
+        """Return the monotonic clock, ns."""
         return clock.mono_ns()
 
     def late_ns(self) -> int:
-        """What the program at the other end of a pty has waited for a processor since last asked;
-        0 for a real device."""
+        """Return how long the program at the other end of a pty waited for a processor, ns.
+
+        The time counts from the last call. It is 0 for a real device.
+        """
         if self._program is None:
             return 0
         before_ns, self._waited_ns = self._waited_ns, waited_ns(self._program.pid)
         return max(0, self._waited_ns - before_ns)
 
     def send(self, data: bytes) -> None:
-        """Hand all of it to the driver; raises `WireLostError` when that takes none."""
+        """Write all of `data` to the driver.
+
+        Raise `WireLostError` if the driver stops taking bytes.
+        """
         fd = self._fileno()
         deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
         while data:
@@ -92,7 +98,7 @@ class BlockingPort:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
 
     def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
-        """What comes until then, each piece with the time it was read."""
+        """Return the data received until `until_ns`, each piece with the time of its read."""
         fd = self._fileno()
         pieces: list[tuple[int, bytes]] = []
         while True:

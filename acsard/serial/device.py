@@ -1,7 +1,7 @@
-"""The serial device itself: opened raw and locked, drained, closed; refusals in words.
+"""System calls on the serial device: open it raw and locked, drain it, close it, explain refusals.
 
-What lives here: system calls on a device and what their errors mean for a person. What must not:
-when to open, reopen or send (`port.py` for the daemon, `blocking.py` for the tools).
+This module knows what an error means to the operator. `port.py` decides for the daemon, and
+`blocking.py` for the tools, when to open, reopen and send.
 """
 
 from __future__ import annotations
@@ -27,14 +27,17 @@ _left_open: list[int] = []
 """Descriptors that could not be closed because no thread could be started."""
 
 DRAIN_STEP_S = 0.001
-"""Between two looks at what has not left yet: a tenth of a line's time."""
+"""Seconds between two looks at the unsent bytes: a tenth of a line's time."""
 
 
 class _Device(serial.Serial):  # type: ignore[misc]
-    """A port that is read when it has something to read, and does not ask once more whether."""
+    """A port whose `read` makes one system call. The caller knows that data is waiting."""
 
     def read(self, size: int = 1) -> bytes:
-        """What is there, at most `size` bytes; raises `SerialException` when lost or closed."""
+        """Return up to `size` waiting bytes.
+
+        Raise `SerialException` if the port is lost or closed.
+        """
         if self.fd is None:
             raise serial.PortNotOpenError
         try:
@@ -49,12 +52,12 @@ class _Device(serial.Serial):  # type: ignore[misc]
 
 
 def open_raw(path: str, baud_rate: int) -> serial.Serial:
-    """The port opened, locked for us alone, raw, flushed; raises OSError."""
+    """Open the port: locked for this process alone, raw and flushed; raise OSError."""
     with suppress(IndexError):  # two threads may empty the list at the same time
         while True:
             _end(_left_open.pop())
-    # With a time between bytes the driver is told to wait for one (VMIN = 1), so that a read which
-    # finds nothing is refused (EAGAIN), and one of nothing is a hang-up and nothing else.
+    # An inter-byte timeout makes pyserial set VMIN = 1, so a read without data fails with EAGAIN
+    # and an empty read always means a hang-up.
     device = _Device(
         baudrate=baud_rate, timeout=0, write_timeout=0, inter_byte_timeout=0, exclusive=True
     )
@@ -66,8 +69,8 @@ def open_raw(path: str, baud_rate: int) -> serial.Serial:
         if device.is_open:
             unlock(device.fileno())
         device.close()
-        # A device that vanishes, or is no tty, is a `termios.error`: that is no OSError, and
-        # pyserial passes it on as it is or in words only.
+        # If the device vanishes or is not a tty the cause is a `termios.error`, which is not an
+        # OSError. pyserial passes it on unchanged or only as text.
         hidden = error.__context__
         known = hidden if isinstance(hidden, termios.error) else error
         raise OSError(*known.args) from error
@@ -78,21 +81,21 @@ def _set_up(device: serial.Serial) -> None:
     fd = device.fileno()
     fcntl.ioctl(fd, termios.TIOCEXCL)
     attributes = termios.tcgetattr(fd)
-    # pyserial leaves some input processing on; a tty that echoes would command the robot with
-    # its own feedback. HUPCL off: closing must not drop DTR, which resets many boards.
+    # pyserial leaves some input processing on. A tty that echoes would command the robot with its
+    # own feedback. Closing must not drop DTR, which resets many boards, so HUPCL is off.
     attributes[0] = attributes[1] = attributes[3] = 0
     attributes[2] &= ~termios.HUPCL
     termios.tcsetattr(fd, termios.TCSANOW, attributes)
     try:
         device.set_low_latency_mode(True)
     except (OSError, ValueError, NotImplementedError):
-        pass  # a pty and CDC-ACM have no such mode
+        pass  # a pty and CDC-ACM lack this mode
     device.reset_input_buffer()
     device.reset_output_buffer()
 
 
 def unsent(fd: int) -> int:
-    """Bytes the driver has not sent yet; 0 where it cannot say (a pty)."""
+    """Return the number of bytes that the driver has not sent, or 0 if it cannot say (a pty)."""
     waiting = array.array("i", [0])
     try:
         fcntl.ioctl(fd, termios.TIOCOUTQ, waiting)
@@ -102,13 +105,16 @@ def unsent(fd: int) -> int:
 
 
 def draining(fd: int, deadline_ns: int) -> Iterator[float]:
-    """The pauses to make, s, until all bytes have left or the time is over."""
+    """Yield the pauses to make, s, until all bytes have left or the deadline has passed."""
     while unsent(fd) and clock.mono_ns() < deadline_ns:
         yield DRAIN_STEP_S
 
 
 def unlock(fd: int) -> None:
-    """Let others open it: a pty outlives us with our mark, and nobody else could."""
+    """Let others open the device.
+
+    A pty outlives this process with its exclusive mark, and nobody else could open it.
+    """
     try:
         fcntl.ioctl(fd, termios.TIOCNXCL)
     except OSError:
@@ -116,18 +122,20 @@ def unlock(fd: int) -> None:
 
 
 def close(device: serial.Serial, *, lost: bool = False, wait_s: float = 0.0) -> None:
-    """Throw away what is stuck, unlock, close in a thread: a driver may drain for 30 s first.
+    """Discard stuck bytes, unlock and close in a thread, because a driver may drain for 30 s.
 
-    `device` is left with /dev/null, which its owner may drain and close in no time. Wait up to
-    `wait_s` for the thread. If no thread can be started, the next `open_raw` closes the device.
+    The descriptor of `device` then refers to /dev/null, which its owner may drain and close without
+    delay. Wait up to `wait_s` for the thread. If no thread can be started, the next `open_raw`
+    closes the device.
     """
     fd = device.fileno()
     if lost or unsent(fd):
-        # Only what is stuck: on a pty a flush throws away a STOP that is already through.
+        # Flush only if bytes are stuck: on a pty a flush discards a STOP that the other end has not
+        # read yet.
         try:
             device.reset_output_buffer()
         except (OSError, termios.error):
-            pass  # the device is gone, and with it what was queued
+            pass  # the device is gone, and with it the queued bytes
     real, null = os.dup(fd), os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
     os.dup2(null, fd, inheritable=False)
     os.close(null)
@@ -146,7 +154,10 @@ def _end(fd: int) -> None:
 
 
 def refusal(path: str, error: OSError) -> MendableError:
-    """Why the port cannot be opened: how a one-shot tool ends; the daemon may wait instead."""
+    """Return the error that explains why the port cannot be opened.
+
+    A tool ends with this error. The daemon may wait and retry instead.
+    """
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
             return NoPortError(f"{path} is not there; plug it in, or name another ({_LISTED})")
@@ -172,7 +183,10 @@ _JOIN = (
 
 
 def require(path: str) -> None:
-    """Raises `refusal` when it is no device: a daemon waits for its port, a tool must not."""
+    """Raise `refusal` if the path is not a character device.
+
+    The daemon waits for its port; a tool must not.
+    """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):
             raise OSError(errno.ENOTTY, "no character device")

@@ -1,8 +1,8 @@
-"""Owns the serial port: opens it, reads it, reopens it, never queues, ends with STOP.
+"""The daemon's serial port: opens it, reads it, reopens it, never queues a line, ends with STOP.
 
-pyserial-asyncio reads; lines are written to the descriptor directly, because its transport keeps
-what the kernel does not take and we hold nothing back (invariant 3). Opening is done in a thread
-with a time limit, since drivers may block.
+pyserial-asyncio reads. The daemon writes lines to the descriptor directly, because that transport
+queues the bytes that the kernel does not take, and the daemon must not hold a line back (invariant
+3). Opening runs in a thread with a time limit, because drivers may block.
 """
 
 from __future__ import annotations
@@ -27,26 +27,30 @@ from acsard.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.values import Event, Instant, Received
 
 OPEN_TIMEOUT_S = 5.0
-"""A driver that takes longer has hung: while it does, only another device is opened."""
+"""Seconds after which an open has hung. Until it ends, only a different device may be opened."""
 
 BACK_OFF_S = (0.05, 0.1, 0.2)
-"""Waits between attempts to reopen; the last one repeats. udev sets groups late, hence short."""
+"""Seconds between attempts to reopen. The last one repeats. They are short because udev sets groups
+late."""
 
 PERMISSION_PATIENCE_S = 2.0
-"""How long a start waits for udev to grant access before it gives up."""
+"""Seconds that a start waits for udev to grant access before it gives up."""
 
 HUNG = "the driver did not answer"
 
 FAREWELL_S = 0.15
-"""Bound on getting the last STOP out: twice a line's time on the slowest wire, and slack."""
+"""Seconds for the last STOP: twice a line's time on the slowest wire, and a margin."""
 
 
 AT_ONCE = 4096
-"""Bytes read at a time: all that a driver holds."""
+"""Bytes per read: as many as a driver buffers."""
 
 
 class SerialPort:
-    """The port to the MCU. Enter it to open, `keep_open` reopens for ever, leaving sends STOP."""
+    """The port to the board, as a context manager.
+
+    Entering opens the port, `keep_open` reopens it for ever, and leaving sends STOP.
+    """
 
     def __init__(
         self,
@@ -70,28 +74,32 @@ class SerialPort:
         self._lost = asyncio.Event()
         self._fd = -1
         self._opening = set[tuple[int, int]]()
-        """The devices that are being opened, in a thread each, by where the path led then."""
+        """The devices that a thread is opening, as (st_dev, st_ino) of the path at that time."""
         self.trouble = ""
-        """Why the port is closed, in words; "" while it is open."""
+        """The reason why the port is closed, "" while it is open."""
 
-    # the control loop's view
+    # The control loop calls the methods below.
 
     @property
     def sent_ns(self) -> int:
-        """When the last line had been handed to the kernel, monotonic."""
+        """Monotonic time at which the kernel took the last line."""
         return self._gate.sent_ns
 
     def take(self, late: Instant | None = None) -> tuple[Received, ...]:
-        """What was received since the last call; with the time of a step that comes late also what
-        lies there: the reader's turn may come behind the step's, which would read it as silence.
+        """Return the bytes received since the last call.
 
-        After a suspend the port is opened anew, whether the device has noticed or not: so all that
-        was before it is of another session, and every commander must be neutral again.
+        A step that comes late passes its time as `late`: then waiting bytes are read too. Otherwise
+        the step may run before the reader and take its delay for silence of the board.
+
+        After a suspend of the computer the port is reopened even if the device did not notice.
+        Everything before the suspend then belongs to another session, and every commander must
+        return to neutral.
         """
         if self._asleep.was():
             self._leave(OSError(errno.EIO, "this computer was suspended"))
         if late is not None and self._transport is not None:
-            with suppress(serial.SerialException):  # lost: the reader finds out, and says so
+            # If the port is lost, the reader notices and reports it.
+            with suppress(serial.SerialException):
                 data = self._transport.serial.read(AT_ONCE)
                 self._received += [Received(late, data)] if data else []
         if not self._received:
@@ -101,10 +109,11 @@ class SerialPort:
         return got
 
     def offer(self, line: bytes, now: Instant) -> Offered:
-        """Send the line now, or say that it did not go; it is never kept."""
+        """Send the line now or report that it did not go. The line is never kept for later."""
         if not self.is_open:
             return "down"
-        waiting = unsent(self._fd)  # before the time is read: asking the driver takes some
+        # Ask before the time is read, because asking the driver takes time.
+        waiting = unsent(self._fd)
         data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
         if data is None:
             return "superseded"
@@ -115,10 +124,10 @@ class SerialPort:
         except OSError as error:
             self._leave(error)
             return "down"
-        # From the moment it went, not from the start of the step that made it.
+        # The wire is busy from the moment of the write, not from the start of the step.
         return self._gate.took(line, data, taken, clock.mono_ns())
 
-    # opening and reopening
+    # Opening and reopening.
 
     async def __aenter__(self) -> SerialPort:
         deadline_ns = clock.now().mono_ns + int(PERMISSION_PATIENCE_S * 1e9)
@@ -179,7 +188,7 @@ class SerialPort:
             self._transport, _ = await serial_asyncio.connection_for_serial(
                 loop, lambda: _Reader(self), device
             )
-        except OSError:  # it sets the port up once more
+        except OSError:  # setting up the port again may fail
             close(device, lost=True)
             raise
         self.is_open, self.trouble = True, ""
@@ -187,26 +196,27 @@ class SerialPort:
         self._log(Event("port_open", f"{path} at {baud_rate} baud"))
 
     def _complain(self, refused: MendableError) -> None:
-        """Say once why the port cannot be opened, not at every attempt."""
+        """Log once why the port cannot be opened, not at every attempt."""
         text = f"{refused}; retrying"
         if text != self.trouble:
             self.trouble = text
             self._log(Event("port_waiting", text, "warning"))
 
-    # the reader's view
+    # The reader calls the methods below.
 
     def _data(self, data: bytes) -> None:
         self._received.append(Received(clock.now(), data))
         self._wake()
 
     def _leave(self, error: BaseException | None) -> None:
-        """Give the port up; what the kernel still holds must not go out later."""
+        """Close the port. Bytes that the kernel still holds must not go out later."""
         if not self.is_open:
             return
         self.is_open = False
         transport, self._transport = self._transport, None
         if transport is not None and transport.serial is not None:
-            # The transport would drain and close on the event loop: it gets /dev/null to do it to.
+            # The transport would drain and close the device on the event loop, so it gets /dev/null
+            # instead.
             transport.pause_reading()
             close(transport.serial, lost=error is not None)
             transport.abort()
@@ -216,7 +226,7 @@ class SerialPort:
         self._lost.set()
         self._wake()
 
-    # the way down
+    # Closing.
 
     async def __aexit__(
         self,
@@ -224,7 +234,7 @@ class SerialPort:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """The last line out is STOP, whatever brought us here; bounded by `FAREWELL_S`."""
+        """Send STOP as the last line, whatever ended the block. It takes at most `FAREWELL_S`."""
         deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
         while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
             if clock.now().mono_ns > deadline_ns:
@@ -236,7 +246,7 @@ class SerialPort:
 
 
 class _Reader(asyncio.Protocol):
-    """Hands bytes and losses from the transport to the port it was made for."""
+    """The protocol that passes bytes and losses from the transport to its port."""
 
     def __init__(self, port: SerialPort) -> None:
         self._port = port
@@ -249,7 +259,8 @@ class _Reader(asyncio.Protocol):
         self._port._data(data)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        # The port may have been reopened since: an old transport's end is not the new one's.
+        # The port may have been reopened meanwhile. The end of an old transport does not concern
+        # it.
         if self._port._transport is self._transport:
             self._port._transport = None
             self._port._leave(exc or OSError(errno.EIO, "closed"))

@@ -1,7 +1,7 @@
-"""The fake MCU behind a real pty, paced by the real clock, so that the real serial code is used.
+"""Connects the simulated board to a real pty in real time, so that the real serial code runs.
 
-A pty carries any baud rate; here a host that sets another one than the MCU's gets garbage, and so
-does the MCU, as on a real wire.
+A pty carries any baud rate. Here a host that sets another rate than the board's gets garbage, and
+so does the board, as on a real wire.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_arg
 
 
 class SimPty:
-    """Enter it to get a serial device at `path` with the fake MCU at its other end."""
+    """The simulated board behind a pty. Entering it creates a serial device at `path`."""
 
     def __init__(self, mcu: FakeMcu) -> None:
         self.mcu = mcu
@@ -59,13 +59,13 @@ class SimPty:
             self._arm()
 
     def _set_speed(self) -> None:
-        """The MCU's own rate, for a host that sets none."""
+        """Set the board's baud rate, for a host that sets none."""
         attributes = termios.tcgetattr(self._end.slave)
         attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
         termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
 
     def _speed(self) -> int:
-        """The host's rate; the MCU's own where it is one no MCU has."""
+        """Return the host's baud rate, or the board's if the host's is not one of a board."""
         return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
 
     def _advance(self) -> None:

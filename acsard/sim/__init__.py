@@ -1,1 +1,1 @@
-"""The simulated robot, pure: a vehicle and the microcontroller that runs it."""
+"""Pure package that simulates the robot: a vehicle and the microcontroller that drives it."""

@@ -1,9 +1,10 @@
-"""The microcontroller's side of the protocol, byte for byte and in time.
+"""Simulates the board's side of the serial protocol, byte for byte and in time.
 
-Bytes in, bytes out, the time given. It keeps the MCU contract by default: boots stopped, acts on
-whole valid lines only, stops the motors when no valid line came for 300 ms, answers a checked line
-checked. It shares no parser with the host, so that an error in one does not hide in the other. Its
-faults are in `faults.py`, each a `with` block; those of `[sim] faults` last:
+Bytes and the time come in, bytes go out. By default the simulated board keeps the contract: it
+boots stopped, obeys only whole valid lines, stops the motors after 300 ms without a valid line, and
+answers a checked line with a checked one. It shares no parser with the host, so an error in one is
+not hidden by the other. Its faults are in `faults.py`, each as a `with` block. Those of `[sim]
+faults` stay on:
 
     with mcu.mute(): ...
 """
@@ -29,17 +30,23 @@ from acsard.values import NS_PER_S
 MS = 1_000_000
 
 RESET_NS = 2 * NS_PER_S
-"""How long a board with a bootloader is deaf after a reset."""
+"""Time for which a board with a bootloader ignores its input after a reset."""
 
 SHORTEST_WINDOW_NS = 4 * MS
-"""Encoder counts over less time than this say nothing; the last figures are sent again."""
+"""Shortest time over which speeds are computed from counts. Before it ends the last speeds are
+repeated."""
 
 PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
-"""Time from the end of a line to the start of its answer, in turn: 1 to 5 ms, no randomness."""
+"""Times from the end of a line to the start of its answer, used in turn: 1 to 5 ms, without
+randomness."""
 
 
 class FakeMcu(Faults):
-    """Feed it with `receive`, ask `next_ns` when it wants time, collect bytes with `advance`."""
+    """The simulated board.
+
+    The caller passes bytes to `receive`, asks `next_ns` for the next event and collects bytes with
+    `advance`.
+    """
 
     def __init__(self, config: Config, now_ns: int = 0) -> None:
         super().__init__()
@@ -48,7 +55,7 @@ class FakeMcu(Faults):
         self._counts = config.sim.encoder_counts
         self._wiring = _wiring(config.mcu.wheels)
         self._now_ns = self._moved_ns = now_ns
-        """Monotonic times of the last `advance`, and up to which the vehicle has moved."""
+        """Monotonic times of the last `advance`, and until which the vehicle has moved."""
         self._events: list[tuple[int, int, str, bytes]] = []
         self._order = count()
         self._processing = cycle(PROCESSING_MS)
@@ -63,7 +70,8 @@ class FakeMcu(Faults):
         self._counted = [0.0] * 4
         self._replied_ns = now_ns - NS_PER_S
         self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
-        """The last lines received with the time each was complete, valid or not, as they came."""
+        """The last lines received, valid or not, with the time at which each was complete, in
+        order."""
         self.valid_lines = 0
         self._watchdog_trips = 0
         if config.sim.boot_time:
@@ -74,20 +82,20 @@ class FakeMcu(Faults):
 
     @property
     def vehicle(self) -> Vehicle:
-        """The robot on the floor at the last `advance`. It moves only when its state matters."""
+        """The robot at the last `advance`. It moves only when its state is needed."""
         self._catch_up()
         return self._vehicle
 
     @property
     def watchdog_trips(self) -> int:
-        """How often the watchdog has stopped the motors."""
+        """Number of times that the watchdog has stopped the motors."""
         self._catch_up()
         return self._watchdog_trips
 
-    # time
+    # Time.
 
     def receive(self, now_ns: int, data: bytes) -> None:
-        """The host wrote `data`; it arrives at the pace of the wire."""
+        """Take bytes that the host wrote. They arrive at the pace of the wire."""
         start, taken = max(self._in_free_ns, now_ns), 0
         data = self._damaged(data)
         *lines, rest = data.split(b"\n")
@@ -100,11 +108,14 @@ class FakeMcu(Faults):
         self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
 
     def next_ns(self) -> int | None:
-        """When it next has something to do, or None."""
+        """Return the time of the next event, or None."""
         return self._events[0][0] if self._events else None
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`; the bytes that have fully arrived at the host since."""
+        """Let time pass up to `now_ns`.
+
+        Return the bytes that have arrived at the host meanwhile.
+        """
         out = b""
         while self._events and self._events[0][0] <= now_ns:
             due_ns, _, what, data = heapq.heappop(self._events)
@@ -129,7 +140,10 @@ class FakeMcu(Faults):
         return out
 
     def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
-        """Power on again: stopped, deaf while the bootloader runs, noise on the line first."""
+        """Power on again.
+
+        The board is stopped, ignores its input while the bootloader runs, and sends noise first.
+        """
         self._now_ns = now_ns
         self._events.clear()
         self._held = self._batch = b""
@@ -147,7 +161,7 @@ class FakeMcu(Faults):
         heapq.heappush(self._events, (due_ns, next(self._order), what, data))
 
     def _catch_up(self) -> None:
-        """Move the vehicle up to now; the watchdog trips at its own time on the way."""
+        """Move the vehicle up to now. The watchdog trips at its own time on the way."""
         vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
         deadline = self._fed_ns + self.watchdog_ns
         if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
@@ -161,7 +175,7 @@ class FakeMcu(Faults):
             moved_ns = now_ns
         self._moved_ns = moved_ns
 
-    # lines
+    # Lines.
 
     def _act(self, now_ns: int, line: bytes) -> None:
         if line.rstrip(b"\r\n") == b"?":
@@ -173,7 +187,7 @@ class FakeMcu(Faults):
                 self._catch_up()
                 self._fed_ns = now_ns
             return
-        # The vehicle obeys the line before until now.
+        # Until now the vehicle has obeyed the line before.
         set_points = self.vehicle.set_points
         for motor, value in command.values.items():
             wheel, forward = self._wiring[self.drivers[motor]]
@@ -211,7 +225,7 @@ class FakeMcu(Faults):
         self._schedule(self._out_free_ns, "sent", data)
 
     def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
-        """What of bytes that have come so far reaches the host now; the rest waits."""
+        """Return the bytes that the USB adapter passes to the host now, and keep the rest."""
         until_ns = self._stalled_until(now_ns)
         if until_ns > now_ns:
             self._schedule(until_ns, what, data)
@@ -227,12 +241,12 @@ class FakeMcu(Faults):
         return waited[:full]
 
     def _encoders(self) -> list[int]:
-        """Counts of motors a to d."""
+        """Return the counts of the motors a to d."""
         angles, tau, per_turn = self.vehicle.angles, math.tau, self._counts
         return [math.floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
 
     def _speeds(self, now_ns: int) -> list[float]:
-        """What the encoders say: whole counts over the time since they were last read."""
+        """Return the speeds by the encoders: whole counts over the time since the last reading."""
         since, before = self._window
         gains = self.gains
         if self.stuck is not None:
@@ -257,17 +271,18 @@ class FakeMcu(Faults):
         return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
 
     def _sample(self) -> tuple[int, ...]:
-        """Milliseconds since power-on when the encoders were read, and what they had counted."""
+        """Return the ms from power-on to the last encoder reading, and its counts."""
         read_ns, _ = self._window
         return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
 
-    # the fault that needs its own time
+    # The fault that needs a clock of its own.
 
     @contextmanager
     def unprompted(self, period_s: float = 0.1) -> Iterator[None]:
-        """Reports by its own clock instead of answering: unpadded, with a trailing comma."""
+        """Report by its own clock instead of answering: unpadded, with a trailing comma."""
         period_ns = int(period_s * NS_PER_S)
-        clock = b"clock %d" % next(self._order)  # a new one: an older one's events go unheeded
+        # A new name, so that events of an older clock are ignored.
+        clock = b"clock %d" % next(self._order)
         self._schedule(self._now_ns + period_ns, "report", clock)
         with self._with(
             unprompted_ns=period_ns, _clock=clock, unpadded_replies=True, ending=",\r\n"
@@ -276,7 +291,7 @@ class FakeMcu(Faults):
 
 
 def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
-    """For motors a to d the wheel (`values.WHEELS` order) and 1 or -1: as the host believes."""
+    """Return the configured wheel (`values.WHEELS` order) and sign of the motors a to d."""
     motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
     place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
     return [place[letter] for letter in "abcd"]

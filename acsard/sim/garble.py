@@ -1,7 +1,7 @@
-"""What a receiver makes of bytes that were sent at another baud rate than its own.
+"""Computes the bytes that a receiver gets from a sender with another baud rate.
 
-The line as it is: start bit, eight data bits with the lowest first, stop bit; the receiver waits
-for an edge and then samples in the middles of its own bits.
+The wire carries a start bit, eight data bits with the lowest first, and a stop bit. The receiver
+waits for an edge and then samples in the middle of each of its own bits.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ BITS = 10
 
 
 def garbled(data: bytes, sent: int, heard: int) -> bytes:
-    """The bytes a receiver at `heard` baud gets from `data` at `sent` baud; one with a wrong stop
-    bit is read as zero, as the kernel hands it out."""
+    """Return the bytes that a receiver at `heard` baud gets from `data` sent at `sent` baud.
+
+    A byte with a wrong stop bit is read as zero, as the kernel delivers it.
+    """
     if sent == heard or not data:
         return data
     levels = [bit for byte in data for bit in (0, *(byte >> n & 1 for n in range(8)), 1)]
@@ -23,7 +25,7 @@ def garbled(data: bytes, sent: int, heard: int) -> bytes:
 
     while at < end:
         if level(at):
-            at = int(at) + 1.0  # idle: on to where the next bit begins
+            at = int(at) + 1.0  # the line is idle: skip to the next bit
             continue
         bits = [level(at + (n + 0.5) * step) for n in range(BITS)]
         if bits[0]:
@@ -33,5 +35,5 @@ def garbled(data: bytes, sent: int, heard: int) -> bytes:
         got.append(byte if bits[9] else 0)
         at += (BITS - 0.5) * step
         while at < end and not level(at):
-            at = int(at) + 1.0  # a break: not a start before it has ended
+            at = int(at) + 1.0  # a break: the next start bit cannot come before it ends
     return bytes(got)

@@ -1,7 +1,7 @@
-"""Chance that can be repeated: the n-th number of a seed is always the same, drawn in any order.
+"""Repeatable random numbers: the n-th number of a seed is always the same, in any order of calls.
 
-The mixing function is SplitMix64's (Steele, Lea & Flood, Fast splittable pseudorandom number
-generators, 2014), here on a counter, so that there is no state to keep.
+The mixing function is that of SplitMix64 (Steele, Lea & Flood, Fast splittable pseudorandom number
+generators, 2014), applied to a counter, so there is no state.
 """
 
 from __future__ import annotations
@@ -13,13 +13,16 @@ _STEP = 0x9E3779B97F4A7C15
 
 
 def uniform(seed: int, n: int) -> float:
-    """The n-th number of this seed, evenly from 0 up to, not including, 1."""
+    """Return the n-th number of this seed, uniformly distributed in [0, 1)."""
     z = (_mixed(seed & _MASK) + n * _STEP) & _MASK
     return (_mixed(z) >> 11) / (1 << 53)
 
 
 def gauss(seed: int, n: int) -> float:
-    """The n-th number of this seed, normally distributed: mean 0, deviation 1 (Box-Muller)."""
+    """Return the n-th number of this seed, normally distributed with mean 0 and deviation 1.
+
+    The method is that of Box and Muller.
+    """
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, 2 * n)))
     return radius * math.cos(math.tau * uniform(seed, 2 * n + 1))
 

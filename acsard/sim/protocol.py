@@ -1,7 +1,8 @@
-"""The microcontroller's language from its side: what it takes for a command, what it answers.
+"""The protocol from the board's side: which lines it accepts as commands, and its answers.
 
-Three kinds of firmware: today's takes whole valid lines only, plain or with a right suffix; two
-older kinds know no suffix, and take the line before it as ever. Shares no code with the host.
+Today's firmware (`whole`) accepts only whole valid lines, plain or with a correct suffix. Older
+firmware does not know the suffix: `plain_only` rejects a line that has one, while `prefix` and
+`latched` obey its plain part. The module shares no code with the host.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 
 from msgspec import Struct
 
@@ -19,11 +21,11 @@ HEX = b"0123456789ABCDEF"
 _LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d),?")
 
 PLAIN = 31
-"""Bytes of a plain line without comma and end."""
+"""Bytes of a plain line without its comma and end."""
 
 
 class Command(Struct, frozen=True):
-    """Speeds by motor, in rad/s, and for a checked line the digits of its sequence."""
+    """The speeds of a command by motor, rad/s, and the digits of a checked line's sequence."""
 
     values: dict[int, float]
     sequence: bytes = b""
@@ -31,7 +33,10 @@ class Command(Struct, frozen=True):
 
 
 def whole(line: bytes) -> Command | None:
-    """Today's firmware: a whole valid line; one with `#` or `*` needs all of a right suffix."""
+    """Decode a line as today's firmware.
+
+    The line must be valid, and with `#` or `*` it must have a correct suffix.
+    """
     text = line.removesuffix(b"\n").removesuffix(b"\r")
     if b"#" not in text and b"*" not in text:
         return _plain(text)
@@ -49,17 +54,17 @@ def whole(line: bytes) -> Command | None:
 
 
 def plain_only(line: bytes) -> Command | None:
-    """Firmware that compares the whole line with the plain form: a suffix makes it no line."""
+    """Decode a line as firmware that accepts only the plain form: a suffix makes it invalid."""
     return _plain(line.removesuffix(b"\n").removesuffix(b"\r"))
 
 
 def prefix(line: bytes) -> Command | None:
-    """Firmware that is strict up to the fourth value and does not look further."""
+    """Decode a line as firmware that is strict up to the fourth value and ignores the rest."""
     return _plain(line[:PLAIN])
 
 
 def latched(line: bytes) -> Command:
-    """The old sketches: a value counts when a comma ends it, whatever the rest says."""
+    """Decode a line as the old sketches: a value counts if a comma ends it, in any line."""
     values = {}
     for token in line.split(b",")[:-1]:
         motor, sign = token[:1], token[1:2]
@@ -73,6 +78,7 @@ def latched(line: bytes) -> Command:
     return Command(values)
 
 
+@lru_cache(4)  # a steady host says the same in each period
 def _plain(text: bytes) -> Command | None:
     match = _LINE.fullmatch(text)
     if match is None:
@@ -87,7 +93,7 @@ def _value(word: bytes) -> float:
 
 
 def speeds_text(speeds: Sequence[float], separator: str, unpadded: bool) -> bytes:
-    """The plain part of a reply."""
+    """Return the plain part of a reply."""
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
         form % (motor, "n" if speed < 0 else "p", min(abs(speed), 99.99))
@@ -97,14 +103,14 @@ def speeds_text(speeds: Sequence[float], separator: str, unpadded: bool) -> byte
 
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
-    """What follows the plain part of a checked reply; `sample` is empty or ms and four counts."""
+    """Return the suffix of a checked reply; `sample` is empty, or ms and four counts."""
     fields = b"".join(_hex(number % 65536, 4) for number in sample)
     body = b"#" + sequence + (b"@" + fields if fields else b"")
     return body + b"*" + _hex(_crc(text + body), 4)
 
 
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
-    """The line with which the firmware names itself."""
+    """Return the line with which the firmware identifies itself."""
     text = f"!acsard-mcu 1 counts={counts} watchdog_ms={watchdog_ms} check=1 sample={int(sample)}"
     return text.encode() + b"\r\n"
 
@@ -114,7 +120,7 @@ def _hex(number: int, digits: int) -> bytes:
 
 
 def _crc(data: bytes) -> int:
-    """CRC-16/XMODEM: polynomial x16 + x12 + x5 + 1, from 0."""
+    """Return the CRC-16/XMODEM: polynomial x16 + x12 + x5 + 1, initial value 0."""
     crc = 0
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC_OF[crc >> 8 ^ byte]

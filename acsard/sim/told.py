@@ -1,4 +1,4 @@
-"""A `Sight` of the simulated robot -> the messages that tell it on the bus."""
+"""Converts a `Sight` of the simulated robot into the messages that are published."""
 
 from __future__ import annotations
 
@@ -7,18 +7,22 @@ from acsard.messages.schema import Header, Imu, Pose, PoseStamped, Quaternion, T
 from acsard.sim.watched import Sight
 
 FRAME = "sim"
-"""Where the robot began, in no tree of transforms: truth is not to be taken for `odom`."""
+"""Frame of the robot's start. It is in no tree of transforms, so nobody takes the truth for
+`odom`."""
 
 
 def true_pose(sight: Sight, wall_ns: int) -> PoseStamped:
-    """Where base_link truly was at `wall_ns`, from where it began: m in the frame `sim`."""
+    """Return the true pose of base_link at `wall_ns`, m from its start, in the frame `sim`."""
     pose = sight.pose
     where = Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
     return PoseStamped(Header(Time.from_ns(wall_ns), FRAME), where)
 
 
 def turn_rate(sight: Sight, frame: str, deviation: float, wall_ns: int) -> Imu:
-    """What the gyro measured until `wall_ns`, with the standard deviation of its noise, rad/s."""
+    """Return the gyro's measurement at `wall_ns`, rad/s.
+
+    `deviation` is the standard deviation of its noise, rad/s.
+    """
     unknown, variance = [-1.0] + [0.0] * 8, deviation * deviation
     known = [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance]
     rate = Vector3(z=sight.gyro)

@@ -1,23 +1,24 @@
-"""Four motors with lag on a base that moves: what the encoders and the floor would see.
+"""Simulates four motors with lag on a moving base: the motion that encoders and the floor see.
 
 Motors follow their set points as first-order systems. The base moves by the wheels' real speeds,
-real radii and real effective track, which `[sim]` can make others than the host believes;
-`turn_slip` makes skidding wheels turn it less than they roll, `load` makes the motors give less
-than they are asked. Hands that push it are stronger than the motors. Wheels are in
+real radii and real effective track, which `[sim]` can set apart from the configured ones. With
+`turn_slip` skidding wheels turn the base less than they roll; with `load` the motors deliver less
+than their set points. A person who pushes the robot is stronger than the motors. Wheels are in
 `values.WHEELS` order.
 
-With w the turn rate in rad/s that the wheels would give at track_multiplier x the configured
-effective track L, and k = track_rate_dependence, the base turns at
+Let w be the turn rate in rad/s that the wheels would give at track_multiplier times the configured
+effective track L, and k = track_rate_dependence. The base turns at
 
     w / (1 + 2 k |w| / (1 + |w|))
 
-so that the effective track is L x track_multiplier at creeping, (1 + k) times that at 1 rad/s, and
-stays bounded.
+The effective track is therefore L x track_multiplier at creeping speed, (1 + k) times that at 1
+rad/s, and it stays bounded.
 """
 
 from __future__ import annotations
 
 import math
+from operator import add
 
 from acsard.config.settings import DriveConfig, SimConfig
 from acsard.drive.path import arc
@@ -25,14 +26,14 @@ from acsard.sim.noise import uniform
 from acsard.values import Pose
 
 GRIP_S = 0.25
-"""How long the wheels grip the floor as they do, before they grip it otherwise."""
+"""Seconds for which the wheels keep their present grip of the floor."""
 
 HANDS_S = 0.1
-"""How long hands take to bring the robot to their speed, as a motor's time constant."""
+"""Seconds in which a person brings the robot to speed, as a time constant like a motor's."""
 
 
 class Vehicle:
-    """The true state: speeds rad/s, angles rad, pose m and rad."""
+    """The true state of the robot: speeds in rad/s, angles in rad, pose in m and rad."""
 
     def __init__(self, sim: SimConfig, drive: DriveConfig) -> None:
         self._lag = sim.motor_time_constant
@@ -47,13 +48,13 @@ class Vehicle:
         self.speeds = [0.0] * 4
         self.angles = [0.0] * 4
         self.pose = Pose()
-        """Where it truly is: base_link from where it began."""
+        """The true pose of base_link relative to its start."""
         self.turned = 0.0
-        """rad to the left since it began, whole turns counted."""
+        """Angle in rad to the left since the start, with whole turns counted."""
         self.turn_slip = 0.0
-        """Share of every turn that is lost to skidding, 0 to 1."""
+        """Fraction of every turn that is lost to skidding, 0 to 1."""
         self.load = 0.0
-        """Share of every set point the motors fall short by, 0 to 1."""
+        """Fraction by which the motors fall short of every set point, 0 to 1."""
 
     def advance(self, dt: float, push: float | None = None) -> None:
         """Let `dt` s pass under the present set points, or pushed by hand at `push` m/s."""
@@ -70,16 +71,18 @@ class Vehicle:
         if not (any(goals) or any(self.speeds)):
             return
         rest = math.exp(-dt / lag) if lag else 0.0
-        gone, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
-        for i, goal in enumerate(goals):
-            error = speeds[i] - goal
-            # The integral of an exponential approach, so that any dt gives the same path.
-            angle = turned[i] = goal * dt + error * lag * gone
-            speed = goal + error * rest
-            speeds[i] = speed if abs(speed) > 1e-9 else 0.0
-            angles[i] += angle
-        left = self._left_radius * (turned[1] + turned[2]) / 2
-        right = self._right_radius * (turned[0] + turned[3]) / 2
+        gone, turned, speeds = 1.0 - rest, [], []
+        for goal, speed in zip(goals, self.speeds, strict=True):
+            error = speed - goal
+            # This is the integral of an exponential approach, so the path does not depend on dt.
+            turned.append(goal * dt + error * lag * gone)
+            after = goal + error * rest
+            speeds.append(after if after > 1e-9 or after < -1e-9 else 0.0)
+        self.speeds[:] = speeds
+        self.angles[:] = map(add, self.angles, turned)
+        front_right, front_left, rear_left, rear_right = turned
+        left = self._left_radius * (front_left + rear_left) / 2
+        right = self._right_radius * (front_right + rear_right) / 2
         turn = (right - left) / self._track
         rate = abs(turn) / dt
         turn *= grip / (1.0 + 2.0 * self._rate_dependence * rate / (1.0 + rate))
@@ -87,7 +90,7 @@ class Vehicle:
         self.pose = arc(self.pose, (left + right) / 2, turn)
 
     def _grip(self) -> float:
-        """What the floor leaves of a turn now."""
+        """Return the fraction of a turn that the floor does not take now."""
         kept = 1.0 - self.turn_slip
         if self._floor:
             kept *= 1.0 - self._floor * uniform(self._seed, int(self._time / GRIP_S))

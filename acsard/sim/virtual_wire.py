@@ -1,7 +1,7 @@
-"""A serial line to the fake MCU in virtual time: no clock runs, waiting costs nothing.
+"""A serial line to the simulated board in virtual time: no clock runs and waiting costs nothing.
 
-The side of `acsard mcu check` that is asked to listen (`checkup.outside.Wire`); a wrong baud rate
-garbles both ways.
+It implements the line that `acsard mcu check` uses (`checkup.outside.Wire`). A wrong baud rate
+garbles both directions.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ class VirtualWire:
         self._now_ns = now_ns
 
     def open(self, baud_rate: int) -> None:
-        """Open the line, or go on at another rate."""
+        """Open the line, or change the baud rate of the open line."""
         self.is_open, self._baud_rate = True, baud_rate
 
     def close(self) -> None:
-        """Nothing more goes out."""
+        """Close the line: nothing goes out any more."""
         self.is_open = False
 
     def now_ns(self) -> int:
-        """The time here."""
+        """Return the virtual time, ns."""
         return self._now_ns
 
     def late_ns(self) -> int:
-        """Nothing waits for a processor."""
+        """Return 0, because in virtual time nothing waits for a processor."""
         return 0
 
     def send(self, data: bytes) -> None:
-        """Put bytes on the line now."""
+        """Send bytes now."""
         assert self.is_open, "a closed line carries nothing"
         self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
 
     def listen(self, until_ns: int) -> list[Piece]:
-        """Let time pass; what came, in pieces, each with its time."""
+        """Let time pass; return the data that came, in pieces, each with its time."""
         pieces = []
         while (due_ns := self.mcu.next_ns()) is not None and due_ns <= until_ns:
             due_ns = max(due_ns, self._now_ns)

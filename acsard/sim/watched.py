@@ -1,6 +1,6 @@
-"""The simulated robot with somebody who sees where it truly is, and with its gyro.
+"""The simulated robot with an observer of its true state, and with a gyro.
 
-What is seen is no business of the microcontroller, which sends what its encoders say and no more.
+The board does not use these observations. It sends only what its encoders show.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from acsard.sim.noise import gauss
 from acsard.values import NS_PER_S, Pose
 
 LOOK_NS = NS_PER_S // 100
-"""Between two looks, and two samples of the gyro."""
+"""Time between two observations, and between two samples of the gyro."""
 
 
 class Sight(Struct, frozen=True):
-    """One look at `at_ns`, monotonic: the true pose, and what the gyro says then, rad/s.
+    """An observation at monotonic `at_ns`: the true pose, and the turn rate by the gyro, rad/s.
 
-    The gyro's is a mean over the time between two looks, which ended `[sim] gyro_delay` ago.
+    The gyro reports the mean over the time between two observations, delayed by `[sim] gyro_delay`.
     """
 
     at_ns: int
@@ -31,7 +31,7 @@ class Sight(Struct, frozen=True):
 
 
 class WatchedMcu(FakeMcu):
-    """A `FakeMcu` whose robot is looked at a hundred times a second, while time passes."""
+    """A `FakeMcu` whose robot is observed a hundred times per second of simulated time."""
 
     def __init__(self, config: Config, now_ns: int, see: Callable[[Sight], None]) -> None:
         super().__init__(config, now_ns)
@@ -40,15 +40,18 @@ class WatchedMcu(FakeMcu):
         self._looks = 0
         self._look_ns = now_ns + LOOK_NS
         self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
-        """When it had turned by how much, as far back as the gyro needs."""
+        """Pairs of time and angle turned, as far back as the gyro needs."""
 
     def next_ns(self) -> int:
-        """When it next has something to do, or somebody looks at it."""
+        """Return the time of the next event or observation."""
         due_ns = super().next_ns()
         return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
 
     def advance(self, now_ns: int) -> bytes:
-        """Let time pass up to `now_ns`; the bytes that have fully arrived at the host since."""
+        """Let time pass up to `now_ns`.
+
+        Return the bytes that have arrived at the host meanwhile.
+        """
         out = b""
         while self._look_ns <= now_ns:
             out += super().advance(self._look_ns)
@@ -69,7 +72,10 @@ class WatchedMcu(FakeMcu):
         self._see(Sight(now_ns, self.vehicle.pose, rate))
 
     def _turned(self, at_ns: int) -> float:
-        """rad by then; it stood before the first look."""
+        """Return the angle in rad at this time.
+
+        The robot stood still before the first observation.
+        """
         before_ns, before = self._history[0]
         if at_ns <= before_ns:
             return before

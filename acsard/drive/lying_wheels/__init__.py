@@ -1,1 +1,2 @@
-"""Wheels that lie or slip, found line by line and left out of the pose: start at `verdict.py`."""
+"""Detects faulty encoders and slip, line by line, and excludes such wheels from the pose.
+`verdict.py` is the entry."""

@@ -1,20 +1,20 @@
-"""Front and rear wheel of one side compared: two witnesses of the same way.
+"""Compares the front and the rear wheel of one side, which roll over the same floor.
 
-Both roll over the same floor, so what one turns more than the other is slip, a lie, or one of four
-things that are neither: the count each of them may stand beside, wheels that differ (a tyre, its
-load), motors of which one follows sooner, and the line's two decimals. The counts' share does not
-grow with the way, since what a count says too much the next one takes back. The wheels' share
-stays the same, so it is learned. So sums that forget are compared, angles and no speeds:
+If one wheel turns more than the other, the reason is slip, a faulty encoder, or one of four
+harmless effects: the position of each wheel within a count, wheels that differ (a tyre, its load),
+motors of which one follows sooner, and the two decimals of the line. The error by counts does not
+grow with the way, because the next count takes it back. The wheels' difference is a constant share,
+so it is learned. The comparison uses sums of angles, not speeds, and these sums forget:
 
     |off - r way| > SHARE way + COUNTS count + LEAST (+ LAG_S |speed - its mean|)
 
-with off the sum of front - rear, way that of the side's turning and r what is learned. Lags make a
-slip of it only beyond the last term; a wheel is suspected before.
+where off is the sum of front - rear, way that of the side's turning and r the learned share. For
+slip the last term, for the motors' lag, is added. A wheel becomes suspect without it.
 
-Two wheels of which nobody knows where in a count they stand differ by up to two counts without any
-slip, so one of s at w rad/s cannot be told for certain before 2 count / (s w): a tenth at 10 rad/s
-takes 0.13 s with 96 counts a turn, and 0.26 s where SHARE is left to tyres. With COUNTS, and sums
-that forget, it is told within 0.2 s above 22 rad/s, and below 11.5 rad/s not at all.
+Two wheels at unknown positions within a count differ by up to two counts without any slip. A slip
+of share s at w rad/s therefore cannot be certain before 2 count / (s w). With 96 counts a turn, a
+slip of a tenth at 10 rad/s takes 0.13 s, and 0.26 s if SHARE is left to tyres. With COUNTS and sums
+that forget it is found within 0.2 s above 22 rad/s, and never below 11.5 rad/s.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ from __future__ import annotations
 import math
 
 MEMORY_S = 0.14
-"""s; after these a sum remembers the 1 / e of what it was."""
+"""Time after which a sum has fallen to 1 / e, s."""
 
 SHARE = 0.05
-"""Of the way: half of the slip of 10 % that is to be found."""
+"""Share of the way that may differ: half of the slip of 10 % that must be found."""
 
 COUNTS = 1.2
-"""Counts; two wheels that stand anywhere within one are seldom further apart."""
+"""Counts that may differ. Two wheels anywhere within a count are seldom further apart."""
 
 LAG_S = 0.03
-"""s by which one motor may follow its command later than the other."""
+"""Lag of one motor behind the other that is allowed, s."""
 
 LEAST = 0.002
-"""rad; two decimals, and play."""
+"""rad that may differ besides, for the two decimals and for play."""
 
 UNEQUAL = 0.05
-"""Share by which two healthy wheels of a side may turn differently for good."""
+"""Share by which two healthy wheels of a side may differ permanently."""
 
 LEARNING_S, DOUBTED_S = 5.0, 20.0
-"""s of driving in which that is learned, and that it takes where they contradict each other."""
+"""Seconds of driving in which that share is learned: normally, and while the wheels contradict each
+other."""
 
 SLOWEST = 1.0
-"""rad/s; slower wheels tell nothing of their size."""
+"""rad/s. Slower wheels show nothing about their size."""
 
 WILD = 0.1
-"""Share that a line which contradicts counts as at most: a slip soon ends, a tyre does not."""
+"""Greatest share that a contradicting line can teach. A slip soon ends, but a tyre stays."""
 
 
 class Residual:
@@ -54,16 +55,16 @@ class Residual:
 
     def __init__(self) -> None:
         self.ratio = 0.0
-        """By which share the front wheel turns more than the rear one, as long as all is well."""
+        """Learned share by which the front wheel turns more than the rear one."""
         self.learns = True
         self.slips = False
-        """They differ by more than motors of which one is later, where they do."""
+        """Whether a contradicting pair differs by more than a lag of one motor explains."""
         self._off = self._way = self._net = 0.0
 
     def add(self, front: float, rear: float, keep: float, dt: float, count: float) -> bool:
-        """A line of `dt` s, rad each; False when they contradict each other.
+        """Take a line of `dt` s, with the wheels' angles in rad; return whether the wheels agree.
 
-        `keep` is what is left of the sums after it, `count` the angle of an encoder's count.
+        `keep` is the factor by which the line reduces the sums, and `count` the angle of a count.
         """
         mean = (front + rear) / 2
         size = abs(mean) if front * rear >= 0.0 else (abs(front) + abs(rear)) / 2
@@ -73,7 +74,7 @@ class Residual:
         self._net = keep * (self._net + mean)
         most = SHARE * way + COUNTS * count + LEAST
         if abs(total) > most:
-            # One motor may be later than the other while the speed changes.
+            # One motor may lag the other while the speed changes.
             late = LAG_S * abs(mean / dt - self._net / MEMORY_S)
             self.slips = abs(total) > most + late
             self._learn(math.copysign(WILD, off * mean) * dt / DOUBTED_S)
@@ -83,13 +84,13 @@ class Residual:
         return True
 
     def stand_in(self, front: bool) -> float:
-        """The front wheel's turn per turn of the rear one, or the other way round."""
+        """Return the ratio of the angles, front to rear, or rear to front if not `front`."""
         more = 1.0 + self.ratio / 2, 1.0 - self.ratio / 2
         return more[0] / more[1] if front else more[1] / more[0]
 
     @property
     def rolling(self) -> bool:
-        """It rolls so fast that wheels which agree do agree."""
+        """Whether the wheels roll so fast that their agreement means something."""
         return self._way > SLOWEST * MEMORY_S
 
     def _learn(self, more: float) -> None:

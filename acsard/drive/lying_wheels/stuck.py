@@ -1,9 +1,9 @@
-"""A wheel that says one and the same speed while its command and the other wheel go elsewhere.
+"""Detects an encoder that repeats one speed although its command and the other wheel change.
 
-At a steady speed a stuck encoder says what a sound one does: nothing can tell it, and nothing need,
-for it costs the pose nothing. Once the command leaves, a wheel that turns by it has to say another
-speed: even one that follows slowly, as soon as it has gone a few counts further than the old
-speed makes it. Where the other one has gone that way, it is not the command that was not obeyed.
+At a steady speed a stuck encoder reports the same as a sound one. Nothing can detect it then, and
+it does not harm the pose. When the command changes, a sound wheel must report another speed, even a
+slow wheel once it has gone a few counts further than the old speed would take it. If the other
+wheel of the side has followed the command, the command itself was obeyed.
 """
 
 from __future__ import annotations
@@ -11,20 +11,20 @@ from __future__ import annotations
 import math
 
 LIE_S = 0.025
-"""s of one and the same; one spoilt reading is no lie."""
+"""Seconds of one repeated speed. A single bad reading is not a fault."""
 
 LEAVES = 0.05
-"""rad/s by which a command differs from the one at which the wheel began to say the same."""
+"""rad/s by which a command must differ from that at the first repetition."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 2.5, 0.01
-"""Counts and rad by which even a slow wheel has left its old speed."""
+"""Counts and rad after which even a slow wheel has left its old speed."""
 
 OTHER_COUNTS, OTHER_ANGLE = 3.5, 0.05
-"""Counts and rad by which the other wheel has."""
+"""Counts and rad by which the other wheel must have left it."""
 
 
 class Stuck:
-    """One wheel, line after line."""
+    """The test of one wheel, line by line."""
 
     def __init__(self) -> None:
         self._begin(0.0, math.nan)
@@ -34,19 +34,24 @@ class Stuck:
         self._seconds = self._followed = self._other = 0.0
 
     def left_by(self, command: float) -> bool:
-        """The command, rad/s, is another one than that at which it began to say the same."""
+        """Return whether the command, rad/s, differs from that at the first repetition."""
         return abs(command - self._command) >= LEAVES
 
     def says(
         self, same: bool, apart: float, dt: float, count: float, slow: float, command: float
     ) -> bool:
-        """Whether it is, after a line of `dt` s in which the other wheel turned `apart` rad more.
+        """Return whether the encoder is stuck, after a line of `dt` s.
 
-        `same` if it says the very speed of the line before, and turns. The rad/s of a wheel that
-        follows its command slowly, and of one that does at once; `count` rad is an encoder's count.
+        Args:
+            same: Whether the wheel turns and repeats the speed of the line before.
+            apart: Angle that the other wheel turned more in the line, rad.
+            dt: Duration of the line, s.
+            count: Angle of an encoder count, rad.
+            slow: Speed of a wheel that follows its command slowly, rad/s.
+            command: Speed of a wheel that follows at once, rad/s.
         """
         leaves = command - self._command
-        if not (same and abs(leaves) >= LEAVES):  # nor of a first line
+        if not (same and abs(leaves) >= LEAVES):  # this also holds for the first line
             self._begin(slow, command)
             return False
         self._seconds += dt

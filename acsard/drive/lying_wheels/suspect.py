@@ -1,10 +1,10 @@
-"""Does one wheel of a side lie? Its sign, and what the command or a gyro says of it.
+"""Decides whether a suspect wheel has a faulty encoder, by its command or a gyro.
 
-An encoder that lies does so in one of three ways: it is dead (says no turn), reversed (the other
-wheel's turn the other way round) or stuck (says one and the same). A wheel with such a sign lies if
-it is further off than the other one from what is known from elsewhere: the turn a gyro tells, else
-the command, by which a healthy wheel is between what it is told and what a slow wheel would have
-made of that by now. Without either nothing is known: who pushes a robot by hand may well turn one
+A faulty encoder shows one of three signs. It is dead (reports no turn), reversed (reports the
+opposite of the other wheel) or stuck (repeats one speed). A wheel with such a sign is faulty if it
+is further than the other wheel from an independent reference. That is the turn by a gyro, or else
+the command: a healthy wheel is between its command and the speed that a slow wheel would have
+reached by now. Without a reference nothing is decided: a person who pushes the robot may turn one
 wheel and not the other.
 """
 
@@ -15,27 +15,29 @@ from typing import Literal
 from msgspec import Struct
 
 LIE_S, LIE_LINES = 0.025, 2
-"""s and lines for which it has to lie: three at 100 Hz, so that one spoilt reading is none."""
+"""Seconds and lines for which the sign must last: three lines at 100 Hz, so one bad reading is not
+enough."""
 
 LIE_COUNTS, LIE_ANGLE = 3.5, 0.05
-"""Counts and rad by which the other wheel must have turned on meanwhile."""
+"""Counts and rad by which the other wheel must have turned further meanwhile."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 1.5, 0.01
-"""Counts and rad by which even a slow wheel has left its speed: one that turns by its command
-cannot have said one and the same all the time, and if the other one has followed, it is stuck."""
+"""Counts and rad after which even a slow wheel has left its speed. A sound wheel cannot have
+repeated one speed by then. If the other wheel has followed the command, this one is stuck."""
 
 VOTE = 1 / 3
-"""Share of what is between the two wheels by which it must be further off than the other one."""
+"""Share of the difference between the two wheels by which this one must be further off."""
 
 HAND_S = 0.3
-"""s of one and the same speed with nothing commanded that no hand can turn a wheel at."""
+"""Seconds of one repeated speed without a command that no hand can produce."""
 
 DEAD, REVERSED = 0.1, 0.3
-"""Shares of the other wheel's turn: less is none, and so close to its opposite is that."""
+"""Shares of the other wheel's turn: below the first a wheel is dead, and this close to the opposite
+it is reversed."""
 
 STUCK = 0.3
-"""Share of the faster wheel's turn by which one is off that says the same: less is slip beside a
-wheel that goes at a steady speed."""
+"""Least difference for a stuck wheel, as a share of the faster wheel's turn. A smaller one is slip
+next to a wheel at a steady speed."""
 
 Lie = Literal["dead", "reversed", "stuck"]
 
@@ -47,25 +49,25 @@ WORDS: dict[Lie, str] = {
 
 
 class Known(Struct, frozen=True):
-    """What is known of one side's turning in one line beside its wheels, rad; None is nothing."""
+    """The independent reference for one side's turn in one line, rad; `gyro` is None if unknown."""
 
     slow: float
-    """A wheel's that follows its command slowly."""
+    """Turn of a wheel that follows its command slowly."""
     command: float
-    """A wheel's that follows at once."""
+    """Turn of a wheel that follows its command at once."""
     commanded: bool
-    """There is a command, and no slow one."""
+    """Whether there is a command, and not a slow one."""
     gyro: float | None
 
 
 class _Ballot:
-    """How far both wheels turned, and how far one can have that tells the truth, rad."""
+    """The turns of both wheels, and the range of a true turn by one reference, rad."""
 
     def __init__(self) -> None:
         self._own = self._other = self._low = self._high = 0.0
 
     def add(self, own: float, other: float, low: float, high: float) -> None:
-        """Of one line."""
+        """Add one line."""
         self._own += own
         self._other += other
         self._low += low
@@ -73,17 +75,17 @@ class _Ballot:
 
     @property
     def apart(self) -> float:
-        """rad between the two."""
+        """Difference between the two wheels, rad."""
         return abs(self._own - self._other)
 
     @property
     def vote(self) -> float:
-        """From 1, that all of it is the suspect's, to -1, that it is the other one's."""
+        """The suspect's part of the error, from 1 (all of it) to -1 (all is the other wheel's)."""
         return (self._off(self._own) - self._off(self._other)) / (self.apart or 1.0)
 
     @property
     def share(self) -> float:
-        """What is between the two of what the faster one turned."""
+        """The difference as a share of the faster wheel's turn."""
         return self.apart / (max(abs(self._own), abs(self._other)) or 1.0)
 
     def _off(self, turned: float) -> float:
@@ -91,26 +93,27 @@ class _Ballot:
 
 
 class Suspect:
-    """One wheel that has the sign of a lie, line after line."""
+    """The test of one wheel that shows the sign of a fault, line by line."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Nothing is suspicious about it."""
+        """Start over: the wheel shows no sign."""
         self.lie: Lie | None = None
         self._lines = 0
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
         self._first: float | None = None
-        """rad/s of a slow wheel when it was first looked at, and rad that it went since beyond
-        that."""
+        """Speed of a slow wheel at the first line, rad/s, and the angle that it went since beyond
+        that speed, rad."""
         self._followed = 0.0
 
     def looks(self, own: float, other: float, same: bool, dt: float, count: float) -> bool:
-        """Whether it does, after a line of `dt` s: rad of both wheels, and of an encoder's count.
+        """Return whether the wheel shows a sign, after a line of `dt` s.
 
-        `same` if it says the very speed of the line before.
+        `own` and `other` are the turns of both wheels and `count` is the angle of a count, rad.
+        `same` means that the wheel repeats the speed of the line before.
         """
         lie = self._sign(own, other, same, count)
         if lie != self.lie:
@@ -122,7 +125,10 @@ class Suspect:
         return lie is not None
 
     def _sign(self, own: float, other: float, same: bool, count: float) -> Lie | None:
-        """The one it had, as long as it has it; through zero and at rest all of them look alike."""
+        """Return the sign.
+
+        An earlier sign is kept where all signs look alike: through zero and at rest.
+        """
         if self.lie == "stuck" and same:
             return "stuck"
         if reverses(own, other, count) or (self.lie == "reversed" and own * other == 0.0):
@@ -132,7 +138,7 @@ class Suspect:
         return "stuck" if same else None
 
     def compare(self, own: float, other: float, dt: float, known: Known) -> None:
-        """What else is known in that line."""
+        """Add the reference for this line."""
         if known.commanded:
             low, high = min(known.slow, known.command), max(known.slow, known.command)
             self._command.add(own, other, low, high)
@@ -143,7 +149,10 @@ class Suspect:
             self._gyro.add(own, other, known.gyro, known.gyro)
 
     def lies(self, count: float) -> bool:
-        """It does, and not the other one; `count` rad is what an encoder's count is worth."""
+        """Return whether this wheel is faulty, and not the other.
+
+        `count` rad is the angle of a count.
+        """
         enough = LIE_COUNTS * count + LIE_ANGLE
         if self._lines < LIE_LINES or self._seconds < LIE_S or abs(self._apart) < enough:
             return False
@@ -157,27 +166,30 @@ class Suspect:
         return self.lie == "stuck" and nothing and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
-        """They are so far apart that who goes at a steady speed cannot just have another tyre."""
+        """Return whether a tyre cannot explain the difference to a wheel at a steady speed."""
         return self.lie != "stuck" or ballot.share >= STUCK
 
     def _ignores(self, count: float) -> bool:
-        """The command has changed, and the other wheel went that way."""
+        """Return whether the command has changed and only the other wheel has followed."""
         enough = FOLLOWED_COUNTS * count + FOLLOWED_ANGLE
         return abs(self._followed) >= enough and self._followed * self._apart > 0.0
 
 
 def stands(own: float, other: float) -> bool:
-    """A wheel that says it does, or nearly, of two that turned so far."""
+    """Return whether a wheel that turned `own` rad stands, or nearly, beside the `other`."""
     return own == 0.0 or abs(own) <= DEAD * abs(other)
 
 
 def reverses(own: float, other: float, count: float) -> bool:
-    """It says the opposite of the other one, but for encoder counts."""
+    """Return whether a wheel reports the opposite of the other one, apart from encoder counts."""
     return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + LIE_COUNTS * count
 
 
 def has_lied(lie: Lie, own: float, other: float, now: float) -> bool:
-    """Whether a line of before may belong to the same lie: speeds, and what it says now."""
+    """Return whether an earlier line with these speeds may belong to the same fault.
+
+    `now` is the present speed.
+    """
     if lie == "reversed":
         return own * other < 0.0
     return stands(own, other) if lie == "dead" else own == now

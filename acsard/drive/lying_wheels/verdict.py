@@ -1,10 +1,11 @@
-"""Which wheel lies, and what slips: front and rear of a side watch each other, line by line.
+"""Decides which wheel is faulty and which side slips: the wheels of a side check each other.
 
-Where they contradict each other (`residual.py`) and one of them has the sign of a lying encoder and
-is denied from elsewhere (`suspect.py`), that one is left out of the pose: the other one stands in.
-It counts again when both have agreed for a while. All other contradiction is slip, and so is a lie
-until it is told. A side is never left without a wheel. A wheel that is blocked or dragged looks
-like one with a dead encoder, and is left out too: the other one is what is driven.
+If they contradict each other (`residual.py`), and one of them shows the sign of a faulty encoder
+and an independent reference contradicts it (`suspect.py`), the pose ignores that wheel and the
+other one stands in. It counts again when both have agreed for a while. Every other contradiction is
+slip, and so is a fault until it is proven. A side always keeps one wheel. A wheel that is blocked
+or dragged looks like one with a dead encoder and is ignored too, because the other wheel shows the
+way driven.
 """
 
 from __future__ import annotations
@@ -19,38 +20,39 @@ from acsard.mcu.codec import Motors
 from acsard.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
-"""rad; the angle of a count is found between these where the configuration does not tell: a wheel
-that turns slowly says one count or none."""
+"""rad. Range in which the angle of a count is learned if none is configured. A wheel that turns
+slowly reports one count or none per line."""
 
 PERIOD, SMOOTHED = 0.01, 0.05
-"""s between two lines until that is known, and the share of a new one in their mean."""
+"""Assumed period of the lines, s, and weight of a new one in their mean."""
 
 RECUR, SOUGHT = 3, 1000
-"""Times that so small an angle comes in so many lines where it is a count; damage makes one."""
+"""Number of times that a small angle must recur within this number of lines to be a count. Damage
+makes one."""
 
 COMMANDED = 0.3
-"""rad/s; a slower command says little of who is right."""
+"""rad/s. A slower command shows little about which wheel is right."""
 
 SLIP_S = 0.5
-"""s after the last contradiction for which a side slips on."""
+"""Seconds after the last contradiction for which a side still counts as slipping."""
 
 SLIP_TOLD_S = 0.1
-"""s of contradiction from which on a slip is worth a log line."""
+"""Seconds of contradiction after which a slip is logged."""
 
 BACK_S = 0.5
-"""s for which a wheel that was left out must agree, rolling, to be believed again."""
+"""Seconds for which an ignored wheel must agree, while rolling, to count again."""
 
 Same = tuple[bool, bool, bool, bool]
-"""Which wheels say the very speed of the line before, in `WHEELS` order."""
+"""Whether each wheel repeats the speed of the line before, in `WHEELS` order."""
 
 NONE: Same = (False, False, False, False)
 
 LEFT, RIGHT = (1, 2), (0, 3)
-"""The front and the rear wheel of each side, in `WHEELS` order."""
+"""Indices of the front and the rear wheel of each side in `WHEELS` order."""
 
 
 class _Side:
-    """Two wheels; which of them is left out, and whether they slip."""
+    """Two wheels of a side: which of them is ignored, and whether they slip."""
 
     def __init__(self, name: str, wheels: tuple[int, int]) -> None:
         self.name, self.wheels = name, wheels
@@ -59,20 +61,20 @@ class _Side:
         self._suspects = (Suspect(), Suspect())
         self._stuck = (Stuck(), Stuck())
         self.out: int | None = None
-        """0 the front, 1 the rear one."""
+        """Index of the ignored wheel: 0 for the front one, 1 for the rear one, None without one."""
         self._lie: Lie = "dead"
         self.slip_s = self._odd_s = self._agreed_s = 0.0
         self.event: Event | None = None
-        """What the last line has to tell."""
+        """The event of the last line, if any."""
 
     @property
     def left_out(self) -> str:
-        """The wheel's name, "" when both count."""
+        """The ignored wheel's name, "" if both count."""
         return "" if self.out is None else WHEELS[self.wheels[self.out]]
 
     @property
     def text(self) -> str:
-        """What is wrong with them, "" when nothing is."""
+        """The trouble of the side in words, "" without any."""
         if self.out is not None:
             return f"{self.left_out} wheel is left out: it {WORDS[self._lie]}, look at its encoder"
         if self.slip_s > 0.0:
@@ -80,7 +82,7 @@ class _Side:
         return ""
 
     def agree(self, dt: float) -> None:
-        """A line in which they do."""
+        """Take a line in which the wheels agree."""
         if self.suspected:
             self.suspected = False
             for suspect in self._suspects:
@@ -97,8 +99,7 @@ class _Side:
     def stands_still(
         self, turned: Motors, same: Same, dt: float, count: float, slow: float, wish: float
     ) -> bool:
-        """Whether a wheel is left out from now on: it turns, and its speed stays while all else
-        changes."""
+        """Test for a stuck encoder; return whether a wheel is ignored from now on."""
         if self.out is not None:
             return False
         for i, stuck in enumerate(self._stuck):
@@ -114,7 +115,7 @@ class _Side:
     def contradict(
         self, turned: Motors, same: tuple[bool, bool], dt: float, count: float, known: Known
     ) -> bool:
-        """They do not; whether one of them is left out from now on."""
+        """Take a line in which they contradict; return whether a wheel is ignored from now on."""
         self._agreed_s = 0.0
         if self.out is not None:
             return False
@@ -137,7 +138,7 @@ class _Side:
         return False
 
     def lied(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
-        """The wheel that is left out may already have lied in an earlier line."""
+        """Return whether the ignored wheel may already have been wrong in an earlier line."""
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
@@ -158,30 +159,37 @@ class _Side:
 
 
 class Witness:
-    """Hears every line; says which wheels to leave out, and whether any slips."""
+    """The checks of all wheels: the wheels to ignore, and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, response_time: float) -> None:
-        """`counts` of the encoders per wheel turn, 0 if unknown; a slow wheel's response, s."""
+        """Start.
+
+        Args:
+            kinematics: The kinematics of the base.
+            counts: Encoder counts per wheel turn, 0 if unknown.
+            response_time: Response time of a slow wheel, s.
+        """
         self._kinematics, self._response = kinematics, response_time
         self._count = math.tau / counts if counts else COARSEST
         self._seeking, self._period = not counts, PERIOD
         self._least, self._looked = [COARSEST] * RECUR, 0
-        """rad; the least that front wheels turned in so many of the last lines."""
+        """The smallest angles, rad, that front wheels turned in one line, among the last `_looked`
+        lines."""
         self._sides = self._left, self._right = _Side("left", LEFT), _Side("right", RIGHT)
         self._slow_left = self._slow_right = 0.0
-        """rad/s of wheels that follow their command slowly."""
+        """Speeds of wheels that follow their command slowly, rad/s."""
         self._last = STILL
         self._busy = self._leaves_out = self._stands = False
         self.slips = False
-        """Front and rear of a side contradict each other, or did half a second ago."""
+        """Whether the wheels of a side contradict each other now, or did half a second ago."""
         self._found: _Side | None = None
-        """The side of which the last line has shown the lie."""
+        """The side in which the last line proved a fault."""
         self.events: list[Event] = []
-        """What the last line has to tell."""
+        """Events of the last line."""
 
     @property
     def status(self) -> WheelsStatus:
-        """Who is left out, and what slips."""
+        """The ignored wheels, and the sides that slip."""
         sides = self._sides
         return WheelsStatus(
             text="; ".join(side.text for side in sides if side.text),
@@ -191,7 +199,7 @@ class Witness:
         )
 
     def believed(self, wheels: Motors) -> Motors:
-        """What four wheels say, rad or rad/s, with others in place of those that are left out."""
+        """Return four wheel values with ignored wheels replaced by their partners, rad or rad/s."""
         if not self._leaves_out:
             return wheels
         said = list(wheels)
@@ -210,11 +218,11 @@ class Witness:
         told: WheelSpeeds | None = None,
         turn: float | None = None,
     ) -> bool:
-        """A line: rad in `dt` s, and the speeds it says.
+        """Take a line: the turned angles, rad, in `dt` s, and its speeds.
 
-        `told` is what the wheels are, rad/s; `turn` the rad that they would tell by a gyro that is
-        trusted. None is nothing known. True where a wheel is left out from now on: ask
-        `lied` of the lines before.
+        `told` is the commanded speeds, rad/s; `turn` is the turn that the wheels would report by a
+        trusted gyro, rad. Return whether a wheel is ignored from now on; then call `lied` for the
+        lines before.
         """
         if self.events:
             self.events = []
@@ -260,7 +268,7 @@ class Witness:
     def _standing(
         self, turned: Motors, same: Same, dt: float, told: WheelSpeeds | None
     ) -> _Side | None:
-        """The side of which a wheel is stuck, of wheels that turn."""
+        """Return the side with a stuck encoder, None without one."""
         if told is None:
             return None
         left, right, count = self._left, self._right, self._count
@@ -269,11 +277,14 @@ class Witness:
         return right if of_right else left if of_left else None
 
     def lied(self, before: WheelSpeeds) -> bool:
-        """Of the wheel that the last line has shown to lie: it may have lied in that line too."""
+        """Return whether the wheel that the last line proved faulty was wrong in that line too."""
         return self._found is not None and self._found.lied(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
-        """The least that a wheel turns in a line, time and again, is a count, or more."""
+        """Learn the angle of a count.
+
+        The smallest angle per line that recurs is at least one count.
+        """
         self._period += SMOOTHED * (dt - self._period)
         self._looked += 1
         if self._looked > SOUGHT:
@@ -288,9 +299,9 @@ class Witness:
     def _known(
         self, i: int, dt: float, turned: Motors, told: WheelSpeeds | None, turn: float | None
     ) -> Known:
-        """What is known of the left (0) or right side beside its own wheels.
+        """Return the reference for the left (0) or right (1) side, apart from its own wheels.
 
-        By a gyro only while the other side agrees: the turn is between both.
+        The gyro counts only while the other side agrees, because the turn involves both sides.
         """
         by_gyro = None
         if turn is not None:

@@ -1,0 +1,1 @@
+"""Random plans against the whole daemon in virtual time: `python -m tests.simulate --help`."""

@@ -1,0 +1,144 @@
+"""Lets the machine look for what nobody thought of: random plans against the whole daemon.
+
+`tests/README.md` says how to use it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from pathlib import Path
+
+from tests.simulate import pairs, shrink
+from tests.simulate.actors import Result, played
+from tests.simulate.plan import Plan, made
+
+HERE = Path(__file__).parent
+
+
+def commit() -> str:
+    """Return the commit that is tried, with a + if files were changed since."""
+    told = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+"],
+        capture_output=True, text=True, check=False, cwd=HERE,
+    )  # fmt: skip
+    return told.stdout.strip() or "unknown"
+
+
+def results(seed: int, seconds: float, workers: int, within_s: float) -> Iterator[Result]:
+    """Play this seed and those behind it until so much time is simulated or has passed."""
+    end = time.monotonic() + within_s
+    with ProcessPoolExecutor(workers) as pool:
+        running = {pool.submit(_play, seed + n) for n in range(workers)}
+        following, total = seed + workers, 0.0
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for one in done:
+                result = one.result()
+                total += result.simulated_s
+                yield result
+                if total < seconds and time.monotonic() < end:
+                    running.add(pool.submit(_play, following))
+                    following += 1
+
+
+def _play(seed: int) -> Result:
+    return played(made(seed))
+
+
+def show(result: Result) -> None:
+    """Print a finding in one line."""
+    print(f"{commit()} seed {result.seed}: {result.finding}", flush=True)
+
+
+def table(counts: Counter[str]) -> str:
+    """Return what was covered, a line for each group of counts."""
+    groups: dict[str, list[str]] = {}
+    for name, count in sorted(counts.items()):
+        group, _, rest = name.partition(" ")
+        groups.setdefault(group, []).append(f"{rest or group} {count}")
+    return "\n".join(f"  {group:<11} {', '.join(items)}" for group, items in groups.items())
+
+
+def explore(seed: int, hours: float, workers: int, within_s: float = math.inf) -> int:
+    """Play seeds for so many simulated hours; return the number of findings."""
+    counts, simulated, cpu, findings, runs = Counter[str](), 0.0, 0.0, 0, 0
+    began = time.perf_counter()
+    for result in results(seed, hours * 3600, workers, within_s):
+        runs += 1
+        simulated += result.simulated_s
+        cpu += result.cpu_s
+        largest = max(counts["largest container"], result.counts["largest container"])
+        counts.update(result.counts)
+        counts["largest container"] = largest
+        if result.finding:
+            findings += 1
+            show(result)
+    took = time.perf_counter() - began
+    print(table(counts))
+    print(
+        f"{commit()}: {runs} runs from seed {seed}, {simulated / 3600:.2f} h simulated in "
+        f"{took:.0f} s by {workers} workers, {simulated / max(cpu, 1e-9):.0f} times real time per "
+        f"core, {findings} findings"
+    )
+    return findings
+
+
+def replay(what: str) -> int:
+    """Play one seed or one file of plain data again."""
+    result = played(shrink.load(Path(what)) if what.endswith(".json") else made(int(what)))
+    if result.finding:
+        show(result)
+    print(f"{result.simulated_s:.1f} s simulated in {result.cpu_s:.1f} s")
+    return int(bool(result.finding))
+
+
+def reduce(seed: int, keep: str) -> int:
+    """Shrink the plan of a seed that breaks a promise, and print or keep what is left."""
+    plan = made(seed)
+    result = played(plan)
+    if not result.finding:
+        print(f"seed {seed} breaks no promise")
+        return 1
+    show(result)
+    small: Plan = shrink.shrunk(plan, result, print)
+    show(played(small))
+    if keep:
+        print(shrink.kept(small, result, commit(), HERE / "corpus" / f"{keep}.json"))
+    else:
+        print(shrink.written(small, result, commit()))
+    return 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser("tests.simulate", description=__doc__.partition("\n")[0])
+    parser.add_argument("--seed", type=int, default=1, help="the first seed")
+    parser.add_argument("--hours", type=float, default=0.1, help="simulated hours in all")
+    parser.add_argument(
+        "--within", type=float, default=math.inf, metavar="MINUTES", help="real time for new seeds"
+    )
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--replay", metavar="SEED", help="play one seed, or a plan's file, again")
+    parser.add_argument("--shrink", metavar="SEED", type=int, help="drop what a finding can spare")
+    parser.add_argument("--keep", metavar="NAME", default="", help="with --shrink: into corpus/")
+    parser.add_argument("--against", metavar="TREE", help="compare with another checkout")
+    options = parser.parse_args()
+    if options.replay:
+        return replay(options.replay)
+    if options.shrink is not None:
+        return reduce(options.shrink, options.keep)
+    if options.against:
+        tree = Path(options.against)
+        return pairs.compare(tree, options.seed, options.hours * 3600, options.workers)
+    return min(1, explore(options.seed, options.hours, options.workers, options.within * 60))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,445 @@
+"""Plays a plan: senders over their networks, operators, the board and the host, in true time.
+
+`Run.play` returns what was covered. It raises `BrokenError` at the first promise that does not
+hold, also for an exception of the product.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import heapq
+import json
+import struct
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import msgspec
+
+from tests.simulate.liveness import Liveness
+from tests.simulate.plan import Plan
+from tests.simulate.pose import LIARS, PoseWitness
+from tests.simulate.product import START_NS, WALL_OFFSET_NS, Product, Seen
+from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.reports import Echo, Reports, judge_state
+from tests.simulate.roads import NS, Message, messages, read_reply, sample
+
+
+class Result(NamedTuple):
+    """What a run came to."""
+
+    seed: int
+    finding: str
+    """The promise that did not hold, when and how; "" if all did."""
+    promise: str
+    at_ns: int
+    simulated_s: float
+    cpu_s: float
+    counts: Counter[str]
+
+
+def played(plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> Result:
+    """Play a plan in this process. `log` gets all that each step showed."""
+    began = time.process_time()
+    run = Run(plan, log)
+    try:
+        run.play()
+        finding, promise, at_ns = "", "", run.true_ns
+    except BrokenError as error:
+        finding, promise, at_ns = str(error), error.promise, error.at_ns
+    simulated_s = (run.true_ns - run.slept_ns) / NS
+    cpu_s = time.process_time() - began
+    return Result(plan["seed"], finding, promise, at_ns, simulated_s, cpu_s, run.counts)
+
+
+class Run:
+    """One plan, one robot."""
+
+    def __init__(self, plan: Plan, log: Callable[[dict[str, Any]], None] | None = None) -> None:
+        self.plan, self.log = plan, log
+        self.slept_ns = 0
+        self.resumed_ns = START_NS
+        """Monotonic time of the last resume: before it nothing can have arrived."""
+        self.witness = Witness(plan["config"])
+        self.pose = PoseWitness(plan["config"])
+        self.reports, self.echo = Reports(), Echo()
+        self.counts: Counter[str] = self.witness.counts
+        self.liveness = Liveness(self)
+        self.failure: BrokenError | None = None
+        self.todo: list[tuple[int, int, Callable[[], None]]] = []
+        self._order = 0
+        self._calls: dict[int, Callable[[bytes], None]] = {}
+        self._ticket = 0
+        self.active: list[tuple[str, tuple[Any, ...]]] = []
+        self._fed_ns = 0
+        self._linked = False
+        """This daemon has heard the board: before that, no event disarms a sender."""
+        self._stalled_ns = -NS
+        self.epilogue = False
+        self.moved_ns = -1
+        self.product = Product(plan["config"], self._see)
+        self.product.fed = self._fed
+
+    # time
+
+    @property
+    def true_ns(self) -> int:
+        return self.product.now_ns - START_NS + self.slept_ns
+
+    def at(self, at_ns: int, do: Callable[[], None]) -> None:
+        """Have something done at this time."""
+        self._order += 1
+        heapq.heappush(self.todo, (at_ns, self._order, do))
+
+    def run_to(self, true_ns: int) -> None:
+        """Do all that is due by then, at its own time."""
+        while self.todo and self.todo[0][0] <= true_ns:
+            at_ns, _, do = heapq.heappop(self.todo)
+            self._pass(at_ns)
+            do()
+            self._raise()
+        self._pass(true_ns)
+        self._raise()
+
+    def _pass(self, true_ns: int) -> None:
+        self.product.run_until(true_ns + START_NS - self.slept_ns)
+
+    def _raise(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+
+    def _arrival(self, true_ns: int) -> int:
+        """Return the robot's time at which something arrives that the network brings now."""
+        return max(self.resumed_ns, min(self.product.now_ns, true_ns + START_NS - self.slept_ns))
+
+    # the play
+
+    def play(self) -> Counter[str]:
+        """Play the plan to its end; raise `BrokenError` for a promise that does not hold."""
+        try:
+            self._begin()
+            self.run_to(int(self.plan["seconds"] * NS))
+            self.liveness.end()
+        except BrokenError:
+            raise
+        except Exception as error:
+            kind = f"{type(error).__name__}: {error}"
+            raise BrokenError("no exception ever", self.true_ns, kind) from error
+        return self.counts
+
+    def _begin(self) -> None:
+        plan, seen = self.plan, Counter[str]()
+        self.lasting = [(name, tuple(values)) for name, *values in plan["board"]]
+        self.active = list(self.lasting)
+        self.product.board(self.active)
+        for sender in plan["senders"]:
+            self.counts[f"way {sender['way']}"] += 1
+            for shape in sender["congestion"]:
+                self.counts[f"congestion {shape[2]}"] += 1
+            if sender["way"] in ("header", "bridged"):
+                seen[f"header native/{sender['source']}" if sender["way"] == "header"
+                     else "session of the bridge"] += 1  # fmt: skip
+            else:
+                for own in (sender["id"], f"session of {sender['id']}"):
+                    seen[own] += 1
+            self.witness.churns |= sender["churn"]
+            queue = messages(sender, plan["seed"], plan["seconds"], START_NS + WALL_OFFSET_NS)
+            queue.reverse()
+            if queue:
+                self._next(sender, queue)
+        several = (name for name, count in seen.items() if count > 1)
+        self.witness.shared_clocks = frozenset(several)
+        for event in plan["events"]:
+            self.counts[f"event {event['do']} {event.get('verb', '')}".strip()] += 1
+            self.at(int(event["at"] * NS), lambda event=event: self._do(event))  # type: ignore[misc]
+
+    def _next(self, sender: dict[str, Any], queue: list[Message]) -> None:
+        message = queue.pop()
+
+        def arrive() -> None:
+            self.deliver(sender, message)
+            if queue:
+                self._next(sender, queue)
+
+        self.at(message.arrives_ns, arrive)
+
+    def deliver(self, sender: dict[str, Any], message: Message) -> None:
+        """Hand a message to the daemon, if there is one."""
+        if not self.product.alive:
+            return
+        at_ns = self._arrival(message.arrives_ns)
+        one = sample(sender, message, self.plan["config"], self.product.wall_ns)
+        true_ns = at_ns - START_NS + self.slept_ns
+        self.witness.command(sender, message, one, true_ns)
+        self.liveness.command(sender, one)
+        shared = one.clock in self.witness.shared_clocks
+        self.reports.command(sender, message, one, at_ns, shared)
+        self.product.deliver(at_ns, one.key, one.payload, **one.options)
+
+    # operators
+
+    def call(self, event: dict[str, Any]) -> None:
+        """Have an operator call a service, over a network that may lose or delay the call."""
+        if event["lost"]:
+            return
+        latch, read_ns = None, None
+        if event.get("named") and self.product.alive:
+            latch, read_ns = self.product.state()["latch"], self.true_ns
+        end_ns = int(self.plan["seconds"] * NS)
+        due_ns = self.true_ns + int(event["late"] * NS)
+        for extra_ns in (0, 700_000_000) if event["twice"] else (0,):
+            if due_ns + extra_ns < end_ns or self.epilogue:
+                self.at(
+                    due_ns + extra_ns,
+                    lambda due=due_ns + extra_ns: self._ask(event, due, latch, read_ns),  # type: ignore[misc]
+                )
+
+    def _ask(
+        self,
+        event: dict[str, Any],
+        due_ns: int,
+        latch: int | None,
+        read_ns: int | None,
+    ) -> None:
+        product, verb, witness = self.product, event["verb"], self.witness
+        if "pose" not in verb and "odometry" not in verb:
+            self.liveness.event()
+        if not product.alive:
+            return
+        at_ns = self._arrival(due_ns)
+        true_ns = at_ns - START_NS + self.slept_ns
+        via, payload = event["via"], b""
+        if verb in ("set", "set_pose") or latch is not None:
+            via = "native"
+        if latch is not None:
+            payload = json.dumps({"latch": latch}).encode()
+        elif verb == "set":
+            payload = json.dumps({"settings": event["settings"]}).encode()
+        elif verb == "set_pose":
+            x, y, yaw = event["pose"]
+            payload = json.dumps({"x": x, "y": y, "yaw": yaw}).encode()
+        attachment = msgspec.msgpack.encode({"sender": event["by"]})
+        if via == "rmw":
+            gid = hashlib.sha256(event["by"].encode()).digest()[:16]
+            attachment = struct.pack("<qqB16s", 1, 1_800_000_000 * NS, 16, gid)
+        elif via == "bridge":
+            attachment = b""
+        if verb == "stop":
+            witness.stops.append(true_ns)
+            if event.get("put"):
+                product.deliver(at_ns, "stop", b"", via="native", attachment=attachment)
+                return
+        self._ticket += 1
+        ticket = self._ticket
+
+        def answered(reply: bytes) -> None:
+            success, text = read_reply(reply, via)
+            self.counts[f"{verb} {'done' if success else 'refused'}"] += 1
+            if not success:
+                return
+            match verb:
+                case "clear":
+                    witness.cleared(true_ns, read_ns, text, event["by"])
+                case "activate":
+                    witness.activated(true_ns, read_ns, event["by"])
+                case "deactivate":
+                    witness.offs.append(true_ns)
+                case "set":
+                    if not text.startswith("nothing new"):
+                        witness.set_limits(self.true_ns, event["settings"])
+                case "set_pose" | "reset_odometry":
+                    self.pose.placed()
+
+        self._calls[ticket] = answered
+        product.ask(at_ns, verb, ticket, payload, via, attachment)
+
+    # the board and the host
+
+    def _do(self, event: dict[str, Any]) -> None:
+        product = self.product
+        if event["do"] not in ("wall", "disk", "call"):
+            self.liveness.event()
+        lasts_ns = min(
+            int(event.get("for", 0.0) * NS),
+            max(0, int(self.plan["seconds"] * NS) - self.true_ns),
+        )
+        after_ns = self.true_ns + lasts_ns
+        match event["do"]:
+            case "call":
+                self.call(event)
+            case "board":
+                name, *values = event["fault"]
+                self.counts[f"board {name}"] += 1
+                fault = (name, tuple(values))
+                self.active.append(fault)
+                self._troubled(name)
+                product.board(list(self.active))
+                if name == "echo":
+                    self.echo.begin()
+                elif name == "mute":
+                    self.at(self.true_ns + NS // 2, self._look)
+                self.at(after_ns, lambda: self._mended(fault))
+            case "reset":
+                product.reset(int(event["deaf"] * NS))
+                self.pose.doubt()
+                self._troubled("reset")
+                deaf_ns = int(event["deaf"] * NS)
+                if deaf_ns > 12 * NS // 10:
+                    self.at(self.true_ns + deaf_ns, lambda: self._disarmed(self.true_ns))
+            case "unplug":
+                product.unplug()
+                self.pose.doubt()
+                self.at(self.true_ns + NS // 2, self._look)
+                self.at(after_ns, lambda: self.plug(event["new"]))
+            case "block":
+                self._block(True)
+                self.at(after_ns, lambda: self._block(False))
+            case "tear":
+                product.tear(event["taken"])
+            case "stall" | "stall in step":
+                self._stalled_ns = after_ns
+                if event["do"] == "stall":
+                    product.stall(lasts_ns / NS)
+                else:
+                    product.stall_in_step(lasts_ns / NS)
+            case "suspend":
+                self._suspend(lasts_ns)
+            case "wall":
+                product.step_wall(event["by"])
+            case "disk":
+                product.disk.fill(True)
+                self.at(after_ns, lambda: product.disk.fill(False))
+            case "restart":
+                if product.alive:
+                    self._restart(event, after_ns)
+
+    def _look(self) -> None:
+        """Judge what `state` says, unless the daemon has just slept or stood still."""
+        product, since_ns = self.product, self.true_ns - NS // 10
+        if product.alive and self._stalled_ns < since_ns and self.resumed_ns < product.now_ns - NS:
+            judge_state(self.true_ns, product.state(), self._fed_ns, self.witness.quiet_ns)
+
+    def _block(self, blocked: bool) -> None:
+        self.liveness.event()
+        self.product.block(blocked)
+        self.witness.blocked_ns = self.true_ns if blocked else None
+
+    def _troubled(self, name: str) -> None:
+        self.witness.troubles[name] = self.true_ns
+        if name in LIARS:
+            self.pose.doubt()
+
+    def _mended(self, fault: tuple[str, tuple[Any, ...]]) -> None:
+        self.active.remove(fault)
+        self.liveness.event()
+        self._troubled(fault[0])
+        self.product.board(list(self.active))
+        self.echo.on = any(name == "echo" for name, _ in self.active)
+        if fault[0] == "echo" and self.product.plugged:
+            # The daemon asks for this, and drives no more until it was done.
+            self.product.unplug()
+            self.at(self.true_ns + NS // 10, lambda: self.plug(False))
+
+    def plug(self, new: bool) -> None:
+        """Plug the board in again, unless it is plugged in."""
+        self.liveness.event()
+        if not self.product.plugged:
+            self.product.plug(new)
+            self._disarmed(self.true_ns)
+
+    def _suspend(self, lasts_ns: int) -> None:
+        """The host sleeps: its monotonic clock stands, and its USB ports lose their power."""
+        product, true_ns = self.product, self.true_ns
+        if not product.alive or not product.plugged:
+            return
+        product.unplug()
+        product.reset(2 * NS)
+        self.pose.doubt()
+        self._troubled("suspend")
+        self.slept_ns += lasts_ns
+        self.resumed_ns = product.now_ns
+        product.step_wall(lasts_ns / NS)
+        self.witness.suspended(true_ns + lasts_ns)
+        self.at(self.true_ns + 20_000_000, lambda: self.plug(False))
+
+    def _restart(self, event: dict[str, Any], after_ns: int) -> None:
+        product, witness = self.product, self.witness
+        product.end(event["way"])
+        behind = product.disk.behind
+        if behind:
+            witness.stops.clear()
+            witness.offs.clear()
+            witness.fault_ns = None
+            witness.limits = dict(witness.file)
+        self._calls.clear()
+
+        def start() -> None:
+            self.resumed_ns = product.now_ns
+            if product.disk.full:
+                witness.stops.append(self.true_ns)
+            product.start()
+            self.liveness.event()
+            self._linked = False
+            witness.new_life(self.true_ns)
+            self.reports = Reports()
+            self.pose.doubt()
+
+        self.at(after_ns + 1000, start)
+
+    # what the product shows
+
+    def _fed(self, at_ns: int) -> None:
+        true_ns = at_ns - START_NS + self.slept_ns
+        gap_ns = true_ns - self._fed_ns
+        if gap_ns > 11 * NS // 10 and self._stalled_ns < self._fed_ns:
+            self._disarmed(true_ns)
+        self._fed_ns, self._linked = true_ns, True
+
+    def _disarmed(self, true_ns: int) -> None:
+        self.liveness.event()
+        if self._linked:
+            self.witness.arming(true_ns)
+
+    def _see(self, seen: Seen) -> None:
+        if self.failure is not None:
+            return
+        try:
+            self._judge(seen)
+        except BrokenError as error:
+            self.failure = error
+
+    def _judge(self, seen: Seen) -> None:
+        witness, offset = self.witness, self.slept_ns - START_NS
+        true_ns = seen.at_ns + offset
+        for ticket, reply in self.product.replies():
+            answered = self._calls.pop(ticket, None)
+            if answered is not None:
+                answered(reply)
+        witness.pending = self.product.disk.full and bool(self._calls)
+        if witness.pending:
+            self.pose.placed()
+        for name, _ in self.active:
+            witness.troubles[name] = true_ns
+        self.reports.follows(true_ns, seen.followed_ns)
+        witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
+        witness.cut |= seen.link != "up"
+        for at_ns, line in seen.lines:
+            witness.line(at_ns + offset, line, self._fed_ns, seen.decided_ns + offset)
+            self.echo.line(at_ns + offset, witness.last)
+            if any(witness.last):
+                self.moved_ns = at_ns + offset
+        self.liveness.look(true_ns)
+        if seen.estimates:
+            lies, truth = {name for name, _ in self.active}, self.product.truth()
+            self.pose.see(true_ns, seen.estimates, truth, offset, lies)
+            witness.wheels(true_ns, truth[4])
+        self.pose.end_step()
+        if self.log is not None:
+            self.log(
+                {
+                    "at": seen.at_ns, "mode": seen.mode, "reason": seen.reason,
+                    "lines": [[at, line.decode("latin-1")] for at, line in seen.lines],
+                    "odometry": seen.estimates,
+                }
+            )  # fmt: skip

@@ -1,0 +1,116 @@
+"""What is known of each sender: its zeros, and how old a command may be by the true clock.
+
+The robot cannot see a true age: it compares delays by two clocks. `deploy/clients/README.md` says
+what it promises all the same, and this module allows exactly that: the timeout beyond the lowest
+delay that the robot has seen, for a foreign clock 1 s and 1 s a minute more, and for a sender that
+is new any delay that has looked constant for the time of a proof.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from tests.simulate.roads import FOREIGN, NS, Message, Sample
+
+MARGIN_NS = 30_000_000
+"""Allowed beside a time limit: two periods at the lowest rate of the plans and a line's way."""
+
+EARLY_NS = 60_000_000
+"""A delay that falls by more than this is a backlog that pours in."""
+
+
+class Wish:
+    """A command that arrived, and what the omniscient view thinks of it."""
+
+    __slots__ = ("armed_ns", "arrived_ns", "certain", "fresh", "identity", "shared", "v", "w")
+
+    def __init__(self, arrived_ns: int, v: float, w: float) -> None:
+        self.arrived_ns, self.v, self.w = arrived_ns, v, w
+        self.fresh = self.certain = self.shared = False
+        self.identity = ""
+        self.armed_ns = -1
+        """Arrival of the zero by which this sender is armed, -1 for none."""
+
+
+class Sender:
+    """Zeros and speeds of one identity on one source."""
+
+    def __init__(self) -> None:
+        self.zeros: list[int] = []
+        """Arrivals of the zeros that no speed has followed."""
+        self.armed_ns = -1
+
+
+class Clock:
+    """The true delays of one sender's messages, as far as the robot can have learned them."""
+
+    def __init__(self) -> None:
+        self.least_ns: int | None = None
+        self.recent: deque[tuple[int, int]] = deque()
+        self.stamp_ns = 0
+        self.loose = False
+        """It was adjusted or its sender paused: the pages promise nothing about its age."""
+
+
+class Ages:
+    """The clocks of all senders, as far as one daemon can have learned them."""
+
+    def __init__(self, born_ns: int) -> None:
+        self.learned_ns = born_ns
+        self.clocks: dict[str, Clock] = {}
+
+    def forget_least(self, at_ns: int) -> None:
+        """Note that the robot's own clock stood until now."""
+        self.learned_ns = at_ns
+        for clock in self.clocks.values():
+            clock.least_ns = None
+
+    def fresh(
+        self,
+        sender: dict[str, Any],
+        message: Message,
+        sample: Sample,
+        arrived_ns: int,
+        timeout_ns: int,
+        loose: bool,
+    ) -> bool:
+        """Return whether the pages allow the robot to obey this command, by its true age."""
+        if not sample.clock:
+            return True
+        age = arrived_ns - message.sent_ns
+        clock = self.clocks.setdefault(sample.clock, Clock())
+        clock.loose |= loose
+        foreign = sender["way"] in FOREIGN
+        if foreign and clock.stamp_ns and message.stamp_ns - clock.stamp_ns > 19 * NS // 10:
+            clock.loose = True
+        if foreign and sender["clock"]:
+            clock.loose = True
+        clock.stamp_ns = message.stamp_ns
+        least, recent = clock.least_ns, clock.recent
+        clock.least_ns = age if least is None else min(least, age)
+        while recent and recent[0][0] < arrived_ns - 3 * NS:
+            recent.popleft()
+        prompt: int = int(sender["delay"] * NS)
+        allowed = timeout_ns + EARLY_NS + MARGIN_NS
+        if foreign:
+            minutes = (arrived_ns - self.learned_ns) / NS / 60
+            allowed += int((1.0 + minutes) * NS)
+        if clock.loose or age <= prompt + allowed:
+            fresh = True
+        elif least is None or self._falls(recent, age, arrived_ns, min(timeout_ns, 2 * NS)):
+            fresh = False
+        else:
+            fresh = age <= least + allowed
+        recent.append((arrived_ns, age))
+        return fresh
+
+    def _falls(self, recent: deque[tuple[int, int]], age: int, now_ns: int, proof_ns: int) -> bool:
+        """Return whether the delays cannot have looked constant for the time of a proof."""
+        window = [(at, d) for at, d in recent if at >= now_ns - proof_ns - MARGIN_NS]
+        if not window or window[0][0] > now_ns - proof_ns + MARGIN_NS:
+            return recent[0][0] > now_ns - proof_ns if recent else True
+        middle = now_ns - proof_ns // 2
+        first = [d for at, d in window if at < middle]
+        second = [d for at, d in window if at >= middle] + [age]
+        return bool(first) and min(first) - min(second) > EARLY_NS

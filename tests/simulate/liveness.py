@@ -1,0 +1,163 @@
+"""The promises that something happens: a lawful sender drives, nothing is lost without a count.
+
+While a plan runs, a sender that keeps all rules and has the highest priority must move the robot,
+if nothing has happened for 3 s. At the end of each plan all faults end, an operator releases all
+latches, and a lawful sender drives.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from tests.simulate.product import START_NS, WALL_OFFSET_NS
+from tests.simulate.promises import BrokenError
+from tests.simulate.reports import judge_counts
+from tests.simulate.roads import NS, Message, Sample
+
+if TYPE_CHECKING:
+    from tests.simulate.actors import Run
+
+MOST_HELD = 2000
+"""Entries of the largest container of a daemon: a thousand clocks and as many numbers."""
+
+SETTLES_NS = 3 * NS
+"""After the last event a lawful sender drives within this time."""
+
+
+class Liveness:
+    """Watches one run for what ought to happen."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self._event_ns = 0
+        self._since: dict[str, int] = {}
+        """Since when each lawful sender has wished a speed without a pause."""
+        self._latest: dict[str, tuple[int, str]] = {}
+        self._lawful: set[str] | None = None
+
+    def event(self) -> None:
+        """Note that something happened beside commands."""
+        self._event_ns = self.run.true_ns
+
+    def command(self, sender: dict[str, Any], sample: Sample) -> None:
+        """Take note of a command of a lawful sender."""
+        if self._lawful is None:
+            self._lawful = {s["name"] for s in self.run.plan["senders"] if self._keeps_rules(s)}
+        name = sender["name"]
+        if name not in self._lawful:
+            return
+        wish = self.run.witness.wishes[-1][1]
+        if wish.armed_ns <= self._event_ns or not (wish.v or wish.w):
+            self._since.pop(name, None)
+        else:
+            self._since.setdefault(name, wish.arrived_ns)
+        self._latest[name] = wish.arrived_ns, sample.identity
+
+    def _keeps_rules(self, sender: dict[str, Any]) -> bool:
+        """Return whether this sender has a good network, a clock of its own and no rival."""
+        run = self.run
+        priority = run.witness.priority
+        rivals = [s for s in run.plan["senders"] if s["name"] != sender["name"]]
+        return (
+            sender["way"] in ("client", "page", "plain", "bridge")
+            and not any(sender[bad] for bad in ("junk", "churn", "loss", "twice", "swap"))
+            and not sender["congestion"]
+            and sender["jitter"] < 0.01
+            and sender["hz"] >= 10.0
+            and not any(rival["junk"] or rival["churn"] for rival in rivals)
+            and all(priority[r["source"]] < priority[sender["source"]] for r in rivals)
+        )
+
+    def look(self, now_ns: int) -> None:
+        """Have a lawful sender drive if it has wished so for long enough."""
+        run = self.run
+        if not self._since or run.active != run.lasting or run.witness.held is not None:
+            return
+        for name, since_ns in self._since.items():
+            heard_ns, identity = self._latest[name]
+            quiet = now_ns - self._event_ns > SETTLES_NS
+            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < NS // 10:
+                run.counts["lawful looks"] += 1
+                if now_ns - run.moved_ns > NS // 2:
+                    text = f"{identity} since {since_ns / NS:.3f} s; {run.witness.reason}"
+                    raise BrokenError("a lawful sender drives", now_ns, text)
+
+    def end(self) -> None:
+        """End all faults, release all latches and have a lawful sender drive."""
+        run = self.run
+        run.epilogue = True
+        product, end_ns = run.product, run.true_ns
+        if not product.alive:
+            run.run_to(max(at for at, _, _ in run.todo) if run.todo else end_ns)
+        run.run_to(run.true_ns + NS // 2)
+        if not product.plugged:
+            run.plug(False)
+        product.disk.fill(False)
+        judge_counts(run.true_ns, product.state(), run.witness.delivered - product.dropped)
+        size, kind = product.largest()
+        run.counts["largest container"] = max(run.counts["largest container"], size)
+        if size > MOST_HELD:
+            raise BrokenError("memory is bounded", run.true_ns, f"a {kind} of {size} entries")
+        run.run_to(run.true_ns + int((2.5 + run.plan["config"]["sim"].get("boot_time", 0)) * NS))
+        for _ in range(3):
+            verbs = {"fault": "clear", "stopped": "clear", "inactive": "activate"}
+            verb = verbs.get(product.state()["mode"])
+            if verb:
+                run.call({"verb": verb, "named": True, "by": "op", "via": "native",
+                            "late": 0.0, "lost": False, "twice": False})  # fmt: skip
+            run.run_to(run.true_ns + NS // 10)
+        self._drive_lawfully()
+
+    def _drive_lawfully(self) -> None:
+        run = self.run
+        plan, begin_ns = run.plan, run.true_ns
+        source = plan["config"]["commands"]["sources"][0]["name"]
+        sender = {
+            "name": "lawful", "id": "lawful/1", "way": "client", "source": source, "wheels": False,
+            "form": "json", "ahead": 0.0, "drift": 0.0, "clock": [], "churn": False, "delay": 0.002,
+        }  # fmt: skip
+        own = [
+            one
+            for one in plan["senders"]
+            if one["way"] in ("client", "page")
+            and not (one["churn"] or one["junk"] or one["id"] in run.witness.shared_clocks)
+        ]
+        number = 10**6
+        if plan["lawful"] != "a new client" and own:
+            sender = own[0]
+        zeros_s = run.witness.pause_ns / NS + 1.0
+        speed = 0.5 * run.witness.limits["linear_speed"]
+        turn = 0.25 * run.witness.limits["angular_speed"]
+        end_ns = begin_ns + int((zeros_s + 3.0) * NS)
+        while run.true_ns < end_ns:
+            zero = run.true_ns - begin_ns < zeros_s * NS
+            now_ns = run.true_ns
+            t = now_ns / NS
+            number += 1
+            v, w = (0.0, 0.0) if zero else (speed, turn)
+            stamp_ns = (
+                START_NS + WALL_OFFSET_NS + int((t + sender["ahead"] + sender["drift"] * t) * NS)
+            )
+            delay_ns = int(sender["delay"] * NS)
+            message = Message(now_ns, now_ns + delay_ns, v, w, stamp_ns, number, "")
+            run.at(now_ns + delay_ns, lambda m=message: run.deliver(sender, m))  # type: ignore[misc]
+            run.run_to(now_ns + 50_000_000)
+        mode, reason = run.witness.mode, run.witness.reason
+        moving = run.true_ns - run.moved_ns < NS // 5
+        if mode != "driving" or not moving:
+            raise BrokenError("a lawful sender drives", run.true_ns, f"{mode}: {reason}")
+        self._check_course(speed, turn)
+        run.counts["lawful drives"] += 1
+        run.run_to(run.true_ns + NS)
+
+    def _check_course(self, speed: float, turn: float) -> None:
+        """The robot drives as it was told, or slower on the same curve."""
+        run = self.run
+        witness, limits = run.witness, run.witness.limits
+        takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
+        if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
+            return
+        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
+        room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
+        if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
+            raise BrokenError("the robot drives as told", run.true_ns, f"{got} for {told}")

@@ -1,0 +1,210 @@
+"""Plays the same plans on two checkouts and compares all that comes out, bit by bit.
+
+Each side is a process of its own with its own `acsard`. The other side brings its own virtual
+world and its own `product.py` where it has them, since both follow the layout of the product. A
+side answers a plan with a hash of each simulated second; the first second that differs is played
+again and shown step by step.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from tests.simulate.differences import DEFAULTS, DIFFERENCES, LEFT_OUT
+from tests.simulate.plan import Plan, made
+
+OURS = Path(__file__).parents[2]
+
+BOOT = """
+import importlib.util, sys
+tree, ours = sys.argv[1:3]
+sys.path.insert(0, tree)
+import acsard
+sys.path[0] = ours
+import tests, tests.scenarios, tests.simulate
+from pathlib import Path
+if (Path(tree) / "tests/scenarios/world.py").exists():
+    tests.scenarios.__path__[:] = [str(Path(tree) / "tests/scenarios")]
+product = Path(tree) / "tests/simulate/product.py"
+if product.exists():
+    spec = importlib.util.spec_from_file_location("tests.simulate.product", product)
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+from tests.simulate.pairs import serve
+serve(Path(acsard.__file__))
+"""
+"""What the process of one side runs. `tree` is a checkout or where a wheel was installed."""
+
+Step = dict[str, Any]
+
+
+def serve(where: Path) -> None:
+    """Answer plans on the standard input until it ends."""
+    from tests.simulate.actors import played
+
+    print(json.dumps(str(where)), flush=True)
+    for line in sys.stdin:
+        asked = json.loads(line)
+        trace = Trace(asked.get("second"))
+        result = played(asked["plan"], trace.step)
+        answer = {
+            "hashes": trace.hashes, "steps": trace.steps, "finding": result.finding,
+            "simulated_s": result.simulated_s,
+        }  # fmt: skip
+        print(json.dumps(answer), flush=True)
+
+
+class Trace:
+    """A hash of each second of a run, and the steps of one second as text."""
+
+    def __init__(self, second: int | None = None) -> None:
+        self.hashes: list[str] = []
+        self.steps: list[Step] = []
+        self._second, self._hash = second, hashlib.sha256()
+
+    def step(self, step: Step) -> None:
+        """Take what a step showed."""
+        step = rewritten(step)
+        second = step["at"] // 10**9
+        self._hash.update(json.dumps(step).encode())
+        while len(self.hashes) <= second:
+            self.hashes.append("")
+        # The hash goes on from second to second, so equal ends mean equal runs.
+        self.hashes[second] = self._hash.hexdigest()[:16]
+        if second == self._second:
+            self.steps.append(step)
+
+
+def rewritten(step: Step, differences: tuple[tuple[str, str, str, str], ...] = DIFFERENCES) -> Step:
+    """Return a step with the deliberate differences taken out."""
+    changed = dict(step)
+    for field, pattern, replacement, _ in differences:
+        value = changed[field]
+        text = value if isinstance(value, str) else json.dumps(value)
+        changed[field] = re.sub(pattern, replacement, text)
+    return changed
+
+
+def comparable(plan: Plan, left_out: tuple[tuple[str, object, str], ...] = LEFT_OUT) -> Plan:
+    """Return a plan without the events and settings by which the sides are meant to differ."""
+    events = plan["events"]
+    for field, value, _ in left_out:
+        events = [event for event in events if event.get(field) != value]
+    config = {
+        table: {
+            key: value
+            for key, value in keys.items()
+            if all((table, key) != default[:2] for default in DEFAULTS)
+        }
+        for table, keys in plan["config"].items()
+    }
+    return plan | {"events": events, "config": config}
+
+
+class Side:
+    """The process that plays plans on one checkout."""
+
+    def __init__(self, tree: Path) -> None:
+        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", BOOT, str(tree.resolve()), str(OURS)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=OURS,
+        )  # fmt: skip
+        self.package = Path(self._read())
+        if tree.resolve() not in self.package.parents:
+            self.close()
+            raise SystemExit(f"{tree} has no acsard: {self.package} was imported")
+
+    def play(self, plan: Plan, second: int | None = None) -> dict[str, Any]:
+        """Return the hashes of a plan, and the steps of one second."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"plan": plan, "second": second}) + "\n")
+        self._process.stdin.flush()
+        answer: dict[str, Any] = self._read()
+        return answer
+
+    def _read(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise SystemExit("a side of the pair ended; its error is above")
+        return json.loads(line)
+
+    def close(self) -> None:
+        """End the process."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(10)
+
+
+class Pair:
+    """Two sides that play the same plans."""
+
+    def __init__(self, ours: Path, other: Path) -> None:
+        self.sides = Side(ours), Side(other)
+
+    def differs(self, plan: Plan) -> tuple[str, float]:
+        """Return the first difference in words, "" for none, and the simulated s."""
+        with ThreadPoolExecutor(2) as pool:
+            a, b = pool.map(lambda side: side.play(plan), self.sides)
+        if a["hashes"] == b["hashes"] and a["finding"] == b["finding"]:
+            return "", a["simulated_s"]
+        both = zip(a["hashes"], b["hashes"], strict=False)
+        second = next((n for n, (x, y) in enumerate(both) if x != y), None)
+        if second is None:
+            return f"ends differ: {a['finding']!r} and {b['finding']!r}", a["simulated_s"]
+        steps = [side.play(plan, second)["steps"] for side in self.sides]
+        return first_difference(*steps), a["simulated_s"]
+
+    def close(self) -> None:
+        """End both processes."""
+        for side in self.sides:
+            side.close()
+
+
+def first_difference(ours: list[Step], theirs: list[Step]) -> str:
+    """Return the first field that differs in these steps, in words."""
+    for a, b in zip(ours, theirs, strict=False):
+        for field in a:
+            if a[field] != b[field]:
+                at = f"robot time {a['at'] / 1e9:.6f} s"
+                return f"{at}, {field}: here {a[field]!r}, there {b[field]!r}"
+    return f"one has {len(ours)} steps in this second, the other {len(theirs)}"
+
+
+def compare(
+    tree: Path, seed: int, seconds: float, workers: int, show: Callable[[str], None] = print
+) -> int:
+    """Compare this checkout with another one for so many s; return 1 if they differ."""
+    began, differing, runs, total = time.perf_counter(), 0, 0, 0.0
+    pairs = [Pair(OURS, tree) for _ in range(max(1, workers // 2))]
+    try:
+        with ThreadPoolExecutor(len(pairs)) as pool:
+            while total < seconds:
+                plans = [comparable(made(seed + runs + n)) for n in range(len(pairs))]
+                found = pool.map(lambda pair, plan: pair.differs(plan), pairs, plans)
+                for plan, (difference, simulated_s) in zip(plans, found, strict=True):
+                    runs += 1
+                    total += simulated_s
+                    if difference:
+                        differing += 1
+                        show(f"seed {plan['seed']}: {difference}")
+    finally:
+        for pair in pairs:
+            pair.close()
+    show(
+        f"{runs} pairs from seed {seed}, {total / 3600:.2f} h simulated on both sides in "
+        f"{time.perf_counter() - began:.0f} s, {differing} differ; "
+        f"{len(DIFFERENCES + LEFT_OUT + DEFAULTS)} deliberate differences are listed"
+    )
+    return min(1, differing)

@@ -1,0 +1,390 @@
+"""From a seed to a plan: what the robot, its board, senders, operators and host will do.
+
+A plan is plain data, so that `shrink.py` can drop parts of it and `corpus/` can keep it. Times are
+in s from the start, by the true clock. Swarm testing (Groce and others, 2012): each run switches a
+random part of the kinds of trouble off, because one kind of trouble often hides another one.
+"""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from tests.simulate.product import problems
+
+Plan = dict[str, Any]
+
+KINDS = (
+    "silent board", "damaged lines", "lying board", "slow board", "resets", "unplugging",
+    "blocked output", "stalls", "suspends", "clock steps", "restarts", "full disk",
+    "stops", "activation", "settings", "poses", "lost calls",
+    "congestion", "loss", "disorder", "sender clocks", "hostile senders", "shared identities",
+    "pushes", "odd configuration",
+)  # fmt: skip
+"""The kinds of trouble that a run may have."""
+
+WAYS = (
+    "client",
+    "client",
+    "page",
+    "signed",
+    "rmw",
+    "header",
+    "zenoh",
+    "plain",
+    "bridge",
+    "bridged",
+)
+SOURCES = ("teleop", "app", "ros2_control", "nav")
+
+LIES = (
+    "stuck_encoder", "frozen_encoder", "dead_motor", "reversed_motor", "reversed_encoder",
+    "bias", "swapped_motors", "swapped_encoders", "late_watchdog", "no_watchdog",
+)  # fmt: skip
+
+
+def made(seed: int, seconds: float | None = None) -> Plan:
+    """Return the plan of this seed."""
+    dice = random.Random(f"plan {seed}")
+    share = dice.choice((0.15, 0.4, 0.6))
+    kinds = sorted(kind for kind in KINDS if dice.random() < share)
+    length = seconds or round(dice.choice((60, 120, 180, 300)) * dice.uniform(0.8, 1.2), 1)
+    while True:
+        config, extras = _config(dice, "odd configuration" in kinds)
+        if not problems(config):
+            break
+    plan: Plan = {
+        "seed": seed,
+        "seconds": length,
+        "kinds": kinds,
+        "config": config,
+        "senders": [
+            _sender(dice, n, kinds, length) for n in range(dice.choice((1, 1, 1, 2, 3, 6)))
+        ],
+        "events": [],
+        "lawful": dice.choice(("a new client", "a sender of the plan")),
+        **extras,
+    }
+    if "shared identities" in kinds:
+        for sender in plan["senders"][1:]:
+            if dice.random() < 0.5:
+                first = plan["senders"][0]
+                sender.update(id=first["id"], way=first["way"], source=first["source"])
+    plan["events"] = sorted(_events(dice, kinds, length, config), key=lambda one: one["at"])
+    return plan
+
+
+def _config(dice: random.Random, odd: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A configuration as tables of `acsard.toml`, and the lasting nature of the board."""
+    linear, angular = round(dice.uniform(0.2, 2.0), 2), round(dice.uniform(0.5, 6.0), 2)
+    slow = round(max(linear / 5, dice.choice((0.5, 1.0, 3.0))) + 0.001, 3)
+    slow_turn = round(max(angular / 5, dice.choice((2.0, 4.0, 9.0))) + 0.001, 3)
+    config: dict[str, Any] = {
+        "mcu": {"port": "/dev/board"},
+        "control": {"rate": 100.0},
+        "limits": {
+            "linear_speed": linear,
+            "angular_speed": angular,
+            "linear_acceleration": round(dice.uniform(0.3, 4.0), 2),
+            "angular_acceleration": round(dice.uniform(1.0, 12.0), 2),
+            "linear_deceleration": slow,
+            "angular_deceleration": slow_turn,
+            "linear_stop_deceleration": round(max(slow, linear / 2) * dice.uniform(1.01, 3.0), 3),
+            "angular_stop_deceleration": round(
+                max(slow_turn, angular / 2) * dice.uniform(1.01, 3.0), 3
+            ),
+            "wheel_speed": round(dice.uniform(10.0, 40.0), 2),
+        },
+        "sim": {"motor_time_constant": round(dice.uniform(0.02, 0.12), 3), "seed": 1},
+        "commands": {
+            "sources": [
+                {"name": name, "priority": priority, "timeout": dice.choice((0.25, 0.25, 0.5))}
+                for name, priority in zip(SOURCES, (100, 50, 20, 10), strict=True)
+            ]
+        },
+    }
+    extras: dict[str, Any] = {"board": []}
+    if odd:
+        _make_odd(dice, config, extras)
+    return config, extras
+
+
+def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any]) -> None:
+    mcu, sim, limits = config["mcu"], config["sim"], config["limits"]
+    config["control"]["rate"] = dice.choice((20.0, 50.0, 100.0, 100.0, 150.0))
+    config["control"]["auto_activate"] = dice.random() < 0.9
+    config["drive"] = {
+        "wheel_radius": round(dice.uniform(0.04, 0.15), 3),
+        "wheel_separation": round(dice.uniform(0.2, 0.8), 3),
+    }
+    if dice.random() < 0.3:
+        limits["linear_jerk"] = round(dice.uniform(1.0, 20.0), 1)
+        limits["angular_jerk"] = round(dice.uniform(5.0, 80.0), 1)
+    letters, signs = dice.sample("abcd", 4), [dice.choice("+-") for _ in range(4)]
+    wheels = ("front_right", "front_left", "rear_left", "rear_right")
+    mcu["wheels"] = {w: s + m for w, s, m in zip(wheels, signs, letters, strict=True)}
+    sim["encoder_counts"] = counts = dice.choice((96, 400, 1024, 3200))
+    sim["boot_time"] = dice.choice((0.0, 0.0, 0.5, 2.0))
+    match dice.randrange(6):
+        case 0:
+            mcu["link_check"] = "auto"
+        case 1:
+            mcu.update(link_check="require", encoder_counts=counts)
+        case 2:
+            mcu.update(link_check="auto", encoder_counts=counts)
+        case 3:
+            mcu["trailing_comma"] = True
+            extras["board"] = [["comma_latched"], ["trailing_comma"]]
+        case 4:
+            mcu["reply_period"] = 0.1
+            extras["board"] = [["unprompted", 0.1]]
+    commands = config["commands"]
+    commands["neutral_first"] = dice.random() < 0.85
+    commands["pause"] = dice.choice((0.5, 1.0, 2.0))
+    names = [*SOURCES, "twin"]
+    commands["sources"] = [
+        {
+            "name": name,
+            "priority": dice.choice((10, 50, 50, 100)),
+            "timeout": dice.choice((0.15, 0.25, 0.5, 1.0, 3.0)),
+        }
+        for name in names
+    ]
+    if dice.random() < 0.3:
+        config["odometry"] = {"gyro": True}
+        sim.update(gyro_bias=0.01, gyro_noise=0.005, gyro_delay=0.01)
+    elif dice.random() < 0.4:
+        sim["motor_time_constant"] = round(dice.uniform(0.2, 0.4), 3)
+
+
+def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:
+    """A sender's habit: from each time on a speed and a turn rate, or None for silence."""
+    habit = dice.choice(("stop and go",) * 4 + ("never neutral", "pauses", "pauses", "wild"))
+    phases: list[list[Any]] = []
+    t = 0.0 if habit == "never neutral" else dice.uniform(0.0, 3.0)
+    while t < seconds:
+        speed = dice.choice((-1, 1)) * dice.uniform(0.05, 1.2)
+        turn = dice.choice((0.0, dice.uniform(-3.0, 3.0)))
+        if dice.random() < 0.1:
+            speed, turn = speed * 20, turn * 20
+        match habit:
+            case "never neutral":
+                phases.append([round(t, 3), speed, turn])
+                t += dice.uniform(2.0, 20.0)
+                continue
+            case "wild":
+                phases.append([round(t, 3), speed, turn])
+                t += dice.uniform(0.05, 0.5)
+                if dice.random() < 0.1:
+                    phases.append([round(t, 3), 0.0, 0.0])
+                    t += dice.uniform(0.5, 3.0)
+                continue
+        phases.append([round(t, 3), 0.0, 0.0])
+        t += dice.choice((0.2, 0.6, 1.3, 2.5))
+        phases.append([round(t, 3), speed, turn])
+        t += dice.uniform(0.5, 10.0)
+        if habit == "pauses" or dice.random() < 0.2:
+            phases.append([round(t, 3), None, None])
+            t += dice.choice((0.15, 0.4, 2.2, 10.0))
+            if habit == "pauses" and dice.random() < 0.5:
+                phases.append([round(t, 3), speed, turn])
+                t += dice.uniform(0.5, 5.0)
+    return [[at, None if v is None else round(v, 3), None if w is None else round(w, 3)]
+            for at, v, w in phases]  # fmt: skip
+
+
+def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> dict[str, Any]:
+    way = dice.choice(WAYS)
+    begin = round(dice.choice((0.0, 0.0, dice.uniform(0.0, seconds / 2))), 3)
+    sender: dict[str, Any] = {
+        "name": f"s{n}",
+        "id": f"s{n}/{dice.getrandbits(64):016x}",
+        "way": way,
+        "source": "teleop" if way == "page" else dice.choice(SOURCES),
+        "wheels": way in ("client", "signed", "plain", "rmw") and dice.random() < 0.2,
+        "form": dice.choice(("json", "msgpack", "cdr")),
+        "hz": dice.choice((5.0, 10.0, 20.0, 20.0, 50.0)),
+        "from": begin,
+        "to": round(dice.choice((seconds, seconds, dice.uniform(begin, seconds))), 3),
+        "ahead": round(dice.choice((0.0, dice.uniform(-0.4, 0.4), dice.uniform(-1e5, 1e5))), 3),
+        "drift": dice.choice((0.0, 1e-5, -1e-4)),
+        "delay": dice.choice((0.001, 0.005, 0.03)),
+        "jitter": dice.choice((0.0, 0.0, 0.002, 0.02)),
+        "phases": _phases(dice, seconds),
+        "congestion": [],
+        "clock": [],
+        "junk": 0.0,
+        "churn": False,
+        "loss": 0.0,
+        "twice": 0.0,
+        "swap": 0.0,
+    }
+    if "loss" in kinds:
+        sender["loss"] = dice.choice((0.0, 0.02, 0.2))
+    if "disorder" in kinds:
+        sender["twice"], sender["swap"] = dice.choice((0.0, 0.05)), dice.choice((0.0, 0.05))
+    if "hostile senders" in kinds and dice.random() < 0.4:
+        sender["junk"] = dice.choice((0.02, 0.3))
+        sender["churn"] = dice.random() < 0.3 and way in ("client", "signed", "rmw")
+        if dice.random() < 0.2:
+            sender["hz"] = 400.0
+    if "congestion" in kinds:
+        t = dice.uniform(0.0, 20.0)
+        while t < seconds:
+            length = dice.choice((dice.uniform(0.5, 5.0), dice.uniform(5.0, 25.0)))
+            shape = dice.choice(("grow", "jump", "hole", "drain", "burst"))
+            size = {
+                "grow": dice.choice((0.01, 0.03, 0.08, 0.5)),
+                "jump": dice.choice((0.3, 0.6, 1.0, 3.0, 8.0)),
+                "hole": 0.0,
+                "drain": dice.uniform(1.2, 6.0),
+                "burst": dice.choice((0.1, 0.3, 1.0)),
+            }[shape]
+            sender["congestion"].append([round(t, 3), round(t + length, 3), shape, round(size, 3)])
+            t += length + dice.uniform(1.0, 15.0)
+    if "sender clocks" in kinds and way not in ("client", "page"):
+        t = dice.uniform(2.0, 30.0)
+        while t < seconds:
+            if dice.random() < 0.5:
+                sender["clock"].append(["step", round(t, 3), round(dice.uniform(-3.0, 3.0), 3)])
+            else:
+                rate = dice.choice((-0.08, -0.0005, 0.0005, 0.08))
+                sender["clock"].append(["slew", round(t, 3), round(t + 20.0, 3), rate])
+            t += dice.uniform(5.0, 60.0)
+    return sender
+
+
+def _events(
+    dice: random.Random, kinds: list[str], seconds: float, config: dict[str, Any]
+) -> list[dict[str, Any]]:
+    events: list[dict[str, Any]] = []
+
+    def add(kind: str, every: float) -> list[float]:
+        """Return times for events of this kind, about one in `every` s."""
+        if kind not in kinds:
+            return []
+        count = dice.randrange(1, max(2, int(2 * seconds / every)))
+        return [round(dice.uniform(1.0, seconds), 3) for _ in range(count)]
+
+    def board(at: float, length: float, *fault: Any) -> None:
+        events.append({"at": at, "do": "board", "for": round(length, 3), "fault": list(fault)})
+
+    def once(at: float, do: str, **more: Any) -> None:
+        events.append({"at": at, "do": do, **more})
+
+    for at in add("silent board", 40):
+        board(at, dice.choice((0.05, 0.2, 0.5, 0.95, 1.3, 4.0)), "mute")
+    for at in add("damaged lines", 40):
+        kind = dice.choice(
+            ("noise", "partial_line", "lost_replies", "lost_commands", "bit_errors", "echo")
+        )
+        board(
+            at,
+            dice.uniform(0.2, 10.0),
+            kind,
+            *([dice.choice((3, 7, 50))] if kind.startswith("lost") or kind == "bit_errors" else []),
+        )
+    for at in add("lying board", 60):
+        kind = dice.choice(LIES)
+        first, second = dice.sample(range(4), 2)
+        more: list[Any] = (
+            [first] if kind.split("_")[0] in ("stuck", "frozen", "dead", "reversed") else []
+        )
+        if kind == "bias":
+            more = [first, dice.choice((-1.0, 0.5, 3.0, 9.0))]
+        elif kind.startswith("swapped"):
+            more = [first, second]
+        board(at, dice.uniform(0.5, 8.0), kind, *more)
+    for at in add("slow board", 40):
+        kind, *values = dice.choice(
+            (("slow_reply", 0.03), ("ftdi", 0.016), ("stalls", 1.0, 0.15), ("sparse_replies", 0.05))
+        )
+        board(at, dice.uniform(1.0, 20.0), kind, *values)
+    for at in add("pushes", 40):
+        board(at, dice.uniform(0.2, 4.0), "pushed", round(dice.uniform(-1.0, 1.0), 2))
+    for at in add("resets", 60):
+        once(at, "reset", deaf=dice.choice((0.3, 1.0, 2.0)))
+    for at in add("unplugging", 60):
+        once(at, "unplug", **{"for": round(dice.uniform(0.05, 5.0), 3)}, new=dice.random() < 0.4)
+    for at in add("blocked output", 40):
+        if dice.random() < 0.5:
+            once(at, "block", **{"for": dice.choice((0.02, 0.2, 0.6, 2.0))})
+        else:
+            once(at, "tear", taken=dice.randrange(40))
+    for at in add("stalls", 30):
+        once(
+            at,
+            dice.choice(("stall", "stall in step")),
+            **{"for": dice.choice((0.015, 0.06, 0.2, 0.4, 1.5))},
+        )
+    for at in add("suspends", 90):
+        once(
+            at,
+            "suspend",
+            **{"for": round(dice.choice((0.5, 5.0, 60.0, 3600.0)) * dice.uniform(0.5, 1.0), 3)},
+        )
+    for at in add("clock steps", 40):
+        once(at, "wall", by=round(dice.choice((0.3, 3.0, 1e5)) * dice.uniform(-1.0, 1.0), 3))
+    for at in add("restarts", 60):
+        once(
+            at,
+            "restart",
+            way=dice.choice(("kill", "term")),
+            **{"for": round(dice.uniform(0.2, 3.0), 3)},
+        )
+    for at in add("full disk", 60):
+        once(at, "disk", **{"for": round(dice.uniform(1.0, 30.0), 3)})
+
+    def call(at: float, verb: str, **more: Any) -> None:
+        lossy = "lost calls" in kinds
+        late = dice.choice((0.01, 0.01, 0.3, 1.5, 6.0, 15.0)) if lossy else 0.01
+        events.append({
+            "at": at, "do": "call", "verb": verb, "late": late,
+            "lost": lossy and dice.random() < 0.2, "twice": lossy and dice.random() < 0.2,
+            "by": f"op{dice.randrange(3)}",
+            "via": dice.choice(("native", "native", "rmw", "bridge")),
+            **more,
+        })  # fmt: skip
+
+    for at in add("stops", 15):
+        call(at, "stop", put=dice.random() < 0.5)
+        for _ in range(dice.randrange(4)):
+            after = round(at + dice.choice((0.0, 0.05, 1.0, 3.0)) + dice.uniform(0.0, 2.0), 3)
+            call(after, "clear", named=dice.random() < 0.7)
+    if "stops" not in kinds and "lying board" in kinds:
+        for at in [round(dice.uniform(1.0, seconds), 3) for _ in range(int(seconds / 10))]:
+            call(at, "clear", named=True)
+    for at in add("activation", 20):
+        call(at, "deactivate")
+        for _ in range(dice.randrange(1, 3)):
+            after = round(at + dice.choice((0.0, 2.5)) + dice.uniform(0.0, 2.0), 3)
+            call(after, "activate", named=dice.random() < 0.7)
+    for at in add("poses", 40):
+        if dice.random() < 0.5:
+            call(at, "reset_odometry")
+        else:
+            call(
+                at,
+                "set_pose",
+                pose=[
+                    round(dice.uniform(-9, 9), 2),
+                    round(dice.uniform(-9, 9), 2),
+                    round(dice.uniform(-3, 3), 2),
+                ],
+            )
+    for at in add("settings", 20):
+        call(at, "set", settings=_settings(dice, config), via="native")
+    return events
+
+
+def _settings(dice: random.Random, config: dict[str, Any]) -> dict[str, float]:
+    """Settings to change, legal or not: the daemon has to know."""
+    limits, found = config["limits"], {}
+    for name in dice.sample(sorted(limits), dice.randrange(1, 3)):
+        found[f"limits.{name}"] = round(limits[name] * dice.choice((0.1, 0.5, 0.8, 1.3, 3.0)), 3)
+    if dice.random() < 0.2:
+        source = dice.choice(config["commands"]["sources"])["name"]
+        found[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 1.0))
+    if dice.random() < 0.1:
+        found["commands.pause"] = dice.choice((0.5, 1.0, 3.0))
+    return found

@@ -1,0 +1,171 @@
+"""Plants faults in copies of the product, and measures how long the simulator needs to find each.
+
+    python -m tests.simulate.planted [--jobs 2] [--only NAME]
+
+Each fault is planted alone into a copy of this tree. One process plays seeds there until a promise
+breaks or the time is over. A finding counts only if the same seed breaks no promise on this tree.
+`PLANTED.md` keeps the results; a run replaces the rows that it has played.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Lock
+from typing import NamedTuple
+
+from tests.simulate.actors import played
+from tests.simulate.plan import made
+from tests.simulate.planted_cases import CASES
+from tests.simulate.planted_faults import FAULTS, Fault
+
+ROOT = Path(__file__).parents[2]
+TABLE = Path(__file__).with_name("PLANTED.md")
+
+FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
+"""Core-minutes within which a fault and a case must be found."""
+
+FIRST_SEED = 1
+
+CHILD = """
+import json, sys
+from tests.simulate.actors import played
+from tests.simulate.plan import made
+seed, left = int(sys.argv[1]), float(sys.argv[2])
+while left > 0.0:
+    result = played(made(seed))
+    left -= result.cpu_s
+    answer = seed, result.promise, result.finding, result.cpu_s, result.simulated_s
+    print(json.dumps(answer), flush=True)
+    seed += 1
+"""
+
+
+class Row(NamedTuple):
+    """A line of the table: texts as they are shown."""
+
+    name: str
+    breaks: str
+    promise: str
+    seed: str
+    minutes: str
+
+
+def plant(fault: Fault, tree: Path) -> None:
+    """Write a copy of the product and of the simulator with this fault into `tree`."""
+    ignored = shutil.ignore_patterns("__pycache__", "page", "*.md")
+    shutil.copytree(ROOT / "acsard", tree / "acsard", ignore=ignored)
+    shutil.copytree(ROOT / "tests" / "simulate", tree / "tests" / "simulate", ignore=ignored)
+    (tree / "tests" / "scenarios").mkdir()
+    for name in ("__init__.py", "scenarios/__init__.py", "scenarios/world.py"):
+        shutil.copy(ROOT / "tests" / name, tree / "tests" / name)
+    for module, text in edited(fault).items():
+        (tree / "acsard" / module).write_text(text, encoding="utf-8")
+
+
+def edited(fault: Fault) -> dict[str, str]:
+    """Return the source of each module with the fault in it.
+
+    Raises:
+        ValueError: The product was changed, and an edit does not fit exactly once any more.
+    """
+    texts: dict[str, str] = {}
+    for module, old, new in fault.edits:
+        text = texts.get(module) or (ROOT / "acsard" / module).read_text(encoding="utf-8")
+        if text.count(old) != 1:
+            raise ValueError(f"{fault.name}: {module} has {text.count(old)} times {old!r}")
+        texts[module] = text.replace(old, new)
+    return texts
+
+
+def hunt(fault: Fault, minutes: float) -> Row:
+    """Plant the fault and play until it is found or the time is over."""
+    with tempfile.TemporaryDirectory() as name:
+        plant(fault, Path(name))
+        environment = os.environ | {"PYTHONPATH": name, "PYTHONDONTWRITEBYTECODE": "1"}
+        child = subprocess.Popen(
+            [sys.executable, "-c", CHILD, str(FIRST_SEED), str(60 * minutes)],
+            stdout=subprocess.PIPE, text=True, cwd=name, env=environment,
+        )  # fmt: skip
+        assert child.stdout is not None
+        cpu_s = 0.0
+        try:
+            for line in child.stdout:
+                seed, promise, _, took_s, _ = json.loads(line)
+                cpu_s += took_s
+                if promise and not played(made(seed)).finding:
+                    return Row(fault.name, fault.breaks, promise, str(seed), f"{cpu_s / 60:.2f}")
+        finally:
+            child.kill()
+            code = child.wait()
+    if code > 0:
+        raise SystemExit(f"{fault.name}: the process that plays ended with {code}")
+    return Row(fault.name, fault.breaks, "not found", "", f"{cpu_s / 60:.2f}")
+
+
+HEAD = """# Planted faults
+
+`python -m tests.simulate.planted` writes this page. Each fault is planted alone into a copy of the
+product, and the simulator plays seeds from {seed} on until a promise breaks. A seed that also
+breaks a promise of the sound product does not count. Core-minutes are the processor time of the
+process that plays, on a machine that other work kept busy.
+
+A fault must be found within {fault:g} core-minutes, a case within {case:g}.
+"""
+
+COLUMNS = "\n| name | what it breaks | the promise that found it | seed | core-minutes |\n"
+
+
+def read() -> dict[str, Row]:
+    """Return the rows of the table as it is."""
+    if not TABLE.exists():
+        return {}
+    lines = re.findall(r"^\| (.+) \|$", TABLE.read_text(encoding="utf-8"), re.MULTILINE)
+    rows = [line.split(" | ") for line in lines]
+    return {row[0]: Row(*row) for row in rows if len(row) == len(Row._fields)}
+
+
+def write(rows: dict[str, Row]) -> None:
+    """Write the table in the order of the lists."""
+    text = HEAD.format(seed=FIRST_SEED, fault=FAULT_MINUTES, case=CASE_MINUTES)
+    for title, faults in (("Faults", FAULTS), ("Cases that were once true", CASES)):
+        known = [rows[fault.name] for fault in faults if fault.name in rows]
+        text += f"\n## {title}\n{COLUMNS}|---|---|---|---|---|\n"
+        text += "".join("| " + " | ".join(row) + " |\n" for row in known)
+    TABLE.write_text(text, encoding="utf-8")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser("tests.simulate.planted")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", metavar="NAME", help="faults whose name begins so")
+    parser.add_argument("--minutes", type=float, help="core-minutes for each, instead of its own")
+    options = parser.parse_args()
+    chosen = [f for f in (*FAULTS, *CASES) if f.name.startswith(options.only or "")]
+    lock, lost = Lock(), 0
+
+    def one(fault: Fault) -> None:
+        nonlocal lost
+        limit = options.minutes or (CASE_MINUTES if fault in CASES else FAULT_MINUTES)
+        row = hunt(fault, limit)
+        with lock:
+            lost += not row.seed
+            write(read() | {row.name: row})
+            print(f"{row.name}: {row.promise}, seed {row.seed}, {row.minutes} core-min", flush=True)
+
+    with ThreadPoolExecutor(options.jobs) as pool:
+        list(pool.map(one, chosen))
+    print(f"{len(chosen) - lost} of {len(chosen)} found")
+    return min(1, lost)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

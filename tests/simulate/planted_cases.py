@@ -1,0 +1,109 @@
+"""Eleven ways in which the robot once moved, or did not stop, planted back for `planted.py`.
+
+Reviewers found them by hand in the virtual world, one afternoon. Each edit brings back what the
+code did then, or the part of it that mattered.
+"""
+
+from __future__ import annotations
+
+from tests.simulate.planted_faults import (
+    FRESHNESS,
+    GUARD,
+    LIFECYCLE,
+    LIMITS,
+    NEUTRAL,
+    ROBOT,
+    SANITY,
+    SESSION,
+    VALUES,
+    Edit,
+    fault,
+)
+
+CASES = (
+    fault(
+        "case 1",
+        "a restart releases a stop, a fault and `inactive`, and lowered limits jump back",
+        VALUES,
+        "return Latches(stop, fault, inactive, self.lowered)",
+        "return Latches()",
+    ),
+    fault(
+        "case 2",
+        "the first zero of a shared sender arms it",
+        NEUTRAL,
+        "elif now_ns >= since_ns and not command.shared:",
+        "elif now_ns >= since_ns:",
+    ),
+    fault(
+        "case 3",
+        "a congested link is taken for a clock that was adjusted",
+        FRESHNESS,
+        "if command.steady and self._later_than_lowest(delay, silence) > timeout_ns:",
+        "if False:",
+        Edit(FRESHNESS, "        if steady:  #", "        if False:  #"),
+        Edit(FRESHNESS, "if hidden > self._budget and not self._paused:", "if False:"),
+    ),
+    fault(
+        "case 4",
+        "the output was blocked for minutes, and then the robot drives on",
+        SESSION,
+        "self.blocked = self._held_up and (self.blocked or (long and not late))",
+        "self.blocked = False",
+    ),
+    fault(
+        "case 5",
+        "an older command after a newer one is obeyed",
+        FRESHNESS,
+        'if verdict == "fresh" and self._superseded(mark):',
+        "if False:",
+    ),
+    fault(
+        "case 6",
+        "the guard does not check that a stopped robot comes to rest, and it does not",
+        GUARD,
+        "if self._late(outputs.now.mono_ns):",
+        "if False:",
+        Edit(
+            LIMITS,
+            "share = 1.0 - dt / seconds if seconds > dt else 0.0",
+            "share = 1.0 if stop else 1.0 - dt / seconds if seconds > dt else 0.0",
+        ),
+    ),
+    fault(
+        "case 7",
+        "a clear that was sent before a stop and arrives after it releases that stop",
+        LIFECYCLE,
+        "LOOK_FIRST_S = 2.0",
+        "LOOK_FIRST_S = 0.0",
+        Edit(LIFECYCLE, "            if number != latch.number:", "            if False:"),
+    ),
+    fault(
+        "case 8",
+        "one clear releases a fault and the stop below it",
+        LIFECYCLE,
+        "self._latch(fault=None)",
+        "self._latch(fault=None, stop=None)",
+    ),
+    fault(
+        "case 9",
+        "healthy motors that lag latch the fault `runaway`",
+        SANITY,
+        "self.slowest = math.inf",
+        "self.slowest = 0.0",
+    ),
+    fault(
+        "case 10",
+        "`state` keeps the last speed when the link is gone",
+        ROBOT,
+        "measured=None if silent else self._odometry.twist",
+        "measured=self._odometry.twist",
+    ),
+    fault(
+        "case 11",
+        "TX joined to RX looks like a board, and the daemon drives it",
+        "mcu/echo.py",
+        "REPORTS = 20",
+        "REPORTS = 1_000_000_000",
+    ),
+)

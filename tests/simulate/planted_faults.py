@@ -1,0 +1,407 @@
+"""Small faults in the product's source, one at a time, for `planted.py` to find.
+
+A fault that only weakens the guard is not here alone: while the rest of the product is sound, the
+guard has nothing to replace. Two faults weaken it together with the part that it watches.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Edit(NamedTuple):
+    """A replacement in one module. The old text occurs exactly once in it."""
+
+    module: str
+    old: str
+    new: str
+
+
+class Fault(NamedTuple):
+    """One planted fault."""
+
+    name: str
+    breaks: str
+    """What a person would notice."""
+    edits: tuple[Edit, ...]
+
+
+def fault(name: str, breaks: str, module: str, old: str, new: str, *more: Edit) -> Fault:
+    return Fault(name, breaks, (Edit(module, old, new), *more))
+
+
+GUARD, ARBITER, NEUTRAL = "guard.py", "drive/arbiter.py", "drive/neutral.py"
+FRESHNESS, LIMITS, LIFECYCLE = "drive/freshness.py", "drive/limits.py", "drive/lifecycle.py"
+MODES, ROBOT, SESSION = "drive/modes.py", "robot.py", "mcu/session.py"
+SANITY, ODOMETRY, PATH = "drive/sanity.py", "drive/odometry.py", "drive/path.py"
+LATCHES, VALUES, LOOP = "runtime/kept_latches.py", "values.py", "runtime/control_loop.py"
+COMMANDS, KINEMATICS, CODEC = "incoming/commands.py", "drive/kinematics.py", "mcu/codec.py"
+
+BLIND_GUARD = Edit(GUARD, 'return (self._stop, trip) if trip else (line, "")', 'return line, ""')
+"""The guard passes every line."""
+
+FAULTS = (
+    # guard
+    fault(
+        "guard margin",
+        "the guard stops a lawful ramp before its end",
+        GUARD,
+        "MARGIN_NS = 300_000_000",
+        "MARGIN_NS = -100_000_000",
+    ),
+    fault(
+        "guard timeout",
+        "the guard replaces lines of a command that is still fresh",
+        GUARD,
+        "s.timeout * 1e9",
+        "s.timeout * 3e8",
+    ),
+    fault(
+        "guard wheel limit",
+        "the guard replaces lines that are within the wheels' limit",
+        GUARD,
+        "limits.wheel_speed * 100 + 1",
+        "limits.wheel_speed * 95",
+    ),
+    fault(
+        "guard samples",
+        "the guard refuses lines that ask for a sample",
+        GUARD,
+        'for letter in (b"", b"S", b"H")',
+        'for letter in (b"", b"H")',
+    ),
+    fault(
+        "guard and latch",
+        "a stopped robot follows commands, and the guard lets it",
+        ROBOT,
+        "elif self._life.mode is Mode.DRIVING and twist is not None:",
+        "elif twist is not None:",
+        BLIND_GUARD,
+    ),
+    fault(
+        "guard and ramp",
+        "a robot without a command keeps its speed, and the guard lets it",
+        LIMITS,
+        "share = 1.0 - dt / seconds if seconds > dt else 0.0",
+        "share = 1.0",
+        BLIND_GUARD,
+    ),
+    # arbiter
+    fault(
+        "arbiter priority",
+        "the source of the lowest priority wins",
+        ARBITER,
+        "key=lambda one: (-one[0].priority, one[1].came_ns)",
+        "key=lambda one: (one[0].priority, one[1].came_ns)",
+    ),
+    fault(
+        "arbiter arming",
+        "a sender drives without having sent a zero",
+        ARBITER,
+        "        if not sender.armed(now_ns):\n            wait =",
+        "        if False:\n            wait =",
+    ),
+    fault(
+        "arbiter stale",
+        "stale commands count",
+        ARBITER,
+        'if verdict == "stale":',
+        'if verdict == "never":',
+    ),
+    fault(
+        "arbiter proof",
+        "the commands of a sender that is new count at once",
+        ARBITER,
+        "sender.take(command, self._since_ns, verdict)",
+        "sender.take(command, self._since_ns)",
+    ),
+    fault(
+        "arbiter senders",
+        "every new name of a sender takes memory for ever",
+        ARBITER,
+        "MAX_SENDERS = 16",
+        "MAX_SENDERS = 1_000_000",
+    ),
+    fault(
+        "arbiter timeout",
+        "a command never times out",
+        ARBITER,
+        "[sender for sender in self.senders.values() if sender.live(now_ns)]",
+        "[sender for sender in self.senders.values() if sender.arrived_ns is not None]",
+    ),
+    fault(
+        "arbiter notice",
+        "a zero arms a shared sender although unreadable speeds follow it",
+        ARBITER,
+        "known.senders[sender].notice(arrived_ns)",
+        "known.senders[sender].noticed_ns = 0",
+    ),
+    # neutral
+    fault(
+        "neutral pause",
+        "a zero of a shared identity arms it after half the pause",
+        NEUTRAL,
+        "now_ns - self._zero_ns >= self._pause_ns",
+        "now_ns - self._zero_ns >= self._pause_ns // 2",
+    ),
+    fault(
+        "neutral again",
+        "a sender stays armed when arming is asked for",
+        NEUTRAL,
+        "self._armed = self._proven_armed = not self._neutral_first\n\n    def unlearn",
+        "self._proven_armed = not self._neutral_first\n\n    def unlearn",
+    ),
+    fault(
+        "neutral timeout",
+        "a command counts for twice its timeout",
+        NEUTRAL,
+        "now_ns - self.arrived_ns <= self._timeout_ns",
+        "now_ns - self.arrived_ns <= 2 * self._timeout_ns",
+    ),
+    fault(
+        "neutral speeds",
+        "speeds behind the zero of a shared identity do not undo it",
+        NEUTRAL,
+        "        if not zero:\n            self._zero_ns = self._proven_zero_ns = None",
+        "        if not zero:\n            pass",
+    ),
+    fault(
+        "neutral cancelled",
+        "wheel speeds that cancel out arm like a zero",
+        NEUTRAL,
+        "return command.twist == REST and not command.cancelled",
+        "return command.twist == REST",
+    ),
+    fault(
+        "neutral never",
+        "a zero arms no sender",
+        NEUTRAL,
+        "            self._armed = True\n        elif",
+        "            pass\n        elif",
+    ),
+    # freshness
+    fault(
+        "freshness age",
+        "commands that are late by twenty timeouts count",
+        FRESHNESS,
+        "if late <= timeout_ns and early <= EARLY_NS:",
+        "if late <= 20 * timeout_ns and early <= EARLY_NS:",
+    ),
+    fault(
+        "freshness proof",
+        "the second command of a new sender counts",
+        FRESHNESS,
+        'if sign == "open" or not -EARLY_NS',
+        "if not -EARLY_NS",
+    ),
+    fault(
+        "freshness budget",
+        "a foreign clock may become later by a minute each second",
+        FRESHNESS,
+        "FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60",
+        "FORGIVE_NS, FORGIVE_RATE = 3600 * NS_PER_S, 1",
+    ),
+    fault(
+        "freshness drift",
+        "a queue that grows by 5 % looks like the drift of a clock",
+        FRESHNESS,
+        "DRIFT = 5000",
+        "DRIFT = 20",
+    ),
+    fault(
+        "freshness halves",
+        "delays that still fall pass the proof",
+        FRESHNESS,
+        "if abs(minima[1] - minima[0]) <= lasted // self._share:",
+        "if minima:",
+    ),
+    # limits
+    fault(
+        "limits stall",
+        "the robot leaps after a stall",
+        ROBOT,
+        "limiter.follow(twist, min(since, self._max_dt))",
+        "limiter.follow(twist, since)",
+    ),
+    fault(
+        "limits swapped",
+        "the robot speeds up by its deceleration",
+        LIMITS,
+        "axis.acceleration if abs(target) > abs(speed) else axis.deceleration",
+        "axis.deceleration if abs(target) > abs(speed) else axis.acceleration",
+    ),
+    fault(
+        "limits speed",
+        "a wish is not clamped to the limits",
+        LIMITS,
+        "return Twist(linear * scale, angular * scale)",
+        "return Twist(linear, angular)",
+    ),
+    fault(
+        "limits wheel",
+        "the wheels are not held to their limit",
+        KINEMATICS,
+        "if fastest <= wheel_speed:",
+        "if fastest <= 2 * wheel_speed:",
+    ),
+    fault(
+        "limits ramp",
+        "the ramp to rest takes twice as long as the deceleration says",
+        LIMITS,
+        "share = 1.0 - dt / seconds if",
+        "share = 1.0 - dt / (2 * seconds) if",
+    ),
+    fault(
+        "limits brake",
+        "the robot always brakes by the stop deceleration",
+        LIMITS,
+        "return axis.stop_deceleration if stop else axis.deceleration",
+        "return axis.stop_deceleration",
+    ),
+    fault(
+        "limits curvature",
+        "a wish over the limits loses its curvature",
+        LIMITS,
+        "return Twist(linear * scale, angular * scale)",
+        "return Twist(linear * scale, angular)",
+    ),
+    # modes and latches
+    fault(
+        "modes stop",
+        "a command drives the robot although it is stopped",
+        MODES,
+        "    if stopped:\n",
+        "    if stopped and not commanded:\n",
+    ),
+    fault(
+        "lifecycle number",
+        "a clear that names an older latch releases the one in force",
+        LIFECYCLE,
+        "            if number != latch.number:",
+        "            if number > latch.number:",
+    ),
+    fault(
+        "lifecycle repeated",
+        "a second stop does not get a number of its own",
+        LIFECYCLE,
+        "self.latches.stop is not None and asked_ns <= self._stop_asked_ns",
+        "self.latches.stop is not None",
+    ),
+    fault(
+        "lifecycle off",
+        "deactivate answers, but does nothing",
+        LIFECYCLE,
+        "self._latch(inactive=self._made(now, by, f\"switched off by {by or 'request'}\"))",
+        "self._off_ns = now.mono_ns",
+    ),
+    # robot
+    fault(
+        "robot clear",
+        "a clear asks no sender for a zero",
+        ROBOT,
+        "                self._arbiter.require_neutral(asked_ns)\n                return released",
+        "                return released",
+    ),
+    fault(
+        "robot set",
+        "new timeouts ask no sender for a zero",
+        ROBOT,
+        "            self._arbiter.require_neutral(now_ns)\n        return news",
+        "        return news",
+    ),
+    fault(
+        "robot limits",
+        "set answers, but the old limits stay in force",
+        ROBOT,
+        "        self._limiter.use(self.config.limits)\n",
+        "",
+    ),
+    fault(
+        "robot unsent",
+        "a line that never left counts as obeyed",
+        ROBOT,
+        "        if not inputs.superseded:\n            self._said",
+        "        if True:\n            self._said",
+    ),
+    # session
+    fault(
+        "session quiet",
+        "a silent board gets lines that move it for a second",
+        SESSION,
+        "NS_PER_S * max(0.1, 4 / rate_hz",
+        "NS_PER_S * max(1.0, 4 / rate_hz",
+    ),
+    fault(
+        "session gap",
+        "a gap of the feedback asks no sender for a zero",
+        SESSION,
+        "since_ns >= LONG_GAP_NS:",
+        "since_ns >= 1000 * LONG_GAP_NS:",
+    ),
+    fault(
+        "session reopened",
+        "a port that was opened again asks no sender for a zero",
+        SESSION,
+        "self.restarted = opened != self._opened",
+        "self.restarted = False",
+    ),
+    fault(
+        "gate late",
+        "a line that was made before a stall leaves after it",
+        "mcu/gate.py",
+        "if now_ns - made_ns > self._period_ns and",
+        "if False and",
+    ),
+    # sanity
+    fault(
+        "sanity evidence",
+        "evidence against a healthy wheel is never dropped",
+        SANITY,
+        "lasted = wheel.evidence[kind] + dt if bad else 0.0",
+        "lasted = wheel.evidence[kind] + (dt if bad else 0.0)",
+    ),
+    fault(
+        "sanity dead",
+        "a healthy wheel that follows its command slowly is called dead",
+        SANITY,
+        "moving and turns < 0.1 * size,",
+        "moving and turns < 0.97 * size,",
+    ),
+    # odometry
+    fault(
+        "odometry turn",
+        "the pose turns the wrong way",
+        KINEMATICS,
+        "(right - left) / self.track",
+        "(left - right) / self.track",
+    ),
+    fault(
+        "odometry yaw",
+        "the pose turns by a fifth too much",
+        PATH,
+        "_wrapped(self._yaw, turn)",
+        "_wrapped(self._yaw, 1.2 * turn)",
+    ),
+    # latch file
+    fault(
+        "latches kept",
+        "the latch file is never written",
+        LATCHES,
+        "                self._keeper.keep(latches)",
+        "                pass",
+    ),
+    fault(
+        "latches lowered",
+        "limits that were lowered are back after a restart",
+        VALUES,
+        "return Latches(stop, fault, inactive, self.lowered)",
+        "return Latches(stop, fault, inactive)",
+    ),
+    fault(
+        "latches fault",
+        "a fault is gone after a restart",
+        VALUES,
+        "return Latches(stop, fault, inactive, self.lowered)",
+        "return Latches(stop, None, inactive, self.lowered)",
+    ),
+)

@@ -1,0 +1,151 @@
+"""The promise of odometry: the pose stays within its covariance and never jumps."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from tests.simulate.promises import BrokenError
+from tests.simulate.roads import NS
+
+LIARS = {
+    "bias", "stuck_encoder", "frozen_encoder", "reversed_encoder", "reversed_motor", "dead_motor",
+    "swapped_motors", "swapped_encoders", "bit_errors", "noise", "partial_line", "echo", "mute",
+    "unprompted", "pushed",
+}  # fmt: skip
+"""Board faults with which the encoders lie, or say nothing while the robot may move."""
+
+SIGMAS = 6.0
+ROOM_M, ROOM_RAD = 0.02, 0.03
+"""Allowed beside the covariance: a sample's time is known to a few ms."""
+
+Pose = tuple[float, float, float]
+
+
+class PoseWitness:
+    """Compares the estimates with the true pose, from an anchor on where both were the same."""
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        drive = config.get("drive", {})
+        fastest = config.get("feedback", {}).get("wheel_speed", 80.0)
+        self.fastest: float = fastest * drive.get("wheel_radius", 0.05)
+        self.track: float = drive.get("wheel_separation", 0.3)
+        self._true: deque[tuple[int, Pose]] = deque(maxlen=400)
+        self._anchor: tuple[Pose, Pose] | None = None
+        self._placed = False
+        self._room = 0.0
+        self._last: tuple[int, Pose] | None = None
+
+    def doubt(self) -> None:
+        """A way was lost that no encoder told of: compare from the next estimate on."""
+        self._anchor = self._last = None
+
+    def placed(self) -> None:
+        """The pose was set: the estimates of this step are still the old ones."""
+        self._placed = True
+
+    def see(
+        self,
+        now_ns: int,
+        estimates: Sequence[Any],
+        truth: tuple[int, float, float, float, float],
+        offset_ns: int,
+        faults: set[str],
+    ) -> None:
+        """Judge the estimates of one step."""
+        at_ns, x, y, yaw, _ = truth
+        self._true.append((at_ns + offset_ns, (x, y, yaw)))
+        if faults & LIARS:
+            self.doubt()
+        for sampled_ns, ex, ey, eyaw, covariance, _ in estimates:
+            if not all(map(math.isfinite, (ex, ey, eyaw, *covariance))):
+                raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
+            self._one(
+                now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, bool(faults & LIARS)
+            )
+
+    def end_step(self) -> None:
+        """Forget the pose if it was set in this step."""
+        if self._placed:
+            self._placed = False
+            self.doubt()
+
+    def _one(
+        self, now_ns: int, at_ns: int, pose: Pose, covariance: tuple[float, ...], lies: bool
+    ) -> None:
+        last, self._last = self._last, (at_ns, pose)
+        if last is not None and not lies:
+            way = math.hypot(pose[0] - last[1][0], pose[1] - last[1][1])
+            seconds = max(0.0, (at_ns - last[0]) / NS)
+            if way > self.fastest * 1.1 * seconds + 0.05:
+                raise BrokenError(
+                    "the pose never jumps", now_ns, f"{last[1]} to {pose} in {seconds:.3f} s"
+                )
+        if lies:
+            return
+        true = self._true_at(at_ns)
+        if true is None:
+            return
+        if self._anchor is None:
+            self._anchor = true, pose
+            self._room = 0.1 * self.speed_at(at_ns)
+            self._first = covariance
+            return
+        expected = _through(self._anchor, true)
+        dx, dy = pose[0] - expected[0], pose[1] - expected[1]
+        dyaw = math.remainder(pose[2] - expected[2], math.tau)
+        xx, _, _, yy, _, yawyaw = covariance
+        far = math.hypot(true[0] - self._anchor[0][0], true[1] - self._anchor[0][1])
+        room = ROOM_M + self._room + 0.1 * self.speed_at(at_ns)
+        room_yaw = ROOM_RAD + self._room / self.track + 0.1 * self.speed_at(at_ns) / self.track
+        allowed = SIGMAS * math.sqrt(xx + yy) + room + far * room_yaw
+        if math.hypot(dx, dy) > allowed:
+            raise BrokenError(
+                "the pose stays within its covariance", now_ns,
+                f"{math.hypot(dx, dy):.3f} m off, allowed {allowed:.3f} m",
+            )  # fmt: skip
+        if abs(dyaw) > SIGMAS * math.sqrt(yawyaw) + room_yaw:
+            raise BrokenError(
+                "the pose stays within its covariance", now_ns,
+                f"{dyaw:.3f} rad off, sigma {math.sqrt(yawyaw):.4f}",
+            )  # fmt: skip
+
+    def speed_at(self, at_ns: int) -> float:
+        """Return the true speed about then, m/s, with that of the rim in a turn."""
+        if len(self._true) < 2:
+            return 0.0
+        (t0, a), (t1, b) = self._true[-2], self._true[-1]
+        seconds = max(0.005, (t1 - t0) / NS)
+        turn = math.remainder(b[2] - a[2], math.tau) * self.track
+        return float((math.hypot(b[0] - a[0], b[1] - a[1]) + abs(turn)) / seconds)
+
+    def _true_at(self, at_ns: int) -> Pose | None:
+        """Return the true pose at a time, None where nobody looked shortly before and after."""
+        after = None
+        for then_ns, pose in reversed(self._true):
+            if then_ns <= at_ns:
+                if after is None:
+                    return pose if at_ns - then_ns < 20_000_000 else None
+                span = after[0] - then_ns
+                if span > 60_000_000:
+                    return None
+                share = (at_ns - then_ns) / span if span else 0.0
+                turn = math.remainder(after[1][2] - pose[2], math.tau)
+                return (
+                    pose[0] + share * (after[1][0] - pose[0]),
+                    pose[1] + share * (after[1][1] - pose[1]),
+                    pose[2] + share * turn,
+                )
+            after = then_ns, pose
+        return None
+
+
+def _through(anchor: tuple[Pose, Pose], true: Pose) -> Pose:
+    """Return where the odometry should be, if both were the same at the anchor."""
+    (tx, ty, tyaw), (ox, oy, oyaw) = anchor
+    turn = oyaw - tyaw
+    dx, dy = true[0] - tx, true[1] - ty
+    c, s = math.cos(turn), math.sin(turn)
+    return ox + c * dx - s * dy, oy + s * dx + c * dy, true[2] + turn

@@ -1,0 +1,393 @@
+"""The product under test, as the simulator sees it. No other module here imports the product.
+
+A paired run loads this module twice, each time beside another checkout of the product. So whatever
+the simulator wants of the product is a method here, and takes and returns plain data.
+
+Time is in ns of the robot's monotonic clock. `Product.see` is called after every control step.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any, NamedTuple
+
+import msgspec
+
+import acsard
+from acsard.config.parsing import ConfigError, parse
+from acsard.incoming.commands import Arrival
+from acsard.incoming.queries import Query
+from acsard.messages.encodings import encode as encode_message
+from acsard.runtime.kept_latches import (
+    LatchFileError,
+    at_start,
+    decode,
+    encode,
+    stopped,
+    unreadable,
+    unwritable,
+)
+from acsard.sim.watched import WatchedMcu
+from acsard.values import Event, Instant, Latches, Outputs, Received
+from tests.scenarios.world import START, World
+
+START_NS = START.mono_ns
+WALL_OFFSET_NS = START.wall_ns - START.mono_ns
+
+HELD = 16
+"""Samples of one key that wait for a step, as the real inbox holds them."""
+
+Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
+"""Time of the sample, x, y, yaw, the upper triangle of the covariance, and the wheel angles."""
+
+
+class Seen(NamedTuple):
+    """What one control step showed to the outside."""
+
+    at_ns: int
+    decided_ns: int
+    """When the step began: a stall may lie between this and `at_ns`."""
+    mode: str
+    reason: str
+    followed_ns: int | None
+    """Arrival of the command that is followed, None if none is."""
+    link: str
+    lines: list[tuple[int, bytes]]
+    """Lines that went to the board since the step before, each with its time."""
+    estimates: Sequence[Estimate]
+
+
+def problems(config: dict[str, Any]) -> list[str]:
+    """Return what makes this configuration illegal, in words."""
+    try:
+        parse(b"", config)
+    except ConfigError as error:
+        return error.problems
+    return []
+
+
+class Disk:
+    """The latch file: what a process that is killed now leaves for the next one."""
+
+    def __init__(self) -> None:
+        self.full = False
+        self.trouble = ""
+        self._newest = Latches()
+        self._data = encode("acsar", self._newest)
+
+    @property
+    def behind(self) -> bool:
+        """Return whether the file lacks the newest latches."""
+        return self._data != encode("acsar", self._newest)
+
+    def fill(self, full: bool) -> None:
+        """Begin or end a time in which nothing can be written; the daemon tries again by itself."""
+        self.full = full
+        self.keep(self._newest)
+
+    def keep(self, latches: Latches) -> None:
+        self._newest = latches
+        self.trouble = unwritable("FILE", "no space left on device") if self.full else ""
+        if not self.full:
+            self._data = encode("acsar", latches)
+
+    def holds(self, latches: Latches) -> bool:
+        return not self.full
+
+    def wait(self, latches: Latches, seconds: float) -> None: ...
+
+    def news(self) -> list[Event]:
+        return []
+
+    def read(self, now: Instant) -> Latches:
+        """Return the latches that the next start begins with."""
+        try:
+            found = decode("acsar", self._data)
+        except LatchFileError as error:
+            found = stopped(Latches(), unreadable("FILE", str(error)), now)
+        if self.full:
+            self._newest = stopped(found, at_start(unwritable("FILE", "no space")), now)
+            return self._newest
+        return found
+
+
+class Product:
+    """One robot with its computer and its board, over all the daemon's lives."""
+
+    def __init__(self, config: dict[str, Any], see: Callable[[Seen], None]) -> None:
+        self._config, self._see = parse(b"", config), see
+        self._faults: list[tuple[str, tuple[Any, ...]]] = []
+        self._lasting = ExitStack()
+        self.disk = Disk()
+        self.alive = True
+        self.fed_ns = START_NS
+        """When bytes of the board last reached the daemon."""
+        self.fed: Callable[[int], None] = lambda at_ns: None
+        self.dropped = 0
+        """Samples that the inbox had no room for, of this daemon."""
+        self.echo = False
+        self._world = World(self._config, keeper=self.disk)
+        self._began()
+
+    def _began(self) -> None:
+        world = self._world
+        world.bus.wanted = set()
+        world.watch = self._watch
+        self.dropped = 0
+        feed = world.port.feed
+
+        def noticed(received: Received) -> None:
+            self.fed(received.at.mono_ns)
+            self.fed_ns = received.at.mono_ns
+            feed(received)
+
+        world.port.feed = noticed  # type: ignore[method-assign]
+
+    def _watch(self, outputs: Outputs) -> None:
+        world = self._world
+        lines: list[tuple[int, bytes]] = []
+        if world.port.sent:
+            lines = list(world.port.sent)
+            world.port.sent.clear()
+            if self.echo:
+                for _, line in lines:
+                    world.port.feed(Received(world.instant, line))
+        world.events.clear()
+        estimates: list[Estimate] = [
+            (
+                found.at.mono_ns,
+                found.pose.x,
+                found.pose.y,
+                found.pose.yaw,
+                (
+                    found.covariance.xx,
+                    found.covariance.xy,
+                    found.covariance.xyaw,
+                    found.covariance.yy,
+                    found.covariance.yyaw,
+                    found.covariance.yawyaw,
+                ),
+                found.positions,
+            )
+            for found in outputs.estimates
+        ]
+        self._see(
+            Seen(
+                world.now_ns,
+                outputs.now.mono_ns,
+                outputs.mode,
+                outputs.reason,
+                outputs.command_ns,
+                outputs.link,
+                lines,
+                estimates,
+            )
+        )
+
+    # time
+
+    @property
+    def now_ns(self) -> int:
+        return self._world.now_ns
+
+    @property
+    def wall_ns(self) -> int:
+        """What the robot's wall clock shows."""
+        return self._world.instant.wall_ns
+
+    def run_until(self, at_ns: int) -> None:
+        """Let time pass; without a daemon only the board lives."""
+        world = self._world
+        if at_ns <= world.now_ns:
+            return
+        if self.alive:
+            world.run((at_ns - world.now_ns) / 1e9)
+        else:
+            world.mcu.advance(at_ns)
+        world.now_ns = max(world.now_ns, at_ns)
+
+    # the bus
+
+    def deliver(
+        self,
+        at_ns: int,
+        key: str,
+        payload: bytes,
+        *,
+        put: bool = True,
+        encoding: str = "",
+        stamp_ns: int | None = None,
+        session: str = "",
+        via: Any = "native",
+        attachment: bytes = b"",
+    ) -> None:
+        """Hand over a sample that arrived at this time, not later than now."""
+        world = self._world
+        arrivals = world.bus.arrivals
+        received = None if session else self.wall_ns
+        arrival = Arrival(
+            key, put, payload, encoding, at_ns, stamp_ns, session, via, attachment, received
+        )
+        if key == "stop":
+            arrivals.insert(0, arrival)
+        else:
+            arrivals.append(arrival)
+            if len(arrivals) > HELD:
+                same = [one for one in arrivals if one.key == key]
+                if len(same) > HELD:
+                    arrivals.remove(same[0])
+                    self.dropped += 1
+        if at_ns == world.now_ns and (world._listens or key == "stop"):
+            world._step()
+
+    def ask(
+        self, at_ns: int, service: str, ticket: int, payload: bytes, via: Any, attachment: bytes
+    ) -> None:
+        """Hand over a service call. A stop also goes ahead of its query, as on the real bus."""
+        key = f"srv/{service}"
+        if service == "stop":
+            self.deliver(at_ns, "stop", b"", via=via, attachment=attachment)
+        query = Query(ticket, key, key, "", payload, "", at_ns, via, attachment)
+        self._world.bus.queries.append(query)
+
+    def replies(self) -> list[tuple[int, bytes]]:
+        """Take the answers that were given since the last call, each with its ticket."""
+        bus = self._world.bus
+        if not bus.replies:
+            return []
+        found = [(ticket, reply.payload) for ticket, all_ in bus.replies.items() for reply in all_]
+        bus.replies.clear()
+        bus.finished.clear()
+        return found
+
+    def state(self) -> dict[str, Any]:
+        """Return what `state` says now, as a client reads it."""
+        found: dict[str, Any] = msgspec.json.decode(encode_message(self._world.state, "json"))
+        return found
+
+    # the board
+
+    def board(self, faults: list[tuple[str, tuple[Any, ...]]]) -> None:
+        """Have the board misbehave in these ways, and in no others, from now on."""
+        self._lasting.close()
+        self._faults = faults
+        for name, values in faults:
+            # The daemon's TX is joined to its RX, so nothing of the board arrives.
+            fault = "mute" if name == "echo" else name
+            self._lasting.enter_context(getattr(self._world.mcu, fault)(*values))
+        self.echo = any(name == "echo" for name, _ in faults)
+
+    def reset(self, deaf_ns: int) -> None:
+        self._world.mcu.reset(self.now_ns, deaf_ns)
+
+    def unplug(self) -> None:
+        self._world.port.unplug()
+        self._world.port.trouble = "the device is gone"
+
+    def plug(self, new: bool = False) -> None:
+        """Plug the board in again, or another one."""
+        world = self._world
+        if new:
+            self._lasting.close()
+            pose = world.mcu.vehicle.pose
+            other = World(self._config, plugged=False).mcu
+            other._now_ns = other._in_free_ns = other._out_free_ns = self.now_ns
+            other._replied_ns = other._fed_ns = self.now_ns
+            other.reset(self.now_ns, int(self._config.sim.boot_time * 1e9))
+            other.vehicle.pose = pose
+            if isinstance(other, WatchedMcu):
+                other._look_ns = self.now_ns + 10_000_000
+                other._see = world._see
+                other._history[0] = (self.now_ns, 0.0)
+            world.mcu = other
+            self.board(self._faults)
+        else:
+            world.mcu.advance(self.now_ns)
+        world.port.trouble = ""
+        world.port.plug(world.mcu)
+
+    def truth(self) -> tuple[int, float, float, float, float]:
+        """Return the time of the board, the true pose, and the true speed of the fastest wheel."""
+        mcu = self._world.mcu
+        pose = mcu.vehicle.pose
+        fastest = max(map(abs, mcu.vehicle.speeds))
+        return mcu._now_ns, pose.x, pose.y, pose.yaw, fastest
+
+    @property
+    def plugged(self) -> bool:
+        return self._world.port.mcu is not None
+
+    # the computer
+
+    def stall(self, seconds: float) -> None:
+        if self.alive:
+            self._world.stall(seconds)
+
+    def stall_in_step(self, seconds: float) -> None:
+        self._world.stall_in_step(seconds)
+
+    def block(self, blocked: bool) -> None:
+        self._world.port.blocked = blocked
+
+    def tear(self, taken: int) -> None:
+        """Have the kernel take only this many bytes of the next line."""
+        self._world.port.takes = taken
+
+    def step_wall(self, seconds: float) -> None:
+        self._world.wall_offset_ns += int(seconds * 1e9)
+
+    def end(self, way: str) -> None:
+        """End the daemon by SIGTERM (`term`) or at once (`kill`)."""
+        world = self._world
+        if way == "term":
+            world.loop.leaving = True
+            for _ in range(60):
+                self.run_until(world.now_ns + 10_000_000)
+                if world.loop.at_rest:
+                    break
+            world.loop.finish(world.instant)
+        if world.port.mcu is not None:
+            # The unit sends zeros when the process has ended.
+            stop = world.loop.robot.session.codec.stop
+            world.port.mcu.receive(world.now_ns + 50_000_000, b"\r\n" + stop)
+        self.alive = False
+
+    def start(self) -> None:
+        """Start the daemon again, on the same board."""
+        old = self._world
+        latches = self.disk.read(old.instant)
+        world = World(self._config, plugged=False, latches=latches, keeper=self.disk)
+        world.now_ns = world.next_period_ns = old.now_ns
+        world.wall_offset_ns = old.wall_offset_ns
+        world.mcu = old.mcu
+        if isinstance(world.mcu, WatchedMcu):
+            world.mcu._see = world._see
+        if old.port.mcu is not None:
+            world.port.plug(world.mcu)
+        world.port.blocked = old.port.blocked
+        self._world, self.alive = world, True
+        self._began()
+
+    def largest(self) -> tuple[int, str]:
+        """Return the length and the type of the largest container that the daemon holds."""
+        seen: set[int] = set()
+        todo: deque[object] = deque([self._world.loop])
+        best = (0, "")
+        while todo:
+            one = todo.pop()
+            if id(one) in seen:
+                continue
+            seen.add(id(one))
+            if isinstance(one, dict):
+                best = max(best, (len(one), "dict"))
+                todo.extend(one.values())
+            elif isinstance(one, list | tuple | set | deque):
+                best = max(best, (len(one), type(one).__name__))
+                todo.extend(one)
+            elif type(one).__module__.startswith(acsard.__name__):
+                slots = getattr(type(one), "__struct_fields__", ())
+                todo.extend(getattr(one, name) for name in slots)
+                todo.extend(getattr(one, "__dict__", {}).values())
+        return best

@@ -1,0 +1,488 @@
+"""The promises of the product as predicates, judged from an omniscient view.
+
+`Witness` knows when each command was really sent, which stop and clear arrived when, and reads the
+lines on the wire with code of its own. It shares nothing with the product: each rule is written
+from the pages (`deploy/clients/README.md`, the README) and allows whatever they allow. The first
+predicate that does not hold raises `BrokenError` with its name.
+
+Times are true ns from the start. A suspended robot's own clock stands, the true one does not.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_right
+from collections import Counter, deque
+from typing import Any
+
+from tests.simulate.ages import MARGIN_NS, Ages, Sender, Wish
+from tests.simulate.roads import NS, Message, Sample
+
+LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
+ZERO = (0.0, 0.0, 0.0, 0.0)
+MODES = {"leaving", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
+
+RAMP_NS = 300_000_000
+"""Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
+
+BLOCKED_NS = 500_000_000
+"""After so long without a line that left, the daemon knows it. The board stops itself earlier."""
+
+STAND_NS = 2 * NS
+"""After a ramp to rest: time for motors with a lag of 0.4 s to stand."""
+
+HARMLESS = {
+    "mute", "noise", "partial_line", "lost_replies", "lost_commands", "slow_reply", "ftdi",
+    "stalls", "sparse_replies", "echo",
+}  # fmt: skip
+"""Troubles of the board that are no reason to latch a fault."""
+
+
+class BrokenError(AssertionError):
+    """A promise did not hold."""
+
+    def __init__(self, promise: str, at_ns: int, text: str) -> None:
+        super().__init__(f"{promise} at {at_ns / NS:.3f} s: {text}")
+        self.promise, self.at_ns, self.text = promise, at_ns, text
+
+
+class Witness:
+    """Holds every line and every step against what really happened."""
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        self.config = config
+        drive = config.get("drive", {})
+        self.radius = drive.get("wheel_radius", 0.05)
+        self.half = drive.get("wheel_separation", 0.3) / 2
+        wheels = config["mcu"].get("wheels") or {
+            "front_right": "+a", "front_left": "+b", "rear_left": "+c", "rear_right": "+d",
+        }  # fmt: skip
+        self.motors = [
+            ("abcd".index(wheels[w][1]), -1 if wheels[w][0] == "-" else 1)
+            for w in ("front_right", "front_left", "rear_left", "rear_right")
+        ]
+        self.file = dict(config["limits"])
+        self.limits = dict(config["limits"])
+        commands = config["commands"]
+        self.neutral_first = commands.get("neutral_first", True)
+        self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
+        self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
+        self.file_pause_ns = int(commands.get("pause", 1.0) * NS)
+        rate = config["control"].get("rate", 100.0)
+        self.period_ns = int(NS / rate)
+        quiet = max(0.1, 4 / rate, 3 * config["mcu"].get("reply_period", 0.0))
+        self.quiet_ns = int(quiet * NS)
+        self.counts: Counter[str] = Counter()
+        self.shared_clocks: frozenset[str] = frozenset()
+        """Clocks that several senders of the plan stamp by."""
+        self.churns = False
+        self.stops: list[int] = []
+        """Arrivals of the stops that no clear has released."""
+        self.offs: list[int] = []
+        """Arrivals of each `deactivate` that no `activate` has released."""
+        self.dormant_ns: int | None = None
+        """Start of a daemon that waits for its first `activate`."""
+        self.fault_ns: int | None = None
+        self.troubles: dict[str, int] = {}
+        """Board faults and when each was last active."""
+        self.blocked_ns: int | None = None
+        """Since when the kernel takes no line."""
+        self.braking: tuple[int, float] | None = None
+        """When a robot that must not move was first seen to move, and how fast."""
+        self.cut = False
+        """The link was lost since the last line, so the speed starts over from zero."""
+        self.pending = False
+        """An answer waits for the disk, so it is not known yet what is in force."""
+        self.mode = self.reason = ""
+        self._decoded: dict[bytes, tuple[float, ...]] = {}
+        self.new_life(0)
+
+    # what happened
+
+    def new_life(self, at_ns: int) -> None:
+        """Note that the daemon started."""
+        self.timeout = dict(self.file_timeout)
+        self.pause_ns = self.file_pause_ns
+        for name, value in self.file.items():
+            kept = not name.endswith("_deceleration") and "jerk" not in name
+            self.limits[name] = min(value, self.limits[name]) if kept else value
+        self.before = dict(self.limits)
+        self.changed_ns = at_ns
+        self.softest = dict(self.limits)
+        self.armed_since_ns = at_ns
+        self.ages = Ages(at_ns)
+        self.senders: dict[tuple[str, str], Sender] = {}
+        self.wishes: deque[tuple[str, Wish]] = deque()
+        self.last: tuple[float, ...] = ZERO
+        self.last_ns = at_ns
+        self.wished_ns = at_ns
+        self.coasting: tuple[int, float] | None = None
+        self.delivered = 0
+        if not self.config["control"].get("auto_activate", True):
+            self.dormant_ns = at_ns
+        self.mode = ""
+
+    def command(
+        self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int
+    ) -> None:
+        """Take note of a command that reached the daemon."""
+        self.delivered += 1
+        source = sender["source"]
+        if message.junk not in ("", "cancels"):
+            return  # it is neither a speed nor a zero
+        if message.junk == "cancels":
+            v, w = 0.0, 0.0
+        else:
+            v, w = message.v, message.w
+        zero = v == w == 0.0 and message.junk == ""
+        wish = Wish(arrived_ns, v, w)
+        wish.identity, wish.shared = sample.identity, sample.shared
+        loose = sample.clock in self.shared_clocks
+        timeout_ns = self.timeout[source]
+        wish.fresh = self.ages.fresh(sender, message, sample, arrived_ns, timeout_ns, loose)
+        wish.certain = (
+            not sample.clock and message.junk == "" and sender["way"] in ("plain", "bridge")
+        )
+        known = self.senders.setdefault((source, sample.identity), Sender())
+        if zero:
+            if not sample.shared:
+                known.armed_ns = arrived_ns
+            known.zeros.append(arrived_ns)
+            del known.zeros[:-4000]
+        else:
+            self._arm(known, arrived_ns)
+            known.zeros.clear()
+        wish.armed_ns = known.armed_ns
+        self.wishes.append((source, wish))
+
+    def _arm(self, known: Sender, now_ns: int) -> None:
+        """Arm a shared identity by the latest zero that the pause has passed behind."""
+        place = bisect_right(known.zeros, now_ns - self.pause_ns)
+        if place:
+            known.armed_ns = max(known.armed_ns, known.zeros[place - 1])
+
+    def arming(self, at_ns: int) -> None:
+        """Note an event after which every sender must send a zero."""
+        self.armed_since_ns = max(self.armed_since_ns, at_ns)
+
+    def suspended(self, at_ns: int) -> None:
+        """Note that the robot's clock stood, so that it cannot know the delays it knew before."""
+        self.ages.forget_least(at_ns)
+
+    def cleared(self, asked_ns: int, read_ns: int | None, text: str, name: str) -> None:
+        """Note a clear that worked, as the daemon says. Its sender saw the latch at `read_ns`."""
+        if text.startswith("nothing"):
+            return
+        self.counts["clear"] += 1
+        self.arming(asked_ns)
+        if self.fault_ns is not None and self.fault_ns <= asked_ns:
+            self.fault_ns = None
+        if "still" in text:
+            return
+        self._release(self.stops, "a clear releases no later stop", asked_ns, read_ns, name)
+
+    def activated(self, asked_ns: int, read_ns: int | None, name: str) -> None:
+        """Note an `activate` that worked, as the daemon says."""
+        if self.dormant_ns is not None or self.offs:
+            self.arming(asked_ns)
+        self._release(self.offs, "an activate undoes no later one", asked_ns, read_ns, name)
+        self.dormant_ns = None
+
+    def _release(
+        self, latched: list[int], promise: str, asked_ns: int, read_ns: int | None, name: str
+    ) -> None:
+        for at_ns in latched:
+            seen = read_ns is not None and read_ns >= at_ns
+            late = read_ns is None and asked_ns >= at_ns + 2 * NS - MARGIN_NS
+            if not (seen or late):
+                text = f"the call of {name} released what was latched at {at_ns / NS:.3f} s"
+                raise BrokenError(promise, asked_ns, text)
+        latched.clear()
+
+    def set_limits(self, at_ns: int, settings: dict[str, float]) -> None:
+        """Note settings that the daemon says it has taken."""
+        self.before, self.changed_ns = dict(self.limits), at_ns
+        for key, value in settings.items():
+            parts = key.split(".")
+            if parts[0] == "limits":
+                self.limits[parts[1]] = value
+                low = self.softest.get(parts[1], value)
+                self.softest[parts[1]] = (
+                    min(low, value) if "deceleration" in key else max(low, value)
+                )
+                continue
+            before_ns = self.pause_ns, dict(self.timeout)
+            if parts[1] == "pause":
+                self.pause_ns = int(value * NS)
+            else:
+                self.timeout[parts[2]] = int(value * NS)
+            if before_ns != (self.pause_ns, self.timeout):
+                self.arming(at_ns)
+
+    # what the daemon showed
+
+    def step(self, at_ns: int, mode: str, reason: str, fed_ns: int = -1) -> None:
+        """Judge the mode and the words for it; `fed_ns` is when the board was last heard."""
+        if mode == "driving" and fed_ns >= 0:
+            if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
+                text = f"last heard {fed_ns / NS:.3f} s"
+                raise BrokenError("a silent board is not driven", at_ns, text)
+            if self.blocked_ns is not None and at_ns - self.blocked_ns > BLOCKED_NS:
+                text = f"no line left since {self.blocked_ns / NS:.3f} s"
+                raise BrokenError("a blocked board is not driven", at_ns, text)
+        if mode == self.mode and reason == self.reason:
+            return
+        if mode not in MODES or len(reason) < 6:
+            raise BrokenError("every state has a reason", at_ns, f"{mode}: {reason!r}")
+        if (mode == "driving") != reason.startswith("driving"):
+            raise BrokenError("every state has a reason", at_ns, f"{mode}: {reason!r}")
+        if "the guard replaced" in reason:
+            raise BrokenError("the guard never has to trip", at_ns, reason)
+        if mode == "fault" != self.mode:
+            self.counts["fault"] += 1
+            recent = [k for k, last_ns in self.troubles.items() if at_ns - last_ns < 4 * NS]
+            if self.mode and self.fault_ns is None and set(recent) <= HARMLESS:
+                raise BrokenError("no fault without a cause", at_ns, f"{reason} (board: {recent})")
+            if self.fault_ns is None:
+                self.fault_ns = at_ns
+        if mode != self.mode:
+            self.counts[f"mode {mode}"] += 1
+        self.mode, self.reason = mode, reason
+
+    @property
+    def held(self) -> tuple[int, str] | None:
+        """Since when nothing may move, and why."""
+        found = []
+        if self.stops:
+            found.append((self.stops[0], "a stop"))
+        if self.fault_ns is not None:
+            found.append((self.fault_ns, "a fault"))
+        if self.offs:
+            found.append((self.offs[0], "being switched off"))
+        if self.dormant_ns is not None:
+            found.append((self.dormant_ns, "being switched off"))
+        return min(found, default=None)
+
+    def line(self, at_ns: int, line: bytes, fed_ns: int, made_ns: int) -> None:
+        """Judge a line on the wire.
+
+        `fed_ns` is when the board was last heard. Speeds grow by the time between the steps that
+        made two lines, at `made_ns`; a stalled step hands its line over later.
+        """
+        wheels = self._decoded.get(line) or self._read(at_ns, line)
+        if wheels is None:
+            return
+        if wheels == ZERO:
+            self.last, self.last_ns, self.coasting, self.braking = ZERO, made_ns, None, None
+            self.softest = dict(self.limits)
+            return
+        self.counts["moving lines"] += 1
+        if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
+            raise BrokenError(
+                "a silent board gets zeros", at_ns, f"last heard {fed_ns / NS:.3f} s: {line!r}"
+            )
+        before, last_ns = self.last, self.last_ns
+        grows = any(
+            abs(new) > abs(old) + 0.001 or new * old < 0.0
+            for new, old in zip(wheels, before, strict=True)
+        )
+        if not self.pending:
+            self._limits(at_ns, wheels, before, made_ns - last_ns, grows)
+        held = None if self.pending else self.held
+        if held is None:
+            self.braking = None
+        else:
+            self._held(at_ns, held, grows, line, max(map(abs, wheels)))
+        self._wished(at_ns, wheels, before, grows, line)
+        self.last, self.last_ns, self.cut = wheels, made_ns, False
+
+    def _read(self, at_ns: int, line: bytes) -> tuple[float, ...] | None:
+        """Return the wheel speeds of a line, None for a question to the board or a torn line."""
+        match = LINE.match(line)
+        if match is None:
+            if line.endswith(b"\n") and line[:1] in b"abcd#":
+                raise BrokenError("every line is whole", at_ns, repr(line))
+            return None
+        motors = [float(g[1:]) * (1 if g[:1] == b"p" else -1) for g in match.groups()]
+        wheels = tuple(motors[place] * sign + 0.0 for place, sign in self.motors)
+        if len(self._decoded) > 20_000:
+            self._decoded.clear()
+        self._decoded[line] = wheels
+        return wheels
+
+    def twist(self, wheels: tuple[float, ...]) -> tuple[float, float]:
+        """Return the speed and turn rate of these wheels, front right and front left first."""
+        right, left = wheels[0], wheels[1]
+        return self.radius * (right + left) / 2, self.radius * (right - left) / (2 * self.half)
+
+    def _most(self, name: str, at_ns: int) -> float:
+        """Return a limit; shortly after it was changed the larger of the two."""
+        value = self.limits[name]
+        if at_ns - self.changed_ns < MARGIN_NS + self.period_ns:
+            return float(max(value, self.before[name]))
+        return float(value)
+
+    def _limits(
+        self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], dt: int, grows: bool
+    ) -> None:
+        if wheels[0] != wheels[3] or wheels[1] != wheels[2]:
+            raise BrokenError("the wheels of a side turn alike", at_ns, str(wheels))
+        most = self._most("wheel_speed", at_ns) + 0.011
+        if max(map(abs, wheels)) > max(most, max(map(abs, before)) if not grows else 0.0):
+            raise BrokenError("no wheel is over its limit", at_ns, f"{wheels} over {most:.2f}")
+        (v, w), (v0, w0) = self.twist(wheels), self.twist(before)
+        ev = self.radius * 0.011
+        ew = self.radius * 0.011 / self.half
+        seconds = min(dt / NS, max(0.05, 1.5 * self.period_ns / NS)) + 0.002
+        saturated = max(map(abs, wheels)) > self._most("wheel_speed", at_ns) - 0.1
+        for name, new, old, room in (("linear", v, v0, ev), ("angular", w, w0, ew)):
+            speed = self._most(f"{name}_speed", at_ns)
+            if abs(new) > max(speed, abs(old)) + room:
+                raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
+            up = self._most(f"{name}_acceleration", at_ns)
+            down = self._most(f"{name}_deceleration", at_ns)
+            if self.mode in ("stopped", "fault", "leaving"):
+                down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
+            gained = abs(new) - abs(old) if new * old >= 0 else abs(new)
+            if gained > up * seconds + 2 * room:
+                raise BrokenError(
+                    "no acceleration is over its limit", at_ns,
+                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
+                )  # fmt: skip
+            lost = abs(old) - abs(new) if new * old >= 0 else abs(old)
+            if lost > down * (dt / NS + 0.002) + 2 * room and not (saturated or self.cut):
+                raise BrokenError(
+                    "no deceleration is over its limit", at_ns,
+                    f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
+                )  # fmt: skip
+
+    def ramp_ns(self, stop: bool) -> int:
+        """Return how long the softest limits of this drive allow a ramp to rest to take."""
+        low = self.softest
+        rim = low["wheel_speed"] * self.radius
+        word = "stop_deceleration" if stop else "deceleration"
+        linear = min(low["linear_speed"], rim) / low[f"linear_{word}"]
+        angular = min(low["angular_speed"], rim / self.half) / low[f"angular_{word}"]
+        return int(max(linear, angular) * NS)
+
+    def _held(
+        self, at_ns: int, held: tuple[int, str], grows: bool, line: bytes, fastest: float
+    ) -> None:
+        since_ns, why = held
+        name = f"nothing moves after {why}"
+        if grows and at_ns > since_ns + self.period_ns:
+            raise BrokenError(name, at_ns, f"{line!r} grows, held since {since_ns / NS:.3f} s")
+        first_ns, then = self.braking = self.braking or (at_ns, fastest)
+        if at_ns - first_ns > 300_000_000 and fastest > then - 0.02:
+            raise BrokenError(name, at_ns, f"{line!r} as fast as at {first_ns / NS:.3f} s")
+        ramp_ns = self.ramp_ns(stop=why != "being switched off")
+        if at_ns > since_ns + ramp_ns + RAMP_NS + self.period_ns:
+            raise BrokenError(name, at_ns, f"{line!r} still, held since {since_ns / NS:.3f} s")
+
+    def wheels(self, at_ns: int, fastest: float) -> None:
+        """Judge the true wheels: those of a robot that is held must stand in the end."""
+        held = self.held
+        if held is None or fastest < 0.5 or self.pending:
+            return
+        since_ns, why = held
+        if at_ns < since_ns + self.ramp_ns(stop=False) + STAND_NS:
+            return
+        if all(at_ns - last_ns > 6 * NS for last_ns in self.troubles.values()):
+            text = f"a wheel turns at {fastest:.2f} rad/s, held since {since_ns / NS:.3f} s"
+            raise BrokenError(f"the wheels stand after {why}", at_ns, text)
+
+    def _wished(
+        self,
+        at_ns: int,
+        wheels: tuple[float, ...],
+        before: tuple[float, ...],
+        grows: bool,
+        line: bytes,
+    ) -> None:
+        if not grows and at_ns - self.wished_ns < 100_000_000:
+            return
+        wish, why = self._explains(at_ns, wheels, before, grows)
+        if wish is not None:
+            self.wished_ns, self.coasting = at_ns, None
+            return
+        if grows:
+            raise BrokenError(
+                "motion needs a fresh wish of an armed sender", at_ns, f"{line!r}: {why}"
+            )
+        fastest = max(map(abs, wheels))
+        if self.coasting is None:
+            self.coasting = at_ns, fastest
+        since_ns, then = self.coasting
+        if at_ns - since_ns > 300_000_000 and fastest > then - 0.02:
+            raise BrokenError("without a wish the robot slows down", at_ns, f"{line!r}: {why}")
+        if at_ns - since_ns > self.ramp_ns(stop=False) + RAMP_NS:
+            raise BrokenError("without a wish the robot comes to rest", at_ns, f"{line!r}: {why}")
+
+    def _explains(
+        self, at_ns: int, wheels: tuple[float, ...], before: tuple[float, ...], grows: bool
+    ) -> tuple[Wish | None, str]:
+        """Return a wish that allows this line, or None and what is wrong with the latest one."""
+        slack = self.period_ns + MARGIN_NS
+        wishes, longest = self.wishes, max(self.timeout.values()) + slack
+        while wishes and wishes[0][1].arrived_ns < at_ns - longest:
+            wishes.popleft()
+        why, lowest = "no command arrived within its timeout", self._lowest(at_ns)
+        for source, wish in reversed(wishes):
+            if wish.arrived_ns > at_ns or at_ns - wish.arrived_ns > self.timeout[source] + slack:
+                continue
+            if self.priority[source] < lowest:
+                why = f"{source} has a lower priority than a source that sends"
+                continue
+            if not wish.fresh:
+                why = f"{source} by {wish.identity} is stale"
+                continue
+            if self.neutral_first:
+                known = self.senders[source, wish.identity]
+                armed_ns = wish.armed_ns
+                if not wish.v and not wish.w:
+                    self._arm(known, at_ns)
+                    armed_ns = known.armed_ns
+                if armed_ns < self.armed_since_ns:
+                    why = f"{source} by {wish.identity} is not armed"
+                    continue
+            if not grows or self._leads(wish, wheels, before):
+                return wish, ""
+            why = f"{source} by {wish.identity} wishes {wish.v:g}, {wish.w:g}"
+        return None, why
+
+    def _lowest(self, at_ns: int) -> int:
+        """Return the highest priority of a source that certainly sends now."""
+        if self.churns:
+            return 0
+        found = 0
+        for source, wish in self.wishes:
+            age = at_ns - wish.arrived_ns
+            live = 2 * MARGIN_NS < age < self.timeout[source] - self.period_ns - MARGIN_NS
+            if live and wish.certain and wish.arrived_ns > self.armed_since_ns + MARGIN_NS:
+                found = max(found, self.priority[source])
+        return found
+
+    def _leads(self, wish: Wish, wheels: tuple[float, ...], before: tuple[float, ...]) -> bool:
+        """Return whether the way from `before` to `wheels` leads towards the wish."""
+        goal_v, goal_w = self.clamped(wish.v, wish.w)
+        for new, old, goal, room in zip(
+            self.twist(wheels),
+            self.twist(before),
+            (goal_v, goal_w),
+            (self.radius * 0.022, self.radius * 0.022 / self.half),
+            strict=True,
+        ):
+            grew = abs(new) > abs(old) + room or (new * old < 0 and abs(new) > room)
+            if grew and (goal * new <= 0 or abs(new) > abs(goal) + room):
+                return False
+        return True
+
+    def clamped(self, v: float, w: float) -> tuple[float, float]:
+        """Return a wish scaled down to the limits with its curvature kept."""
+        limits, scale = self.softest, 1.0
+        scale = min(scale, limits["linear_speed"] / abs(v) if v else 1.0)
+        scale = min(scale, limits["angular_speed"] / abs(w) if w else 1.0)
+        rim = max(abs(v - w * self.half), abs(v + w * self.half)) / self.radius
+        if rim:
+            scale = min(scale, limits["wheel_speed"] / rim)
+        return v * scale, w * scale

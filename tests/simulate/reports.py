@@ -1,0 +1,110 @@
+"""What the robot says of itself, held against what really happened.
+
+The lines on the wire do not show which of several commands the robot follows, or what `state` says
+of its speed while the board says nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from tests.simulate.ages import MARGIN_NS
+from tests.simulate.promises import BrokenError
+from tests.simulate.roads import NS, Message, Sample, stable
+
+KEPT = 4000
+"""Commands that are remembered: those of the longest timeout, 3 s, at 400 Hz by three senders."""
+
+ECHO_LINES, ECHO_CHANGE = 40, 6.0
+"""Lines with another speed, and rad/s of change in all, by which an echo is known as one: twice as
+many as the pages say, and three times the change."""
+
+
+class Reports:
+    """The commands that arrived at one daemon, by their time, and the newest it has followed."""
+
+    def __init__(self) -> None:
+        self._arrived: dict[int, tuple[str, int] | None] = {}
+        """Clock and number of the command that arrived at this monotonic time of the robot. None
+        if several did, or if the order of its clock says nothing."""
+        self._order: deque[int] = deque()
+        self._followed: dict[str, int] = {}
+        """The highest number that the robot has followed, by clock."""
+
+    def command(
+        self, sender: dict[str, Any], message: Message, sample: Sample, arrived_ns: int, loose: bool
+    ) -> None:
+        """Take note of a command; `loose` if other senders stamp by the same clock."""
+        known = None
+        if sample.clock and stable(sender) and not (loose or sender["churn"]):
+            known = sample.clock, message.number
+        if arrived_ns in self._arrived:
+            known = None
+        else:
+            self._order.append(arrived_ns)
+        self._arrived[arrived_ns] = known
+        while len(self._order) > KEPT:
+            del self._arrived[self._order.popleft()]
+
+    def follows(self, at_ns: int, followed_ns: int | None) -> None:
+        """Judge the command that the robot follows: none older than one that it has followed."""
+        if followed_ns is None:
+            return
+        known = self._arrived.get(followed_ns)
+        if known is None:
+            return
+        clock, number = known
+        newest = self._followed.get(clock, number)
+        if number < newest:
+            raise BrokenError(
+                "no older command after a newer one", at_ns,
+                f"number {number} of {clock} is followed after number {newest}",
+            )  # fmt: skip
+        self._followed[clock] = number
+
+
+def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -> None:
+    """Hold the speeds in `state` against the time at which the board was last heard."""
+    said = state["linear"], state["angular"], state["wheels"]
+    if at_ns - fed_ns > quiet_ns + 2 * MARGIN_NS and said != (None, None, []):
+        raise BrokenError(
+            "state has no speed of a silent board", at_ns,
+            f"last heard {fed_ns / NS:.3f} s, and state says {said}",
+        )  # fmt: skip
+
+
+def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
+    """Hold the counters against the number of commands that arrived: each is in one of them."""
+    counters = state["counters"]
+    counted = counters.get("commands", 0) + counters.get("commands_first_contact", 0)
+    counted += sum(n for name, n in counters.items() if name.startswith("command_"))
+    if counted != expected:
+        text = f"{expected} arrived, {counted} are counted: {counters}"
+        raise BrokenError("every command is counted", at_ns, text)
+
+
+class Echo:
+    """The lines while TX is joined to RX and no board answers."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self._lines, self._change = 0, 0.0
+        self._last: tuple[float, ...] = ()
+
+    def begin(self) -> None:
+        """Note that from now on the daemon hears itself."""
+        self.on = True
+        self._lines, self._change, self._last = 0, 0.0, ()
+
+    def line(self, at_ns: int, wheels: tuple[float, ...]) -> None:
+        """Judge a line: an echo through changes of speed is known as one."""
+        if not self.on or wheels == self._last:
+            return
+        pairs = zip(wheels, self._last or wheels, strict=True)
+        self._change += max(abs(new - old) for new, old in pairs)
+        self._last = wheels
+        self._lines += any(wheels)
+        if self._lines > ECHO_LINES and self._change > ECHO_CHANGE and any(wheels):
+            text = f"{self._lines} changes of speed, {self._change:.1f} rad/s in all, were an echo"
+            raise BrokenError("an echo is no board", at_ns, text)

@@ -1,0 +1,243 @@
+"""The messages of one sender of a plan: when each is sent, when it arrives, and its bytes.
+
+Nothing here knows the product: the formats are those of `deploy/clients/README.md`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+import struct
+from typing import Any, NamedTuple
+
+import msgspec
+
+NS = 1_000_000_000
+STEADY = ("client", "page")
+FOREIGN = ("signed", "rmw", "header", "zenoh", "bridged")
+AHEAD_NS = NS // 2
+"""Zenoh replaces a timestamp that is further ahead of the receiver's clock."""
+
+JUNK = ("garbage", "not a number", "delete", "wildcard", "huge", "stranger", "cancels", "fields")
+
+
+class Message(NamedTuple):
+    """One command, as the omniscient view knows it. Times are true ns."""
+
+    sent_ns: int
+    arrives_ns: int
+    v: float
+    w: float
+    stamp_ns: int
+    number: int
+    junk: str
+
+
+class Sample(NamedTuple):
+    """What the bus hands over, and whom the sender's identity makes it come from."""
+
+    key: str
+    payload: bytes
+    options: dict[str, Any]
+    identity: str
+    shared: bool
+    clock: str
+    """The clock that stamped it, "" without a stamp."""
+
+
+def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) -> list[Message]:
+    """Return all messages of a sender in the order of their arrival. `wall_ns` is at time 0."""
+    dice = random.Random(f"{seed} {sender['name']}")
+    found: list[Message] = []
+    last_ns, number, t = 0, 0, float(sender["from"])
+    phases, place = sender["phases"], -1
+    while t < min(sender["to"], seconds):
+        while place + 1 < len(phases) and phases[place + 1][0] <= t:
+            place += 1
+        chance = [dice.random() for _ in range(6)]
+        wish: list[Any] = phases[place][1:] if place >= 0 else [None, None]
+        if wish[0] is not None:
+            number += 1
+            late = sender["delay"] + _jitter(sender["jitter"], chance[0]) + _held(sender, t)
+            arrives_ns = int((t + late) * NS)
+            lost = chance[1] < sender["loss"]
+            junk = JUNK[int(chance[2] * 1e6) % len(JUNK)] if chance[3] < sender["junk"] else ""
+            if not lost:
+                arrives_ns = last_ns = max(last_ns + 1000, arrives_ns)
+                if chance[4] < sender["swap"]:
+                    arrives_ns += int(1.5 / sender["hz"] * NS)
+                stamp_ns = wall_ns + int((t + _ahead(sender, t)) * NS)
+                v, w = float(wish[0]), float(wish[1])
+                message = Message(int(t * NS), arrives_ns, v, w, stamp_ns, number, junk)
+                found.append(message)
+                if chance[5] < sender["twice"]:
+                    again_ns = arrives_ns + int(chance[0] * 0.4 * NS)
+                    found.append(message._replace(arrives_ns=again_ns))
+        t += (0.9 + 0.2 * chance[0]) / sender["hz"] if sender["jitter"] else 1 / sender["hz"]
+    end_ns = int((seconds + 0.2) * NS)
+    return sorted((one for one in found if one.arrives_ns < end_ns), key=lambda m: m.arrives_ns)
+
+
+def _jitter(scale: float, chance: float) -> float:
+    return min(0.1, -scale * math.log(1.0 - chance)) if scale else 0.0
+
+
+def _held(sender: dict[str, Any], t: float) -> float:
+    """How much longer a message takes that is sent at `t`, s."""
+    for begin, end, shape, size in sender["congestion"]:
+        if shape == "drain":
+            # Everything waits until half of the time is over, then flows faster than it was sent.
+            middle = (begin + end) / 2
+            if begin <= t < end:
+                return float(max(0.0, middle + (t - begin) / size - t))
+            continue
+        if not begin <= t < end:
+            continue
+        match shape:
+            case "grow":
+                return float(size * (t - begin))
+            case "jump":
+                return float(size)
+            case "hole":
+                return float(end - t)
+            case "burst":
+                return float(size - (t - begin) % size)
+    return 0.0
+
+
+def _ahead(sender: dict[str, Any], t: float) -> float:
+    """By how much the sender's clock is ahead of the true one, s."""
+    ahead = sender["ahead"] + sender["drift"] * t
+    for kind, at, *rest in sender["clock"]:
+        if kind == "step" and t >= at:
+            ahead += rest[0]
+        elif kind == "slew" and t >= at:
+            ahead += rest[1] * (min(t, rest[0]) - at)
+    return float(ahead)
+
+
+def stable(sender: dict[str, Any]) -> bool:
+    """Return whether nothing adjusts this sender's clock."""
+    return not sender["clock"]
+
+
+def sample(
+    sender: dict[str, Any], message: Message, config: dict[str, Any], robot_wall_ns: int
+) -> Sample:
+    """Return a message as it arrives at the robot, whose wall clock shows `robot_wall_ns`."""
+    way, source = sender["way"], sender["source"]
+    options: dict[str, Any] = {}
+    own = f"{sender['id']}{message.number}" if sender["churn"] else sender["id"]
+    identity, shared, clock = own, False, own
+    keeps = message.stamp_ns - robot_wall_ns <= AHEAD_NS
+    session, stamp_ns = "", None
+    by_key = f"native/{source}"
+    match way:
+        case "client" | "page" | "signed":
+            options["attachment"] = msgspec.msgpack.encode(
+                {"sender": own, "stamp": message.stamp_ns, "sequence": message.number}
+                | ({"steady": True} if way in STEADY else {})
+            )
+        case "rmw":
+            gid = hashlib.sha256(own.encode()).digest()[:16]
+            options["attachment"] = struct.pack(
+                "<qqB16s", message.number, message.stamp_ns, 16, gid
+            )
+        case "header":
+            identity, shared, clock = by_key, True, f"header {by_key}"
+        case "zenoh":
+            identity = clock = f"session of {own}"
+            session, stamp_ns = identity, message.stamp_ns
+        case "bridged":
+            identity = clock = "session of the bridge"
+            session, stamp_ns, shared = identity, message.stamp_ns, True
+        case "plain":
+            identity, shared, clock = by_key, True, ""
+        case "bridge":
+            identity, shared, clock = f"bridge/{source}", True, ""
+    via = "bridge" if way.startswith("bridge") else "rmw" if way == "rmw" else "native"
+    if stamp_ns is not None and not keeps:
+        session, stamp_ns, shared, clock = "", None, True, ""
+        identity = f"{via if via == 'bridge' else 'native'}/{source}"
+    options.update(via=via, session=session, stamp_ns=stamp_ns)
+    key, payload = _payload(sender, message, config, via, options)
+    return Sample(key, payload, options, identity, shared, clock)
+
+
+def _payload(
+    sender: dict[str, Any],
+    message: Message,
+    config: dict[str, Any],
+    via: str,
+    options: dict[str, Any],
+) -> tuple[str, bytes]:
+    kind = "wheel_cmd" if sender["wheels"] and via == "native" else "cmd"
+    key, v, w = f"{kind}/{sender['source']}", message.v, message.w
+    match message.junk:
+        case "garbage":
+            return key, b'{"linear": {"x": '
+        case "delete":
+            options["put"] = False
+        case "wildcard":
+            return f"{kind}/*", b'{"linear": {"x": 1.0}, "angular": {}}'
+        case "huge":
+            return key, b'{"linear": {"x": 1.0}, "angular": {}}' + b" " * 5000
+        case "stranger":
+            key = f"{kind}/stranger"
+        case "not a number":
+            v = math.nan
+        case "fields":
+            return key, b'{"linear": {"x": 1.0, "warp": 9}, "angular": {}}'
+    if kind == "wheel_cmd":
+        return key, _wheels(config, v, w, cancels=message.junk == "cancels")
+    if message.junk == "cancels":
+        linear, angular = {"x": 0.0, "y": 1.0}, {"z": 0.0}
+    else:
+        linear, angular = {"x": v}, {"z": w}
+    if sender["form"] == "cdr" or via != "native" or math.isnan(v):
+        sideways = 1.0 if message.junk == "cancels" else 0.0
+        return key, _cdr(message, linear["x"], sideways, angular["z"], sender["way"], options)
+    body: dict[str, Any] = {"linear": linear, "angular": angular}
+    if sender["way"] == "header":
+        seconds, nanoseconds = divmod(message.stamp_ns, NS)
+        body = {"header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}}, "twist": body}
+    if sender["form"] == "msgpack":
+        return key, msgspec.msgpack.encode(body)
+    return key, json.dumps(body).encode()
+
+
+def _cdr(
+    message: Message, v: float, sideways: float, w: float, way: str, options: dict[str, Any]
+) -> bytes:
+    twist = struct.pack("<6d", v, sideways, 0.0, 0.0, 0.0, w)
+    name = "TwistStamped" if way == "header" else "Twist"
+    options["encoding"] = f"application/cdr;geometry_msgs/msg/{name}"
+    if way != "header":
+        return b"\0\1\0\0" + twist
+    seconds, nanoseconds = divmod(message.stamp_ns, NS)
+    # An empty frame_id is a length of 1 and a NUL; the doubles are aligned to 8.
+    return b"\0\1\0\0" + struct.pack("<iIIB3x", seconds, nanoseconds, 1, 0) + twist
+
+
+def _wheels(config: dict[str, Any], v: float, w: float, cancels: bool) -> bytes:
+    drive = config.get("drive", {})
+    radius = drive.get("wheel_radius", 0.05)
+    half = w * drive.get("wheel_separation", 0.3) / 2
+    left, right = (v - half) / radius, (v + half) / radius
+    speeds = [1.0, -1.0, 1.0, -1.0] if cancels else [right, left, left, right]
+    sides = ("front_right", "front_left", "rear_left", "rear_right")
+    names = [f"{side}_wheel_joint" for side in sides]
+    # msgpack says NaN, JSON does not.
+    return msgspec.msgpack.encode({"name": names, "velocity": speeds})
+
+
+def read_reply(reply: bytes, via: str) -> tuple[bool, str]:
+    """Return whether a call worked, and the answer in words."""
+    if via == "native":
+        found = msgspec.json.decode(reply)
+        return found["success"], found["message"]
+    # CDR: a bool, three bytes to the next multiple of four, and a string with its length.
+    length = struct.unpack_from("<I", reply, 8)[0]
+    return bool(reply[4]), reply[12 : 12 + length - 1].decode()

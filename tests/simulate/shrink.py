@@ -1,0 +1,141 @@
+"""Drops from a plan what its finding can spare: delta debugging (Zeller & Hildebrandt, 2002).
+
+A part of a plan is named by its path: a sender, an event, a phase of a sender, a setting. Each
+sender draws its chances by its own name, so the others do the same without it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+from tests.simulate.actors import Result, played
+from tests.simulate.plan import Plan
+from tests.simulate.product import problems
+
+Part = tuple[Any, ...]
+
+MOST_RUNS = 400
+"""Plans that are tried; what is left then is small enough to read."""
+
+
+class _Search:
+    def __init__(self, plan: Plan, promise: str, report: Callable[[str], None]) -> None:
+        self.plan, self.promise, self.report = plan, promise, report
+        self.runs = 0
+
+    def holds(self, plan: Plan) -> Result | None:
+        """Return the result if this plan still breaks the same promise."""
+        self.runs += 1
+        if self.runs > MOST_RUNS or problems(plan["config"]):
+            return None
+        result = played(plan)
+        return result if result.promise == self.promise else None
+
+    def drop(self, kind: Callable[[Plan], list[Part]]) -> None:
+        """Drop parts of one kind: halves first, then quarters, down to single ones."""
+        parts = kind(self.plan)
+        size = max(1, len(parts) // 2)
+        while parts:
+            for begin in range(0, len(parts), size):
+                less = without(self.plan, parts[begin : begin + size])
+                result = self.holds(less)
+                if result is not None:
+                    self.plan = less
+                    self.cut(result)
+                    parts = kind(self.plan)
+                    self.report(f"{self.runs} runs, {len(parts)} parts left: {result.finding}")
+                    size = max(1, min(size, len(parts) // 2))
+                    break
+            else:
+                if size == 1:
+                    return
+                size = max(1, size // 2)
+
+    def cut(self, result: Result) -> None:
+        """End the plan just behind the finding, unless only its end shows it."""
+        at = result.at_ns / 1e9
+        if at < self.plan["seconds"]:
+            self.plan = ended(self.plan, at)
+
+
+def ended(plan: Plan, at: float) -> Plan:
+    """Return the plan without all that begins behind this time."""
+    less = deepcopy(plan)
+    less["seconds"] = round(at + 0.5, 3)
+    less["events"] = [event for event in less["events"] if event["at"] <= at]
+    for sender in less["senders"]:
+        sender["phases"] = [phase for phase in sender["phases"] if phase[0] <= at]
+    return less
+
+
+def large(plan: Plan) -> list[Part]:
+    """Return the senders and events of a plan."""
+    return [(kind, n) for kind in ("senders", "events") for n in range(len(plan[kind]))]
+
+
+def small(plan: Plan) -> list[Part]:
+    """Return the phases, congestions and clock changes of all senders."""
+    lists = ("phases", "congestion", "clock")
+    return [
+        ("senders", n, name, place)
+        for n, sender in enumerate(plan["senders"])
+        for name in lists
+        for place in range(len(sender[name]))
+    ]
+
+
+def settings(plan: Plan) -> list[Part]:
+    """Return the settings that may be at their defaults; the simulator itself reads the others."""
+    needed = ("limits", "commands")
+    return [
+        ("config", table, key)
+        for table, keys in plan["config"].items()
+        for key in keys
+        if table not in needed and key != "port"
+    ]
+
+
+def without(plan: Plan, parts: list[Part]) -> Plan:
+    """Return the plan without these parts."""
+    less = deepcopy(plan)
+    for part in sorted(parts, key=lambda one: [str(x).zfill(6) for x in one], reverse=True):
+        inner: Any = less
+        for name in part[:-1]:
+            inner = inner[name]
+        del inner[part[-1]]
+    return less
+
+
+def shrunk(plan: Plan, result: Result, report: Callable[[str], None] = lambda text: None) -> Plan:
+    """Return a smaller plan that breaks the same promise."""
+    search = _Search(plan, result.promise, report)
+    first = deepcopy(plan)
+    search.cut(result)
+    if search.holds(search.plan) is None:
+        search.plan = first
+    for kind in (large, small, settings, large):
+        search.drop(kind)
+    return search.plan
+
+
+def written(plan: Plan, result: Result, commit: str) -> str:
+    """Return a corpus file as text."""
+    found = {"promise": result.promise, "found": f"{commit} seed {result.seed}", "plan": plan}
+    return json.dumps(found, indent=1) + "\n"
+
+
+def kept(plan: Plan, result: Result, commit: str, path: Path) -> str:
+    """Write a corpus file, which `test_corpus.py` plays from now on; return where."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(written(plan, result, commit), encoding="utf-8")
+    return f"{path}: commit it with the change that mends this"
+
+
+def load(path: Path) -> Plan:
+    """Return the plan of a corpus file."""
+    plan: Plan = json.loads(path.read_text(encoding="utf-8"))["plan"]
+    return plan

@@ -1,0 +1,17 @@
+"""Every plan that once broke a promise breaks none now; `--shrink SEED --keep NAME` adds one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.simulate.actors import played
+from tests.simulate.shrink import load
+
+CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
+
+
+@pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.stem)
+def test_it_breaks_no_promise_any_more(path: Path) -> None:
+    assert played(load(path)).finding == ""

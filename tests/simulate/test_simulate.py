@@ -1,0 +1,221 @@
+"""The simulator itself: it repeats a seed to the byte, finds a planted fault and shrinks it."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+
+import pytest
+
+from tests.simulate import __main__ as main
+from tests.simulate import pairs, shrink
+from tests.simulate.actors import Result, played
+from tests.simulate.pairs import OURS, Pair, Trace
+from tests.simulate.plan import KINDS, Plan, made
+from tests.simulate.product import problems
+from tests.simulate.promises import BrokenError, Witness
+from tests.simulate.roads import NS, messages
+
+PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
+EMPTY: Plan = {
+    "seed": 0, "seconds": 2.0, "kinds": [], "board": [], "senders": [], "events": [],
+    "lawful": "a new client",
+}  # fmt: skip
+
+
+def quiet() -> Plan:
+    """A plan in which nothing happens but the lawful drive at the end."""
+    return EMPTY | {"config": PLAIN["config"]}
+
+
+def test_a_seed_gives_the_same_bytes_twice() -> None:
+    first, second = Trace(), Trace()
+    one = made(4, 15.0)
+    assert json.dumps(one) == json.dumps(made(4, 15.0))
+    results = [played(deepcopy(one), trace.step) for trace in (first, second)]
+    assert first.hashes == second.hashes
+    assert len(first.hashes) > 15
+    assert results[0].finding == results[1].finding == ""
+
+
+def test_a_plan_is_plain_data_and_plays_the_same_from_a_file() -> None:
+    first, second = Trace(), Trace()
+    played(made(9, 10.0), first.step)
+    played(json.loads(json.dumps(made(9, 10.0))), second.step)
+    assert first.hashes == second.hashes
+
+
+def test_every_configuration_of_a_plan_is_legal_and_every_kind_of_trouble_is_drawn() -> None:
+    plans = [made(seed) for seed in range(30)]
+    assert [problems(one["config"]) for one in plans] == [[]] * 30
+    assert {kind for one in plans for kind in one["kinds"]} == set(KINDS)
+
+
+def test_a_sender_sends_the_same_without_the_other_senders() -> None:
+    one = next(p for p in map(made, range(20)) if len(p["senders"]) > 2)
+    alone = shrink.without(one, [("senders", 0)])
+    both = [
+        messages(plan_["senders"][place], plan_["seed"], one["seconds"], 0)
+        for plan_, place in ((one, 1), (alone, 0))
+    ]
+    assert both[0] == both[1] != []
+
+
+def test_a_quiet_plan_breaks_no_promise() -> None:
+    assert played(quiet()).finding == ""
+
+
+def test_a_seed_of_a_replay_is_played_and_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(main, "made", lambda seed: made(seed, 3.0))
+    assert main.replay("17") == 0
+    assert " s simulated in " in capsys.readouterr().out
+    broken = Result(17, "a promise at 2.000 s: so", "a promise", 2 * NS, 2.0, 0.1, Counter())
+    monkeypatch.setattr(main, "played", lambda plan: broken)
+    assert main.replay("17") == 1
+    assert " seed 17: a promise at 2.000 s: so\n" in capsys.readouterr().out
+
+
+def test_seeds_are_played_until_the_time_is_simulated_and_what_they_covered_is_printed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(main, "made", lambda seed: made(seed, 3.0))
+    assert main.explore(1, 0.012, 2) == 0
+    out = capsys.readouterr().out
+    assert re.search(r": \d runs from seed 1, 0\.0\d h simulated in .* 0 findings\n", out)
+    assert re.search(r"^  way +\w+ \d", out, re.MULTILINE)
+
+
+# the witness
+
+
+def moves(witness: Witness, at_s: float) -> None:
+    """Put a first slow line on the wire."""
+    witness.line(
+        int(at_s * NS), b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", int(at_s * NS), int(at_s * NS)
+    )
+
+
+def witnessed() -> Witness:
+    """A witness of a robot that has just started, and drives."""
+    witness = Witness(PLAIN["config"])
+    witness.step(NS // 2, "driving", "driving: commanded by app")
+    return witness
+
+
+@pytest.mark.parametrize(
+    ("what", "promise"),
+    [
+        (lambda w: None, "motion needs a fresh wish of an armed sender"),
+        (lambda w: w.stops.append(NS // 2), "nothing moves after a stop"),
+        (lambda w: w.offs.append(NS // 2), "nothing moves after being switched off"),
+        (lambda w: w.step(NS, "fault", "it is broken somehow"), "no fault without a cause"),
+        (lambda w: w.step(NS, "ready", ""), "every state has a reason"),
+        (
+            lambda w: w.line(NS, b"ap99.00,bp99.00,cp99.00,dp99.00\r\n", NS, NS),
+            "no wheel is over its limit",
+        ),
+        (
+            lambda w: w.line(NS, b"ap05.00,bp05.00,cp05.00,dp05.00\r\n", NS, NS),
+            "no acceleration is over its limit",
+        ),
+        (
+            lambda w: w.line(NS, b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", 0, NS),
+            "a silent board gets zeros",
+        ),
+        (lambda w: w.line(NS, b"ap00.02,bp00.02\r\n", NS, NS), "every line is whole"),
+    ],
+)
+def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], promise: str) -> None:
+    witness = witnessed()
+
+    def run() -> None:
+        what(witness)
+        moves(witness, 1.0)
+
+    with pytest.raises(BrokenError) as broken:
+        run()
+    assert broken.value.promise == promise
+
+
+def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> None:
+    witness = witnessed()
+    witness.stops.append(5 * NS)
+    with pytest.raises(BrokenError, match="releases no later stop"):
+        witness.cleared(9 * NS, 4 * NS, "cleared; each sender must send a zero", "ann")
+    witness.cleared(9 * NS, 6 * NS, "cleared; each sender must send a zero", "ann")
+    assert witness.held is None
+
+
+# shrinking
+
+
+def test_shrinking_leaves_what_the_finding_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(one: Plan) -> Result:
+        verbs = [event.get("verb") for event in one["events"]]
+        found = "clear" in verbs and any(s["phases"] for s in one["senders"])
+        name = "a made-up promise" if found else ""
+        return Result(1, name, name, int(500 * NS), 1.0, 0.1, Counter())
+
+    monkeypatch.setattr(shrink, "played", broken)
+    dice = random.Random(1)
+    large = next(
+        p for p in map(made, range(99)) if any(e.get("verb") == "clear" for e in p["events"])
+    )
+    dice.shuffle(large["events"])
+    small = shrink.shrunk(large, broken(large))
+    assert [event.get("verb") for event in small["events"]] == ["clear"]
+    assert [len(sender["phases"]) for sender in small["senders"]] == [1]
+    assert not problems(small["config"])
+
+
+# pairs
+
+
+def copy_of_the_package(where: Path) -> Path:
+    """Make another checkout of the package alone, as an installed wheel is one."""
+    shutil.copytree(OURS / "acsard", where / "acsard", ignore=shutil.ignore_patterns("__pycache__"))
+    return where
+
+
+def test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_one_else(
+    tmp_path: Path,
+) -> None:
+    other = copy_of_the_package(tmp_path)
+    one = quiet()
+    pair = Pair(OURS, other)
+    assert pair.sides[1].package.is_relative_to(tmp_path)
+    assert pair.differs(one)[0] == ""
+    pair.close()
+    words = other / "acsard" / "drive" / "words.py"
+    text = words.read_text(encoding="utf-8")
+    words.write_text(text.replace("waiting for a command", "no command"), encoding="utf-8")
+    pair = Pair(OURS, other)
+    difference, _ = pair.differs(one)
+    pair.close()
+    assert "reason: here 'waiting for a command" in difference
+    assert "there 'no command" in difference
+
+
+def test_an_event_that_is_left_out_of_pairs_is_in_no_plan_of_theirs() -> None:
+    one = next(p for p in map(made, range(99)) if any(e["do"] == "restart" for e in p["events"]))
+    less = pairs.comparable(one, (("do", "restart", "it restarts in another way"),))
+    assert {event["do"] for event in one["events"]} - {event["do"] for event in less["events"]} == {
+        "restart"
+    }
+
+
+def test_a_listed_difference_is_taken_out_on_both_sides() -> None:
+    listed = (("reason", "no command|waiting for a command", "X", "new words"),)
+    steps = [
+        pairs.rewritten({"at": 1, "reason": words}, listed)
+        for words in ("waiting for a command: now", "no command: now")
+    ]
+    assert steps[0] == steps[1] == {"at": 1, "reason": "X: now"}
