@@ -3,8 +3,8 @@
 It prints the time of each run. Four busy loops run at the same time with the same priority. The
 tests start as nohup and a script's `&` start a program: there is no terminal, standard input is
 empty, SIGINT and SIGHUP are ignored, and LC_ALL is C. They run as a plain user; if root starts this
-program, that is the user nobody, who must be able to run this Python. The exit code is 0 if no run
-failed.
+program, that is the user nobody, which must be able to run this Python. The exit code is 0 if no
+run failed.
 
 `python -m tests.loaded -n 1 -- tests/system` runs one part once; the words after `--` go to pytest.
 """

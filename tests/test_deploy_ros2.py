@@ -471,7 +471,7 @@ def test_the_toml_of_the_readme_is_accepted() -> None:
 
 
 def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
-    """Without a namespace the bridge shows nothing of a robot that has one.
+    """If the bridge has no namespace, it shows nothing of a robot that has one.
 
     Over the network each robot has one.
     """

@@ -56,7 +56,7 @@ def asked_everything(world: World) -> None:
 
 
 def names(texts: list[bytes]) -> list[str]:
-    """Every word, and every run of characters between quotes, that may be a sender's id."""
+    """Return every word, and every quoted run of characters, that may be a sender's id."""
     found: dict[str, None] = {}
     for text in texts:
         decoded = text.decode("utf-8", "replace")

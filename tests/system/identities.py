@@ -19,7 +19,7 @@ ADMITTED: tuple[Identity, ...] = ("local", "viewer", "operator", "maintainer")
 """Plain TCP on this machine, and the certificates that `acsard lan init` makes."""
 
 STRANGERS: tuple[Identity, ...] = ("unlisted", "nobody", "foreign", "expired")
-"""A valid certificate without a role, no certificate, one of another CA, and an expired one."""
+"""A valid but unlisted certificate, no certificate, another CA's operator, and an expired one."""
 
 
 class Certificates:

@@ -1,6 +1,6 @@
 """A client that is admitted over TLS cannot disturb the loop, the stop or the other users.
 
-Each attack comes with a viewer's certificate and with a certificate without a role, while a local
+Each attack comes with a viewer's certificate and with an unlisted certificate, while a local
 client drives. The attack goes to the robot's own TLS gateway, and to the router of a fleet to which
 the robot belongs.
 """

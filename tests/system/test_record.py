@@ -1,6 +1,6 @@
 """The real process keeps its recording when killed or ended, and drives on without a disk.
 
-Real disks that fail are in `test_record_disks.py`.
+The same holds for a full disk. Real disks that fail are in `test_record_disks.py`.
 """
 
 from __future__ import annotations

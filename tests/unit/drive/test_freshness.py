@@ -461,6 +461,21 @@ def test_a_minimum_that_fell_for_a_moment_still_bounds_a_steady_clock() -> None:
     assert "fresh" in clock.steadily(5.0, 500)
 
 
+def test_adjustments_that_showed_are_forgotten_once_the_clock_is_prompt_again() -> None:
+    clock = Clock()
+    for _ in range(50):
+        clock.sends(100.0)
+        assert clock.sends(0.0) == "fresh"
+    clock.now += 5000
+    assert set(clock.steadily(5000.0, 5000)) == {"stale"}
+
+
+def test_a_clock_that_was_set_forward_by_minutes_is_not_new() -> None:
+    clock = Clock()
+    assert clock.sends(-300_000.0) == "stale"
+    assert "set" in clock.steadily(-300_000.0, 2000)
+
+
 @pytest.mark.parametrize("steady", [True, False])
 def test_a_network_that_holds_all_back_for_minutes_does_not_make_a_clock_new(steady: bool) -> None:
     clock = Clock(steady=steady)
