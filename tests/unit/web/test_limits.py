@@ -134,11 +134,11 @@ def test_the_page_tells_the_places_that_there_are() -> None:
     page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
     told = " ".join(page.read_text(encoding="utf-8").split())
     assert (
-        f"There is room for {CONNECTIONS} from elsewhere: at most {CONNECTIONS_OF_ONE} of one "
-        f"address (whatever their tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
+        f"room for {CONNECTIONS} connections from other machines: at most {CONNECTIONS_OF_ONE} of "
+        f"one address (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
         f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
     ) in told
-    assert f"At the machine there is room for {CONNECTIONS_HERE}, " in told
+    assert f"room for another {CONNECTIONS_HERE} connections from the machine itself" in told
 
 
 def test_each_token_has_a_pace_of_its_own() -> None:

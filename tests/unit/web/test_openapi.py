@@ -59,7 +59,11 @@ def test_every_schema_is_one() -> None:
 
 PAGE = Path(__file__).parents[3] / "deploy/web/README.md"
 
-TO_IT = PAGE.read_text().partition("| to the robot |")[2].partition("| from it |")[0]
+TO_IT = (
+    PAGE.read_text()
+    .partition("| message to the robot |")[2]
+    .partition("| message from the robot |")[0]
+)
 
 MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one]
 
