@@ -191,13 +191,15 @@ class Witness:
     def _release(
         self, latched: list[int], promise: str, asked_ns: int, read_ns: int | None, name: str
     ) -> None:
-        for at_ns in latched:
+        # A stop that arrived behind the call stays latched. The answer may be later than both.
+        later = [at_ns for at_ns in latched if at_ns > asked_ns]
+        for at_ns in latched[: len(latched) - len(later)]:
             seen = read_ns is not None and read_ns >= at_ns
             late = read_ns is None and asked_ns >= at_ns + 2 * NS - MARGIN_NS
             if not (seen or late):
                 text = f"the call of {name} released what was latched at {at_ns / NS:.3f} s"
                 raise BrokenError(promise, asked_ns, text)
-        latched.clear()
+        latched[:] = later
 
     def set_limits(self, at_ns: int, settings: dict[str, float]) -> None:
         """Note settings that the daemon says it has taken."""
