@@ -1,4 +1,4 @@
-"""What holds for every test: the hypothesis profile, and signals as at a terminal."""
+"""Set up every test run: the hypothesis profiles, and signals as a terminal delivers them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadGroupScheduling
 
-# No deadline: a slow machine must not fail a true sentence. The same examples every time: what a
-# change is judged by must not be luck. `explore` looks for new ones.
+# There is no deadline, because a slow machine must not fail a property that holds. The examples are
+# the same in every run, so that luck never decides how a change is judged. `explore` looks for new
+# examples.
 settings.register_profile("default", deadline=None, max_examples=10, derandomize=True)
 settings.register_profile("thorough", deadline=None, max_examples=100, derandomize=True)
 """`pytest --hypothesis-profile thorough`, as `.ci/run` does."""
@@ -25,17 +26,19 @@ settings.register_profile("explore", deadline=None, max_examples=3000)
 """`pytest --hypothesis-profile explore tests/unit`: 8 minutes, other examples each time."""
 settings.load_profile("default")
 
-# nohup and a script's `&` start a program with these ignored, and what a test starts inherits that.
-# A handler is not inherited; one that does nothing ignores them as well.
+# nohup and a script's `&` start a program with these signals ignored, and the programs that a test
+# starts inherit that. A handler is not inherited, and a handler that does nothing ignores the
+# signals just as well.
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)
 
-# Where bytecode may not be written, as in many containers, or by a user who does not own the clone,
-# each of the hundreds of daemons here would compile all of acsard anew, and each worker the tests.
+# In many containers, and for a user who does not own the clone, Python cannot write bytecode. Each
+# of the hundreds of daemons here would then compile all of acsard again, and each worker would
+# compile the tests again.
 if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
     place = str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
-    if "PYTHONPYCACHEPREFIX" in os.environ:  # a worker's
+    if "PYTHONPYCACHEPREFIX" in os.environ:  # this is an xdist worker
         place = os.environ["PYTHONPYCACHEPREFIX"]
     elif not os.access(__file__, os.W_OK):
         place = tempfile.mkdtemp(prefix="acsard-")
@@ -46,13 +49,19 @@ if sys.dont_write_bytecode or not os.access(__file__, os.W_OK):
 
 
 TIMED = {"bench": "timed", "firmware": "timed", "system": "timed", "systemd": "systemd"}
-"""Where real time passes, and its group: those of one run one after the other. What a container
-waits for minds company as little as what is only computed, so it goes on beside the others; a mark
-of its own says the same of a single test."""
+"""Directories whose tests depend on real time, and the group of each.
+
+The tests of one group run one after the other. Waiting for a container tolerates a busy machine as
+well as pure computation does, so the systemd group runs in parallel with the others. A mark on a
+single test puts that test into a group.
+"""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes for what `.ci/run` runs; one, which shows what is printed, for any other."""
+    """Use two processes for the suite that `.ci/run` runs, and one for any other call.
+
+    A single process shows the output that tests print.
+    """
     part = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
     other = (
         config.option.capture == "no" or "soak" not in config.option.markexpr.partition("not")[2]
@@ -61,8 +70,11 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 class _ByFile(LoadGroupScheduling):  # type: ignore[misc]
-    """Groups, and of all else whole files: after each test all that its worker was ever given is
-    counted anew, so 10,000 handed out one by one take the time of many tests."""
+    """Distribute groups, and every other test by whole files.
+
+    After each test xdist counts every test that the worker was ever given. Handing out 10,000 tests
+    one by one therefore costs as much time as many tests.
+    """
 
     def _split_scope(self, nodeid: str) -> str:
         scope: str = super()._split_scope(nodeid)
@@ -70,7 +82,7 @@ class _ByFile(LoadGroupScheduling):  # type: ignore[misc]
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> _ByFile:
-    config.option.loadscopereorder = False  # the longest group is first as it is
+    config.option.loadscopereorder = False  # the longest group already comes first
     return _ByFile(config, log)
 
 
@@ -86,7 +98,7 @@ def _all_but_some_are_slow(items: list[pytest.Item]) -> None:
         seen[test] += 1
 
 
-@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
+@pytest.hookimpl(tryfirst=True)  # runs before `-m` selects tests
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     here = Path(__file__).parent
     _all_but_some_are_slow(items)
@@ -98,7 +110,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """To look through thousands of tests for what nobody holds took a quarter of a second: in the
-    middle of a test that times something."""
+    """Exempt the collected tests from garbage collection.
+
+    Scanning thousands of tests took a quarter of a second, and it could happen in the middle of a
+    test that measures time.
+    """
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""What `/ws` says, held against the OpenAPI document by a validator that is not ours."""
+"""Check the messages of `/ws` against the OpenAPI document with an independent validator."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COMPONENTS = document("1")["components"]
 SCHEMAS = COMPONENTS["schemas"]
 
 NO_VALUE = {"of": "nothing"}
-"""What no field may be."""
+"""A value that is not valid for any field."""
 
 
 def _judge(schema: dict[str, Any]) -> Draft202012Validator:
@@ -34,7 +34,7 @@ _FRAME = _judge({"$ref": f"#/components/schemas/{FROM_ROBOT}"})
 
 
 def kinds(frames: Iterable[Any]) -> set[str]:
-    """What they are; fails for one that is described by none or by several."""
+    """Return the kinds of these frames. Fails if no description, or more than one, fits a frame."""
     found = set()
     for frame in frames:
         (kind,) = [name for name, judge in FRAMES.items() if judge.is_valid(frame)] or [frame]
@@ -47,11 +47,11 @@ def kinds(frames: Iterable[Any]) -> set[str]:
 
 
 def spoilt(frame: dict[str, Any]) -> list[dict[str, Any]]:
-    """The same with a field that is missing, or another thing than it has to be."""
+    """Yield copies of the frame with a field missing or with a value of the wrong type."""
     without = [{key: one for key, one in frame.items() if key != name} for name in frame]
     return without + [frame | {name: NO_VALUE} for name in frame]
 
 
 def taken(frame: dict[str, Any]) -> bool:
-    """It is as described."""
+    """Return whether the frame matches its description."""
     return bool(_FRAME.is_valid(frame))

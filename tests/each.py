@@ -1,5 +1,8 @@
-"""`@each`: as `parametrize`, but one test for all sets. Ten thousand tests of a microsecond take
-longer to hand out and to report than to run; what fails says with which set."""
+"""Provide `@each`: like `parametrize`, but as one test for all parameter sets.
+
+Ten thousand tests of a microsecond take longer to distribute and report than to run. A failure
+names its parameter set.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,11 @@ from typing import Any
 
 
 def each(names: str | tuple[str, ...], sets: Iterable[Any]) -> Callable[[Any], Any]:
-    """Run the test for each of these; one decorator above another gives all combinations. Fixtures
-    are the same for all of them: they must not remember."""
+    """Run the test for each of these parameter sets.
+
+    Stacked decorators give all combinations. All sets share the same fixtures, so a fixture must
+    not keep state.
+    """
     every = list(sets)
     given = (names,) if isinstance(names, str) else names
 

@@ -1,10 +1,12 @@
-"""`python -m tests.loaded`: the test command where it is hardest, several times, with its times.
+"""`python -m tests.loaded`: run the test command several times under the hardest conditions.
 
-Beside it run four loops that take all they get, at the same priority. The tests run as nohup and a
-script's `&` start a program: no terminal, nothing on standard input, SIGINT and SIGHUP ignored,
-LC_ALL=C; and by a plain user, nobody when root starts this (who must be able to run this Python).
-It ends with 0 when no run failed. `python -m tests.loaded -n 1 -- tests/system` is one run of a
-part; what stands behind `--` goes to pytest.
+It prints the time of each run. Four busy loops run at the same time with the same priority. The
+tests start as nohup and a script's `&` start a program: there is no terminal, standard input is
+empty, SIGINT and SIGHUP are ignored, and LC_ALL is C. They run as a plain user; if root starts this
+program, that is the user nobody, which must be able to run this Python. The exit code is 0 if no
+run failed.
+
+`python -m tests.loaded -n 1 -- tests/system` runs one part once; the words after `--` go to pytest.
 """
 
 from __future__ import annotations
@@ -27,15 +29,15 @@ ROOT = Path(__file__).resolve().parents[1]
 NOBODY = 65534
 
 LOOP = "import os, sys\nwhile os.getppid() == int(sys.argv[1]):\n    pass"
-"""Ends by itself when this program does."""
+"""A busy loop that ends by itself when this program ends."""
 
 
 class Run(NamedTuple):
-    """What became of one run of the test command."""
+    """The result of one run of the test command."""
 
     seconds: float
     code: int | None
-    """None when its time was up."""
+    """None if the run exceeded its time limit."""
     said: str
 
     @property
@@ -44,13 +46,13 @@ class Run(NamedTuple):
 
     @property
     def again(self) -> list[str]:
-        """What failed while no core was free, and was judged again."""
+        """Return the tests that failed while no core was free and were run again."""
         return re.findall(r"^RERUN .*$", self.said, re.M)
 
 
 @contextmanager
 def loops(count: int) -> Iterator[None]:
-    """So many busy loops beside what is done in here."""
+    """Run this number of busy loops while the body runs."""
     with ExitStack() as stack:
         for _ in range(count):
             words = [sys.executable, "-c", LOOP, str(os.getpid())]
@@ -60,20 +62,20 @@ def loops(count: int) -> Iterator[None]:
 
 
 def plain_user() -> dict[str, object]:
-    """How Popen starts a process of a user without rights."""
+    """Return the arguments that make Popen start a process of a user without rights."""
     if os.geteuid() != 0:
         return {}
     return {"user": NOBODY, "group": NOBODY, "extra_groups": []}
 
 
 def unattended() -> None:
-    """As nohup and `&` leave a program; called in the child."""
+    """Ignore signals as nohup and `&` do; called in the child process."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
 
 
 def environment(home: Path) -> dict[str, str]:
-    """A plain user's, who can write to a home only."""
+    """Return the environment of a plain user who can write only to a home directory."""
     kept = {key: os.environ[key] for key in ("PATH", "VIRTUAL_ENV") if key in os.environ}
     return kept | {
         "HOME": str(home),
@@ -85,7 +87,7 @@ def environment(home: Path) -> dict[str, str]:
 
 
 def run(home: Path, words: list[str], within: float) -> Run:
-    """The test command once; ended with all it has started when its time is up."""
+    """Run the test command once. Ends it, with all processes it started, when its time is up."""
     command = [sys.executable, "-m", "pytest", "-q", "-o", f"cache_dir={home}/cache", *words]
     log, begun = home / "log", time.monotonic()
     with (

@@ -1,8 +1,9 @@
-"""`python -m tests.lock`: writes `deploy/systemd/requirements.lock` anew, with today's versions.
+"""`python -m tests.lock`: rewrite `deploy/systemd/requirements.lock` with today's versions.
 
-It asks pip what an install of acsard with the extras `lan` and `web` takes from the package index,
-also to build it, for each Python we support on x86_64 and aarch64, and pins it with the hashes of
-those wheels. All get the same versions. `--check` tells what would change and writes nothing.
+It asks pip which distributions an install of acsard with the extras `lan` and `web` takes from the
+package index, including those needed to build it. It asks for each supported Python on x86_64 and
+aarch64, and pins the hashes of those wheels. All platforms get the same versions. `--check` prints
+the changes and writes nothing.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ PYTHONS = ("3.11", "3.12", "3.13")
 MACHINES = ("x86_64", "aarch64")
 
 GLIBC = 36
-"""Debian 12 has 2.36: wheels for it and for all before."""
+"""Wheel platforms.
+
+Debian 12 has glibc 2.36, which runs wheels for 2.36 and for all earlier versions.
+"""
 
 HEAD = """\
 # What the service is built with and runs on, for Python 3.11 to 3.13 on x86_64 and aarch64:
@@ -41,7 +45,7 @@ HEAD = """\
 
 
 def wanted() -> list[str]:
-    """What `pyproject.toml` asks for, to build it and to run it."""
+    """Return the requirements in `pyproject.toml`, both to build acsard and to run it."""
     pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project = pyproject["project"]
     asked = {*pyproject["build-system"]["requires"], *project["dependencies"]}
@@ -49,7 +53,10 @@ def wanted() -> list[str]:
 
 
 def resolved(python: str, machine: str, held: dict[str, str]) -> dict[str, tuple[str, str]]:
-    """Version and hash of each distribution pip would install there, held to these versions."""
+    """Return the version and hash of each distribution that pip would install on that platform.
+
+    The given versions constrain pip.
+    """
     platforms = [f"manylinux_2_{minor}_{machine}" for minor in range(GLIBC, 4, -1)]
     platforms += [f"manylinux2014_{machine}"]
     with tempfile.TemporaryDirectory() as path:
@@ -74,10 +81,10 @@ def resolved(python: str, machine: str, held: dict[str, str]) -> dict[str, tuple
 
 
 def lock() -> str:
-    """The whole file."""
+    """Return the contents of the whole lock file."""
     versions: dict[str, str] = {}
     hashes: defaultdict[str, set[str]] = defaultdict(set)
-    # The oldest Python first: what it cannot have no other one gets.
+    # Resolve for the oldest Python first: no other Python gets a version that it cannot install.
     for python, machine in product(PYTHONS, MACHINES):
         for name, (version, digest) in resolved(python, machine, versions).items():
             assert versions.setdefault(name, version) == version, name

@@ -1,6 +1,8 @@
-"""`python -m tests.lowest`: what pip is held to for the lowest versions `pyproject.toml` allows.
+"""`python -m tests.lowest`: print pip constraints for the lowest allowed versions.
 
-It writes one `name==version` a line, of all that is depended on, for `pip install --constraint`.
+It writes one `name==version` per line: for each dependency the lowest version that
+`pyproject.toml` allows. The output is for `pip install
+--constraint`.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ BOUND = re.compile(r"^([A-Za-z0-9-]+)>=([0-9.]+)")
 
 
 def lowest() -> dict[str, str]:
-    """The lowest version of each distribution."""
+    """Return the lowest version of each distribution."""
     pyproject = tomllib.loads(PYPROJECT.read_text())
     project, builder = pyproject["project"], pyproject["build-system"]["requires"]
     found: dict[str, str] = {}

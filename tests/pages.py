@@ -1,4 +1,7 @@
-"""What the pages say to type, and what runs each of it: a command that is not here fails a test."""
+"""List every command that the pages ask the reader to type, with the check that runs it.
+
+A command on a page that is missing here fails a test.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ LANGUAGES = {"", "console", "json5", "python", "sh", "toml", "yaml"}
 
 
 class Block(NamedTuple):
-    """A fenced block and where it is."""
+    """A fenced block and its place on a page."""
 
     page: str
     line: int
@@ -34,7 +37,7 @@ class Block(NamedTuple):
         return f"{self.page}:{self.line}"
 
     def commands(self) -> list[str]:
-        """What it says to type, without comments and what is printed."""
+        """Return the commands of the block, without comments and without printed output."""
         lines = self.text.splitlines()
         if self.language == "console":
             lines = [line.removeprefix("$ ") for line in lines if line.startswith("$ ")]
@@ -49,7 +52,7 @@ def text_of(page: str) -> str:
 
 
 def blocks(*languages: str) -> list[Block]:
-    """The fenced blocks of all pages, of these languages or of any."""
+    """Return the fenced blocks of all pages that are in these languages, or in any."""
     return list(_blocks(languages))
 
 
@@ -63,42 +66,43 @@ def _blocks(languages: tuple[str, ...]) -> Iterator[Block]:
 
 
 def prose(page: str) -> str:
-    """A page without its fenced blocks."""
+    """Return a page without its fenced blocks."""
     return _FENCED.sub("", text_of(page))
 
 
-# what runs each command
+# the check that runs each command
 
 
 class Run(NamedTuple):
-    """tests/system/test_pages.py types it beside a daemon on the simulator; what it then says."""
+    """A command that tests/system/test_pages.py types against a daemon on the simulator."""
 
     says: str = ""
-    """A pattern in its output."""
+    """A pattern that the command's output must match."""
     codes: tuple[int, ...] = (0,)
 
 
 class Elsewhere(NamedTuple):
-    """That test runs it, with other addresses and places."""
+    """A command that the named test runs, with other addresses and directories."""
 
     file: str
     test: str
     but: str = ""
-    """What is not as on the page beyond that: it is the nearest there is."""
+    """Any further difference between the test and the page. The test is the nearest one there is.
+    """
 
 
 class InCi(NamedTuple):
-    """.ci/run has it; the words there."""
+    """A command that .ci/run contains, in these words."""
 
     words: str
 
 
 class Collected(NamedTuple):
-    """A call of pytest: tests/system/test_pages.py asks it whether it finds tests."""
+    """A call of pytest. tests/system/test_pages.py checks that the call finds tests."""
 
 
 class Shown(NamedTuple):
-    """Nothing runs it; why."""
+    """A command that no test runs, and the reason."""
 
     why: str
 
@@ -454,7 +458,10 @@ COMMANDS: dict[str, How] = {
 
 
 def promises() -> list[list[str]]:
-    """What pytest is given for each row of the promises, and in each call of it in a block."""
+    """Return the arguments of each pytest call on the pages.
+
+    There is one per row of the table of promises, and one per call in a block.
+    """
     spans = []
     for row in re.findall(r"^\| .* \|$", text_of("tests/README.md"), re.M):
         cell = row.rstrip(" |").rpartition(" | ")[2]

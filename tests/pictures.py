@@ -1,8 +1,8 @@
-"""What the robot's page and a recording's report look like, for people to look at.
+"""Take pictures of the robot's page and of a recording's report, for people to look at.
 
-`python -m tests.pictures DIRECTORY` writes every view of the page as PNG, on a phone upright and
-sideways and on a desktop, light and dark; and the report of a drive, whole, 1280 and 390 pixels
-wide. With `--report` that alone.
+`python -m tests.pictures DIRECTORY` writes every view of the page as PNG: on a phone upright and
+sideways and on a desktop, in light and dark colours. It also writes the whole report of a drive,
+1280 and 390 pixels wide. `--report` writes the report alone.
 """
 
 from __future__ import annotations
@@ -30,8 +30,10 @@ LOOKS = ("light", "dark")
 
 
 def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = True) -> list[Path]:
-    """The pictures, named `phone-dark-drive.png`; light alone unless `both`. What the page wrote to
-    its console is an error."""
+    """Write the pictures, with names like `phone-dark-drive.png`, and return their paths.
+
+    Only light ones are written unless `both` is set. Console output of the page is an error.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     with (
         tempfile.TemporaryDirectory() as place,
@@ -55,7 +57,7 @@ def write(directory: Path, sizes: Sequence[str] = tuple(SIZES), *, both: bool = 
 
 
 def _drive(bus: Bus) -> None:
-    """A way to see on the map, and something that was refused."""
+    """Drive a path for the map, and cause a refused command."""
     bus.linked()
     for angular, key, target in ((0.0, "x", 0.6), (0.8, "yaw", 1.5), (0.0, "y", 1.2)):
         with bus.commanding(0.4, angular):
@@ -65,7 +67,7 @@ def _drive(bus: Bus) -> None:
 
 
 def show(browser: Browser, view: str) -> None:
-    """That one, when there is something in it."""
+    """Take that one picture if the view has contents."""
     browser.js(f"document.getElementById('tab-{view}').click()")
     rows = {"robots": "#cards a", "set": "#settings div", "status": "#parts li"}
     if row := rows.get(view):
@@ -86,7 +88,7 @@ DRAWN = "document.querySelectorAll('.picture.js-plotly-plot .main-svg').length"
 
 
 def report(directory: Path) -> list[Path]:
-    """The pictures of a drive's report, named `report-phone-dark.png`."""
+    """Write the pictures of a drive's report, with names like `report-phone-dark.png`."""
     directory.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place, browsing() as browser:
         drawn = Path(place) / "drive.html"
@@ -107,7 +109,7 @@ def report(directory: Path) -> list[Path]:
 
 
 def _recorded(path: Path) -> Path:
-    """Two minutes: two drive, one is stopped, links and wheels fail."""
+    """Record two minutes: two clients drive, one is stopped, and links and wheels fail."""
     tape = Tape()
     world = World(Config(), recorder=tape)
     two_drivers(world)

@@ -1,10 +1,11 @@
-"""`python -m tests.pythons PYTHON...`: recordings of this Python are lived again by others.
+"""`python -m tests.pythons PYTHON...`: check that Python versions replay each other's recordings.
 
-Ten minutes through every fault of the simulator are recorded by the Python that runs this, plain
-and on the checked link with counts and a gyro, each from its start and from a state in its middle.
-Each PYTHON (its path) then replays them and `tests/recordings`, in a venv of its own that has what
-the service is installed from, and records ten minutes that this one replays. A line for each file;
-it ends with 0 when every line, mode and pose is the same, to the last bit.
+The Python that runs this program records ten minutes through every fault of the simulator. It
+records them on the plain link, and on the checked link with counts and a gyro, each from the start
+and from a state in the middle. Each PYTHON (a path) then replays these recordings and
+`tests/recordings`. It does so in a venv of its own with the dependencies of the service, and
+records ten minutes that this Python replays. One line is printed per file. The exit code is 0 if
+every line, mode and pose is the same to the last bit.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ FULL = replace(
 )
 
 VERDICT = re.compile(r"([\d ]+) of \1 lines the same, ([\d ]+) of \2 poses, ([\d ]+) of \3 modes$")
-"""Of all, and no word of what is the same to the um only."""
+"""The verdict when everything is the same to the last bit, not merely to the micrometre."""
 
 
 def record(where: Path, seconds: float) -> list[Path]:
-    """The drives, by this Python."""
+    """Record the drives with this Python."""
     made = []
     for name, config in (("plain", PLAIN), ("full", FULL)):
         tape = Tape(every=50_000)
@@ -55,7 +56,7 @@ def record(where: Path, seconds: float) -> list[Path]:
 
 
 def installed(python: str, where: Path) -> str:
-    """The Python of a new venv."""
+    """Create a venv and return its Python."""
     subprocess.run([python, "-m", "venv", where], check=True)
     pip = [str(where / "bin/pip"), "install", "--quiet", "--disable-pip-version-check"]
     subprocess.run([*pip, "-r", str(ROOT / "deploy/systemd/requirements.lock")], check=True)
@@ -63,7 +64,7 @@ def installed(python: str, where: Path) -> str:
 
 
 def run(python: str, *words: str) -> str:
-    """What it prints, of acsard as it is here."""
+    """Run this Python with the acsard of this repository, and return its output."""
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [python, *words], cwd=ROOT, env=env, text=True, check=False,
@@ -73,12 +74,13 @@ def run(python: str, *words: str) -> str:
 
 
 def replays(python: str, paths: Sequence[Path]) -> bool:
-    """Does it live all of them again as they were? Says so of each."""
+    """Return whether that Python replays all recordings identically. Prints a line for each."""
     version, same = run(python, "-V"), True
     for path in paths:
         said = run(python, "-m", "acsard", "log", "replay", str(path))
         print(f"{version:14} {path.name:20} {said}", flush=True)
-        verdict, *_ = said.splitlines() or [""]  # what follows says what was compared
+        # the lines after the verdict list the items that were compared
+        verdict, *_ = said.splitlines() or [""]
         same = same and VERDICT.match(verdict) is not None
     return same
 

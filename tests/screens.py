@@ -1,6 +1,6 @@
-"""What `acsard drive`, `top`, `fleet` and `echo --short` show at 40, 80 and 160 columns, as text.
+"""`python -m tests.screens`: print the terminal screens at 40, 80 and 160 columns, as text.
 
-python -m tests.screens
+The screens are those of `acsard drive`, `top`, `fleet` and `echo --short`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ WIDTHS = (40, 80, 160)
 WAITING = replace(
     STATE, mode="ready", reason=f"ready: {chosen(Choice())}", linear=0.0, angular=0.0, source=""
 )
-"""The same robot when nobody drives it."""
+"""The same robot while no client drives it."""
 
 
 def screens(width: int) -> dict[str, list[str]]:
-    """By verb."""
+    """Return the lines of each screen, by verb."""
     robots = [test_roster.ROW, replace(test_roster.ROW, robot_id="robot2", state=WAITING)]
     return {
         "drive": [text for _, text in lines(replace(test_teleop.SEEN, state=WAITING), width)],

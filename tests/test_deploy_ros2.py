@@ -1,6 +1,6 @@
-"""deploy/ros2 is true: what it tells ROS of the robot is what acsard's defaults say.
+"""The files in deploy/ros2 describe the same robot to ROS as the defaults of acsard do.
 
-Nothing here needs ROS; that the files also please ROS itself is not shown by these tests.
+Nothing here needs ROS. These tests do not show that ROS itself accepts the files.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from acsard.ros.transports import ros_names
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()
-WHEEL_SIGNS = {  # x and y of each wheel's place
+WHEEL_SIGNS = {  # x and y of each wheel's position
     CONFIG.joints.front_right: (1, -1),
     CONFIG.joints.front_left: (1, 1),
     CONFIG.joints.rear_left: (-1, 1),
@@ -308,7 +308,10 @@ def test_the_launch_file_has_its_arguments_and_no_broadcaster() -> None:
 
 
 def launched(namespace: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
-    """The nodes, by executable; run with stand-ins for `launch` and `launch_ros` of ROS."""
+    """Run the launch file with stand-ins for ROS's `launch` and `launch_ros`.
+
+    Returns the nodes by executable.
+    """
     modules = ("launch", "launch.actions", "launch.conditions", "launch.substitutions")
     for module in (*modules, "launch_ros", "launch_ros.actions"):
         monkeypatch.setitem(sys.modules, module, MagicMock())
@@ -326,13 +329,16 @@ def launched(namespace: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[
 
 
 def hardware(nodes: dict[str, dict[str, Any]]) -> dict[str | None, str | None]:
-    """The parameters of the hardware plugin in the description that is published."""
+    """Return the hardware plugin's parameters from the published description."""
     text = nodes["robot_state_publisher"]["parameters"][0]["robot_description"]
     return {p.get("name"): p.text for p in ET.fromstring(text).findall("ros2_control//param")}
 
 
 def resolved(topic: str, namespace: str, remappings: list[tuple[str, str]]) -> str:
-    """What ROS makes of a topic in a process with these remappings: they hold for every node."""
+    """Return the name to which ROS resolves a topic in a process with these remappings.
+
+    The remappings hold for every node of the process.
+    """
 
     def full(name: str) -> str:
         return name if name.startswith("/") else f"{namespace and '/' + namespace}/{name}"
@@ -365,7 +371,7 @@ def test_the_launch_file_puts_the_namespace_before_every_topic(
 def test_the_hardware_of_ros2_control_hears_and_commands_the_robot(
     namespace: str, prefix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It lives in the process of ros2_control_node, and the remappings of that are its own."""
+    """The controller runs inside the process of ros2_control_node, which has its own remappings."""
     nodes = launched(namespace, monkeypatch)
     manager, parameters = nodes["ros2_control_node"], hardware(nodes)
     ours = {f"{prefix}/{row.name}": row.direction for row in ros_names(RosConfig())}
@@ -465,14 +471,20 @@ def test_the_toml_of_the_readme_is_accepted() -> None:
 
 
 def test_the_readme_starts_a_bridge_over_the_network_below_the_robot_s_namespace() -> None:
-    """Without, the bridge shows nothing of a robot that has one, and over the network each has."""
+    """If the bridge has no namespace, it shows nothing of a robot that has one.
+
+    Over the network each robot has one.
+    """
     lines = re.findall(r"^zenoh-bridge-ros2dds .*-e .*$", (FILES / "README.md").read_text(), re.M)
     assert lines
     assert all(" -n /robot1" in line for line in lines)
 
 
 def test_drive_py_begins_and_ends_with_zeros() -> None:
-    """By a bridge a zero counts a second after the last speed, so they go on for longer."""
+    """Over the bridge a zero counts for a second after the last speed.
+
+    The zeros therefore continue for longer than that.
+    """
     text = (FILES / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
     assert float(zeros) > CONFIG.commands.pause + min(TIMEOUTS)

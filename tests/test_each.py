@@ -35,7 +35,7 @@ def test_what_fails_says_with_which_set() -> None:
 def test_no_sets_at_all_fail() -> None:
     @each("value", [])
     def test(value: int) -> None:
-        """Never run."""
+        """Fail if it is ever run."""
 
     with pytest.raises(AssertionError, match="nothing to test"):
         test()

@@ -1,4 +1,4 @@
-"""The names of events are a closed set, and the service's page has all of it."""
+"""The names of events form a closed set, and the service's page lists all of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NAMES = get_args(EventName)
 
 
 def named() -> set[str]:
-    """The texts that stand where an event or a log line has its name."""
+    """Return the string literals at the places where an event or a log line has its name."""
     found = set()
     for path in (ROOT / "acsard").rglob("*.py"):
         code = path.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The lock that the service installs from fits what `pyproject.toml` allows."""
+"""The lock file from which the service is installed satisfies `pyproject.toml`."""
 
 from __future__ import annotations
 

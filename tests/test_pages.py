@@ -1,6 +1,7 @@
-"""The pages are true as far as one can see without running anything: commands, files, links, toml.
+"""Commands, files, links and toml on the pages are right, as far as static checks can tell.
 
-What they say to type is run by `tests/system/test_pages.py`, or by what `tests/pages.py` names.
+The commands themselves are run by `tests/system/test_pages.py`, or by the checks that
+`tests/pages.py` names.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ parser = cache(cli.parser)
 
 
 def calls(command: str) -> Iterator[list[str]]:
-    """The words behind each `acsard` of a command, also of one that a shell is given."""
+    """Return the words after each `acsard` of a command, also inside a shell's argument."""
     words = shlex.split(command)
     while words:
         end = words.index("&&") if "&&" in words else len(words)
@@ -127,7 +128,7 @@ def test_a_call_of_acsard_has_the_options_it_is_given(command: str) -> None:
 
 
 def inline() -> Iterator[tuple[str, list[str]]]:
-    """What the text calls by name: the page, and the words behind `acsard`."""
+    """Yield each inline mention of a command: the page and the words after `acsard`."""
     for page in PAGES:
         for span in re.findall(r"`acsard\s([^`]+)`", prose(page)):
             yield page, span.split()
@@ -199,12 +200,12 @@ def test_settings_for_zenoh_are_accepted(block: Block) -> None:
 
 
 def test_python_is_on_the_page_whose_examples_are_run() -> None:
-    """`tests/system/test_client.py` and `test_web.py` run them, and say which there are."""
+    """`tests/system/test_client.py` and `test_web.py` run these blocks, and list them."""
     assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
 def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:
-    """`tests/system/test_languages.py` runs them, with a key of their own."""
+    """`tests/system/test_languages.py` runs these blocks with a key of its own."""
     calls = re.findall(r"`(session\.declare\w+\([^`]+)`", prose("README.md"))
     sources = [
         text_of(f"deploy/clients/{file}")
@@ -221,7 +222,7 @@ def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run
 
 
 def anchors(text: str) -> set[str]:
-    """What a forge lets one link to: headings, lower-case, with - for spaces."""
+    """Return the link targets of headings on a code forge: lower-case, - for spaces."""
     titles = re.findall(r"^#+ (.+)$", text, re.M)
     return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
@@ -239,7 +240,7 @@ def test_every_link_leads_somewhere(page: str) -> None:
 
 
 def files_in(text: str) -> set[str]:
-    """The words that are names of files or directories."""
+    """Return the words that are names of files or directories."""
     found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
     kinds = (".py", ".js", ".toml", ".json5", ".yaml", ".c", ".md")
     return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
@@ -256,13 +257,16 @@ def test_every_file_that_a_recipe_names_is_there() -> None:
 
 
 def recipe(begin: str, end: str) -> set[str]:
-    """The files that a part of the page for who changes the code names."""
+    """Return the files that this part of the page for developers names."""
     part = prose("acsard/README.md").partition(begin)[2].partition(end)[0]
     return files_in("\n".join(re.findall(r"`([^`\s]+)`", part)))
 
 
 def files_with(pattern: str, *rooms: str) -> set[str]:
-    """The files below these directories in whose text it is, as the recipes write them."""
+    """Return the files below these directories that contain the text.
+
+    The names are written as the recipes write them.
+    """
     files = [file for room in rooms for file in (ROOT / room).rglob("*") if file.is_file()]
     texts = [(file, file.read_bytes()) for file in files if file.suffix != ".pyc"]
     found = [file for file, text in texts if re.search(pattern.encode(), text)]
@@ -277,10 +281,10 @@ def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
 
 
 LISTS_KEYS = r"(?s)^(?=.*\bwheel_states\b)(?=.*\bcmd_vel_out\b)(?=.*\bdiagnostics\b)"
-"""Three published keys in one file."""
+"""A file that contains three published keys."""
 
 READS_KEYS = {"error_budget/feed.py", "web/page/main.js"}
-"""Files that only follow some of them."""
+"""Files that follow only some of the published keys."""
 
 
 @each(
@@ -298,7 +302,7 @@ READS_KEYS = {"error_budget/feed.py", "web/page/main.js"}
 def test_a_recipe_names_every_file_that_knows_one_like_it(
     part: str, pattern: str, some: str, beyond: set[str]
 ) -> None:
-    """`beyond` are files that use this one alone."""
+    """Check a recipe's list of files. `beyond` are files that use this one alone."""
     knowing = files_with(pattern, "acsard", "deploy")
     assert {some, *beyond} <= knowing
     assert knowing - beyond <= recipe(f"## Add a {part}", "\n## ")

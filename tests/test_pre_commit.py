@@ -1,4 +1,4 @@
-"""What git runs before a commit, once `pre-commit install` was typed: every check, by `.venv`."""
+"""After `pre-commit install`, git runs every check before a commit, using `.venv`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ echo "${{0##*/}}${{*:+ $*}}" >>"{log}"
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
-    """A repository with the hooks and, in the place of the tools, what writes down its call."""
+    """Create a repository with the hooks. Each tool in it is a stand-in that logs its call."""
     if shutil.which("git") is None:
         pytest.skip("no git")
     place = tmp_path / "clone"
@@ -41,7 +41,7 @@ def clone(tmp_path: Path) -> Path:
 
 
 def run(place: Path, *words: str) -> None:
-    """In an environment whose PATH has no tool of ours, by a git that knows nobody."""
+    """Run a command without the project's tools on PATH and without a git identity."""
     env = {"PATH": os.defpath, "HOME": str(place.parent), "PRE_COMMIT_HOME": str(place.parent)}
     for who in ("AUTHOR", "COMMITTER"):
         env |= {f"GIT_{who}_NAME": "a", f"GIT_{who}_EMAIL": "a@example.org"}

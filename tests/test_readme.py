@@ -1,6 +1,6 @@
-"""The README is true: its key table is the topic table, its commands and examples exist.
+"""The README is true: its key table is the topic table, and its commands and examples exist.
 
-Write the table anew with `python -m tests.test_readme`.
+`python -m tests.test_readme` rewrites the table.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def test_every_verb_named_in_the_readme_exists() -> None:
 
 
 def test_every_extra_is_named_on_a_page() -> None:
-    """Who reads learns of what it brings."""
+    """A reader learns from the pages which features each extra adds."""
     root = README.parent
     extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]
     pages = "".join(page.read_text() for page in (README, *root.glob("deploy/*/README.md")))

@@ -1,7 +1,7 @@
-"""Every drive in `tests/recordings` comes out as it did when it was recorded.
+"""Every drive in `tests/recordings` replays with the same result as when it was recorded.
 
-One that fails names the first line, mode or pose that is another now. Where the change is wanted,
-`python -m tests.recordings` writes those anew that are the simulator's.
+A failure names the first line, mode or pose that changed. If the change is wanted, `python -m
+tests.recordings` rewrites the recordings that were made with the simulator.
 """
 
 from __future__ import annotations

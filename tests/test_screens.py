@@ -1,4 +1,4 @@
-"""`python -m tests.screens`: what a person sees at 40, 80 and 160 columns, as text."""
+"""The screens of `python -m tests.screens` fit a person's terminal of 40, 80 and 160 columns."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tests.pages import ROOT
 from tests.screens import WAITING, WIDTHS
 
 LINE_BY_LINE = "echo state --short"
-"""Goes on below the last line, whatever the width: a terminal breaks it, a pipe does not."""
+"""This verb scrolls below the last line at any width, because a terminal breaks long lines."""
 
 
 def printed() -> dict[tuple[str, int], list[str]]:
-    """What it prints, by verb and width."""
+    """Return the printed lines by verb and width."""
     words = [sys.executable, "-m", "tests.screens"]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stderr == ""

@@ -1,6 +1,6 @@
-"""The shape of the code is a law like any other: the core is pure, and each part of it is tested.
+"""The structure of the code follows rules: the core is pure, and each part of it is tested.
 
-Which room may import which is a contract in `pyproject.toml`, checked by `lint-imports`.
+A contract in `pyproject.toml`, checked by `lint-imports`, says which room may import which.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PURE_ROOMS = (
     "values", "config", "mcu", "drive", "messages", "ros", "incoming", "robot", "guard", "sim",
     "checkup", "calibration", "error_budget", "report",
 )  # fmt: skip
-"""No clock, no I/O, no asyncio, no logging, no randomness."""
+"""Modules without a clock, I/O, asyncio, logging or randomness."""
 
 PURE_AMONG_SHELLS = (
     "bus.access",
@@ -85,8 +85,10 @@ PURE_IMPORTS = {
     "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib", "typing", "xxhash",
     "zlib",
 }  # fmt: skip
-"""All that a pure module may import beside pure modules, with what is in it; none of it does I/O by
-itself, knows the time or anything of chance."""
+"""All modules that a pure module may import apart from pure modules, with the allowed names.
+
+None of them does I/O, reads a clock or uses randomness by itself.
+"""
 
 IMPURE_CALLS = {"open", "print", "input", "exec", "eval", "__import__"}
 
@@ -94,14 +96,17 @@ CLOCKS = {
     "time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns",
     "clock_gettime", "clock_gettime_ns",
 }  # fmt: skip
-"""What reads a clock in module `time`. `time.sleep` is not among them, and client/ and cli/ are
-tools that a person waits for: they may use `time.monotonic`."""
+"""The functions of module `time` that read a clock.
+
+`time.sleep` is not among them. client/ and cli/ are tools for which a person waits, so they may use
+`time.monotonic`.
+"""
 
 KINDS = {"CLOCK_MONOTONIC_RAW", "CLOCK_MONOTONIC", "CLOCK_BOOTTIME"}
-"""What `clock_gettime_ns` is asked for; the last two tell a suspend."""
+"""The clocks that `clock_gettime_ns` may read. The last two reveal a suspend."""
 
 DAEMON_ROOMS = ("host", "serial", "bus", "door", "record", "runtime")
-"""What the daemon is made of: one clock for all."""
+"""The rooms that form the daemon. They share one clock."""
 
 LONG_FILE, LONG_FUNCTION = 300, 50
 LONGEST_FILE, LONGEST_FUNCTION = 500, 55
@@ -117,7 +122,10 @@ def tree_of(path: Path) -> ast.Module:
 
 
 def all_modules() -> list[str]:
-    """Every module of acsard below its root, `__init__` of a package as the package."""
+    """Return every module of acsard below its root.
+
+    The `__init__` of a package counts as the package.
+    """
     names = []
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
@@ -134,7 +142,7 @@ PURE = tuple(
 
 
 def imported(tree: ast.Module) -> Iterator[str]:
-    """The dotted names a module imports, wherever in it, `from a import b` as `a.b`."""
+    """Return the dotted names that a module imports anywhere, with `from a import b` as `a.b`."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -144,7 +152,7 @@ def imported(tree: ast.Module) -> Iterator[str]:
 
 
 def has_behaviour(tree: ast.Module) -> bool:
-    """There is a function beside those of protocols, which only say what others have."""
+    """Return whether the module has a function outside its protocol classes."""
     return any(
         isinstance(node, ast.FunctionDef)
         for top in tree.body
@@ -172,13 +180,16 @@ def test_the_init_of_a_package_imports_nothing() -> None:
 
 
 def impure(names: Iterable[str]) -> set[str]:
-    """Those of the imported names that a pure module may not import."""
+    """Return those of the imported names that a pure module may not import."""
     allowed = PURE_IMPORTS | {f"acsard.{module}" for module in PURE}
     return {name for name in names if not allowed & {*prefixes(name)}}
 
 
 def prefixes(name: str) -> Iterator[str]:
-    """`a`, `a.b` and `a.b.c` of `a.b.c`; of acsard the module alone, whatever room it is in."""
+    """Yield `a`, `a.b` and `a.b.c` for `a.b.c`.
+
+    For acsard, yield only the module, whatever its room.
+    """
     parts = name.split(".")
     dotted = [".".join(parts[: n + 1]) for n in range(len(parts))]
     if parts[0] != "acsard":
@@ -262,8 +273,10 @@ def test_the_daemon_does_not_load_numpy() -> None:
 
 
 def test_no_module_nor_function_is_far_longer_than_it_should_be() -> None:
-    """What exceeds the first bound lacks an idea: `pytest -s tests/test_shape.py -k longer` prints
-    it. The second one is a law."""
+    """`pytest -s tests/test_shape.py -k longer` prints each module above the first limit.
+
+    Such a module lacks an idea. No module may exceed the second limit.
+    """
     files, functions = [0], [0]
     for path in sorted(PACKAGE.rglob("*.py")):
         where = path.relative_to(PACKAGE.parent)

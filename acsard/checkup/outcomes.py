@@ -33,6 +33,10 @@ FAIL baud rate: garbage | only garbage
 FAIL baud rate: few | hardly a good line
     at {configured} baud {heard}; fewer good lines at any other
     -> a short cable away from the motors' leads, one ground, a lower baud rate at both ends
+FAIL baud rate: sparse | good lines, too far apart
+    at {configured} baud {heard}, all of them good; no good line at any other
+    -> the board must answer each line, or report by its own clock every 0.25 s or sooner; is its
+    loop held up by delay() or by a slow print?
 
 PASS identification: named | {short}
     {text}

@@ -78,20 +78,21 @@ class _Wheel:
         `still` means that all wheels should stand.
         """
         expected = self.expected = self.expected + (told - self.expected) * share
-        size, wish, turns = abs(expected), abs(told), abs(speed)
+        size, turns = abs(expected), abs(speed)
         driven = self.driven = not still or (self.driven and turns > SLACK)
         constant, self.seen = speed == self.seen, speed
-        most = size if size > wish else wish
+        most = max(size, abs(told))
         fast = driven and turns > 1.5 * most + SLACK
         slowing = turns < self.slowest - SLACK
         if slowing or not fast:
             self.slowest = turns
         moving = size > SLACK and expected * told > 0
+        constant = constant and driven and speed != 0.0
         return (
             moving and turns < 0.1 * size,
             moving and speed * expected < 0 and turns > 0.3 * size,
             fast and not slowing,
-            constant and driven and speed != 0.0 and abs(speed - expected) > SLACK + 0.3 * most,
+            constant and abs(speed - expected) > SLACK + 0.3 * most,
         )
 
 
@@ -170,10 +171,9 @@ class Sanity:
         rows = zip(WHEELS, self._wheels, sent.as_tuple(), seen.as_tuple(), strict=True)
         for name, wheel, told, speed in rows:
             signs = wheel.signs(told, speed, share, still)
-            odd = True in signs
-            if not (odd or wheel.suspected):
+            if not (True in signs or wheel.suspected):
                 continue
-            wheel.suspected = odd
+            wheel.suspected = True in signs
             for kind, bad in zip(_FAULTS, signs, strict=True):
                 lasted = wheel.evidence[kind] + dt if bad else 0.0
                 wheel.evidence[kind] = lasted

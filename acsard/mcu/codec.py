@@ -48,9 +48,6 @@ class FrameError(AcsardError):
 class Codec:
     """An encoder and decoder of lines for one wiring and one dialect."""
 
-    _last_read: tuple[bytes | None, WheelSpeeds] = (None, STILL)
-    """The last line that was decoded, and its speeds."""
-
     def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
         motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
         place = {motor[1]: index for index, motor in enumerate(motors)}
@@ -97,9 +94,6 @@ class Codec:
 
         Raise `FrameError` unless all of it is valid.
         """
-        last, speeds = self._last_read
-        if line == last:  # A robot at rest reports the same in each period.
-            return speeds
         match = _LINE.fullmatch(line)
         if match is None:
             raise FrameError("malformed", line)
@@ -115,9 +109,7 @@ class Codec:
         front_right, front_left, rear_left, rear_right = wheel
         if front_right is None or front_left is None or rear_left is None or rear_right is None:
             raise FrameError("wheel_twice", line)
-        speeds = WheelSpeeds(front_right, front_left, rear_left, rear_right)
-        self._last_read = line, speeds
-        return speeds
+        return WheelSpeeds(front_right, front_left, rear_left, rear_right)
 
 
 def _token(letter: str, speed: float) -> str:

@@ -54,11 +54,10 @@ class WheelCounter:
         self._owing += 1
         if self._owing > OWED_FOR:
             self.forgive()
-        told = self._told
-        if speed and told is not None:
-            size, way = (speed, 1) if speed > 0 else (-speed, -1)
-            told[size] = told.get(size, 0) + way
-            if len(told) > MOST_TOLD:
+        if speed and self._told is not None:
+            size, way = abs(speed), 1 if speed > 0 else -1
+            self._told[size] = self._told.get(size, 0) + way
+            if len(self._told) > MOST_TOLD:
                 self._told = None
         if self._search is None and abs(speed - self._last) >= FLICKER:
             self._last, size = speed, abs(speed)

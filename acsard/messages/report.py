@@ -132,11 +132,9 @@ class Report:
             yield "cmd_vel_out", self._cmd_vel_out(outputs)
         if outputs.events and "events" in wanted and (told := self._happened.told()):
             yield "events", told
-        another, rates = outputs.status_changed, self._rates
-        if "state" in wanted and rates["state"].due(now_ns, another):
-            yield "state", self._state(outputs, look())
-        if "diagnostics" in wanted and rates["diagnostics"].due(now_ns, another):
-            yield "diagnostics", self._diagnostics(outputs, look())
+        for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
+            if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
+                yield key, build(outputs, look())
 
     def current(self, key: str, look: Look) -> Message | None:
         """Return the present value of a published key, or None if it has no value yet."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from functools import lru_cache
 
 from msgspec import Struct
 
@@ -78,7 +77,6 @@ def latched(line: bytes) -> Command:
     return Command(values)
 
 
-@lru_cache(4)  # a steady host says the same in each period
 def _plain(text: bytes) -> Command | None:
     match = _LINE.fullmatch(text)
     if match is None:

@@ -18,7 +18,6 @@ rad/s, and it stays bounded.
 from __future__ import annotations
 
 import math
-from operator import add
 
 from acsard.config.settings import DriveConfig, SimConfig
 from acsard.drive.path import arc
@@ -71,18 +70,16 @@ class Vehicle:
         if not (any(goals) or any(self.speeds)):
             return
         rest = math.exp(-dt / lag) if lag else 0.0
-        gone, turned, speeds = 1.0 - rest, [], []
-        for goal, speed in zip(goals, self.speeds, strict=True):
-            error = speed - goal
+        gone, turned, speeds, angles = 1.0 - rest, [0.0] * 4, self.speeds, self.angles
+        for i, goal in enumerate(goals):
+            error = speeds[i] - goal
             # This is the integral of an exponential approach, so the path does not depend on dt.
-            turned.append(goal * dt + error * lag * gone)
-            after = goal + error * rest
-            speeds.append(after if after > 1e-9 or after < -1e-9 else 0.0)
-        self.speeds[:] = speeds
-        self.angles[:] = map(add, self.angles, turned)
-        front_right, front_left, rear_left, rear_right = turned
-        left = self._left_radius * (front_left + rear_left) / 2
-        right = self._right_radius * (front_right + rear_right) / 2
+            angle = turned[i] = goal * dt + error * lag * gone
+            speed = goal + error * rest
+            speeds[i] = speed if abs(speed) > 1e-9 else 0.0
+            angles[i] += angle
+        left = self._left_radius * (turned[1] + turned[2]) / 2
+        right = self._right_radius * (turned[0] + turned[3]) / 2
         turn = (right - left) / self._track
         rate = abs(turn) / dt
         turn *= grip / (1.0 + 2.0 * self._rate_dependence * rate / (1.0 + rate))

@@ -1,11 +1,11 @@
-"""As little as `polled.py` does, in acsard's way: what waiting for events costs by itself.
+"""A minimal event-driven driver like `polled.py`: it shows the cost of waiting for events.
 
     python -m tests.bench.by_events --config FILE --port DEVICE
 
-A line goes every period, and at once for a command; feedback is told when it comes, by a thread of
-its own, so that a bus that is locked holds up nothing. That is asyncio, a timer of the kernel's and
-a hand-over: two wake-ups a period where the polled one has one, and a third for each command.
-What acsard takes beyond this is what it decides.
+It sends a line every period, and at once for a command. A thread of its own publishes feedback when
+it arrives, so that a locked bus delays nothing. It uses asyncio, a kernel timer and a hand-over to
+that thread: two wake-ups a period while the polled driver has one, and a third for each command.
+The time that acsard takes beyond this is the time of its decisions.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from tests.bench.polled import Robot, session_of
 
 
 class Sender:
-    """Puts in a thread what is left with it, as `acsard/bus/outlets.py` does."""
+    """A thread that publishes the messages left for it, as `acsard/bus/outlets.py` does."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self._publisher = publisher
@@ -57,7 +57,7 @@ class Sender:
 
 
 class Loop(asyncio.Protocol):
-    """What happens at the end of a period, with a command, and with feedback."""
+    """The reactions to the end of a period, to a command, and to feedback."""
 
     def __init__(self, port: serial.Serial, sender: Sender, period_ns: int) -> None:
         self.robot = Robot()
@@ -68,7 +68,7 @@ class Loop(asyncio.Protocol):
         asyncio.get_running_loop().add_reader(self._timer.fileno(), self._tick)
 
     def write(self) -> None:
-        """The newest command, in place of the next period's line."""
+        """Write the newest command, in place of the next period's line."""
         os.write(self._port.fileno(), self.robot.line)
         self._ahead = True
 
@@ -87,7 +87,7 @@ class Loop(asyncio.Protocol):
 
 
 async def run(config: dict[str, Any], port: serial.Serial) -> None:
-    """Until it is killed."""
+    """Run until the process is killed."""
     session, root, source = session_of(config)
     sender = Sender(session.declare_publisher(f"{root}/odom"))
     events = asyncio.get_running_loop()
@@ -105,7 +105,7 @@ async def run(config: dict[str, Any], port: serial.Serial) -> None:
 
 
 def main() -> None:
-    """As `polled.py`."""
+    """Run the program, with the arguments of `polled.py`."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--config", type=Path)
     parser.add_argument("--port")

@@ -1,12 +1,13 @@
-"""The way of the original, for comparison: poll, update, write, sleep; a line each way per cycle.
+"""The original driver's method, for comparison: poll, update, write, sleep.
 
     python -m tests.bench.polled --config FILE --port DEVICE [--drain]
 
-A ros2_control hardware interface in small: every cycle takes at most one line from the port and
-leaves the rest in its buffer, publishes the odometry, writes the newest command on the tick. With
---drain every cycle takes all lines and keeps the newest: the obvious mend of the original. It
-has nothing of what a robot needs (no limits, no timeouts, no checks), only what takes time. The
-wire format and the keys are acsard's, so that the same rig measures both.
+It is a ros2_control hardware interface in small, with a line each way per cycle. Every cycle takes
+at most one line from the port and leaves the rest in its buffer, publishes the odometry, and writes
+the newest command on the tick. With --drain every cycle takes all lines and keeps the newest: the
+obvious fix of the original. It has none of a robot's safety functions (no limits, no timeouts, no
+checks), only the parts that take time. The wire format and the keys are acsard's, so that the same
+rig measures both.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ RADIUS, SEPARATION = 0.05, 0.30
 
 
 def line_for(linear: float, angular: float) -> bytes:
-    """What one command says on the wire."""
+    """Return the line on the wire for one command."""
     right = (linear + angular * SEPARATION / 2) / RADIUS
     left = (linear - angular * SEPARATION / 2) / RADIUS
     wheels = zip("abcd", (right, left, left, right), strict=True)
@@ -39,7 +40,7 @@ def line_for(linear: float, angular: float) -> bytes:
 
 
 class Robot:
-    """Pose, the newest command, and the bytes nobody has looked at yet."""
+    """Pose, the newest command, and the bytes that have not been read yet."""
 
     def __init__(self) -> None:
         self.x = self.y = self.yaw = self.linear = self.angular = 0.0
@@ -47,13 +48,13 @@ class Robot:
         self.buffer = b""
 
     def on_command(self, sample: zenoh.Sample) -> None:
-        """The newest wins; it waits for the next tick."""
+        """Keep the newest command; it waits for the next tick."""
         message = msgspec.msgpack.decode(sample.payload.to_bytes())
         linear = message.get("linear", {}).get("x", 0.0)
         self.line = line_for(linear, message.get("angular", {}).get("z", 0.0))
 
     def read(self) -> bool:
-        """One line, if there is a whole one."""
+        """Return one line, if a whole one has arrived."""
         line, end, rest = self.buffer.partition(b"\n")
         if not end:
             return False
@@ -66,7 +67,7 @@ class Robot:
         return True
 
     def update(self, dt: float) -> dict[str, object]:
-        """Integrate and tell."""
+        """Integrate the speeds and publish the odometry."""
         self.x += self.linear * math.cos(self.yaw) * dt
         self.y += self.linear * math.sin(self.yaw) * dt
         self.yaw += self.angular * dt
@@ -83,7 +84,7 @@ class Robot:
 
 
 def session_of(config: dict[str, Any]) -> tuple[zenoh.Session, str, str]:
-    """A session, what its keys begin with, and the source of commands."""
+    """Return a session, the prefix of its keys, and the source of commands."""
     settings = zenoh.Config()
     settings.insert_json5("mode", '"peer"')
     settings.insert_json5("listen/endpoints", json.dumps(config["bus"]["listen"]))
@@ -93,7 +94,7 @@ def session_of(config: dict[str, Any]) -> tuple[zenoh.Session, str, str]:
 
 
 def main() -> None:
-    """Until it is killed."""
+    """Run until the process is killed."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--config", type=Path)
     parser.add_argument("--port")

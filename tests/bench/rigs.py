@@ -1,4 +1,4 @@
-"""What the benchmarks share: a program on the rig of `acsard bench`, and its figures."""
+"""The shared parts of the benchmarks: a program on the rig of `acsard bench`, and its figures."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from acsard.bench.setup import bench_config, free_endpoint, write
 from acsard.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
-"""The original's way."""
+"""The original driver's method."""
 
 BY_EVENTS = (sys.executable, "-m", "tests.bench.by_events")
-"""As little as the polled one does, in our way."""
+"""A driver as minimal as the polled one, but event-driven like acsard."""
 
 DRAINING = (*POLLED, "--drain")
-"""The same with its obvious mend."""
+"""The polled driver with its obvious fix."""
 
 
 def trees() -> dict[str, Sequence[str]]:
-    """acsard, and beside it those of the other trees that $ACSARD_BESIDE names, as PATH does."""
+    """Return the commands of acsard and of the source trees in $ACSARD_BESIDE, a list like PATH."""
     others = os.environ.get("ACSARD_BESIDE")
     named = [Path(other) for other in others.split(os.pathsep)] if others else []
     return {"acsard": ACSARD} | {
@@ -40,13 +40,13 @@ def trees() -> dict[str, Sequence[str]]:
 
 
 def config(rate: float = 100.0, reply_period: float = 0.0) -> Config:
-    """As `acsard bench` measures with."""
+    """Return the configuration with which `acsard bench` measures."""
     wanted = Config(control=ControlConfig(rate=rate), mcu=McuConfig(reply_period=reply_period))
     return bench_config(wanted, simulated=True)
 
 
 def sibling(one: Config, number: int) -> Config:
-    """The same robot under another name and address."""
+    """Return the same robot under another name and address."""
     name, bus = RobotConfig(f"{one.robot.id}-{number}"), BusConfig(listen=(free_endpoint(),))
     return replace(one, robot=name, bus=bus)
 
@@ -60,7 +60,7 @@ def rig(
     unprompted: float = 0.0,
     wire_baud_rate: int = 0,
 ) -> Iterator[Rig]:
-    """The program up and linked."""
+    """Run the program until its link is up."""
     with TemporaryDirectory(prefix="acsard-bench-") as where:
         file = write(one, Path(where))
         with Rig(
@@ -75,29 +75,29 @@ def rig(
 
 
 def driven(one: Config, words: Sequence[str], seconds: float, seed: int) -> Record:
-    """Commanded for so long."""
+    """Send commands for this many seconds, and return the record."""
     with rig(one, words) as running:
         running.command(seconds, staircase, seed)
         return running.end()
 
 
 def waits_us(record: Record) -> list[float]:
-    """Command -> first byte on the port."""
+    """Return the times from a command to its first byte on the port."""
     return [wait / 1000 for wait in command_waits(record)]
 
 
 def delays_us(one: Config, record: Record) -> list[float]:
-    """Feedback line's last byte -> its odometry in this process."""
+    """Return the times from a feedback line's last byte to its odometry in this process."""
     return [fed.delay_ns / 1000 for fed in feedback_fates(one, record)]
 
 
 def share(values: Sequence[float], part: float) -> float:
-    """The value that `part` of all do not exceed."""
+    """Return the value that `part` of all values do not exceed."""
     return sorted(values)[min(len(values) - 1, int(part * len(values)))]
 
 
 def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, float]:
-    """The median of each way, all taken in turn in each round."""
+    """Return the median of each program. Each round runs all programs in turn."""
     values: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(rounds):
         for name, measure in ways.items():
@@ -106,18 +106,18 @@ def in_turns(ways: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, 
 
 
 def schedule(pid: int, policy: int, priority: int = 0) -> None:
-    """Give every thread of a process this policy; raises PermissionError where that is not ours."""
+    """Give every thread of a process this policy; raises PermissionError if not permitted."""
     for task in os.listdir(f"/proc/{pid}/task"):
         os.sched_setscheduler(int(task), policy, os.sched_param(priority))
 
 
 HOGS_S = 120
-"""What keeps a core busy ends by itself, whatever becomes of the test."""
+"""A process that keeps a core busy ends by itself after this time, even if the test dies."""
 
 
 @contextmanager
 def all_cores_busy(wanted: bool) -> Iterator[None]:
-    """A process for each core that does nothing but compute."""
+    """Run a process for each core that does nothing but compute."""
     busy = f"import time\nend = time.monotonic() + {HOGS_S}\nwhile time.monotonic() < end: pass"
     words = [sys.executable, "-c", busy]
     number = len(os.sched_getaffinity(0)) if wanted else 0

@@ -1,11 +1,11 @@
-"""The latencies of a busy machine beside those of a quiet one, in one table.
+"""Print the latencies of a busy machine and of a quiet one in one table.
 
-pytest -s -m bench tests/bench/test_busy.py
+    pytest -s -m bench tests/bench/test_busy.py
 
-Busy: a process on each core that does nothing but compute, at the same priority. The two ends of
-the measurement go ahead of those: what is measured is the daemon, with the loop's real-time
-scheduling that its unit permits and without any. Then a flood besides: a program that puts
-commands as fast as it can. Each quiet and busy one is taken in turns with one that records, whose
+On the busy machine each core has a process that does nothing but compute, at the same priority. The
+two ends of the measurement have a higher priority, because the daemon is measured: with the loop's
+real-time scheduling that its unit permits, and without. A last case adds a flood: a program that
+puts commands as fast as it can. Each quiet and busy case alternates with one that records, whose
 thread shares the interpreter with the loop.
 """
 
@@ -31,12 +31,12 @@ pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 SECONDS = 20.0
 
 AHEAD = 60
-"""Of the measuring process, SCHED_FIFO."""
+"""SCHED_FIFO priority of the measuring process."""
 
 
 @contextmanager
 def ahead_of_all() -> Iterator[None]:
-    """All threads of this process, as far as that is permitted."""
+    """Raise the priority of all threads of this process, as far as that is permitted."""
     try:
         schedule(os.getpid(), os.SCHED_FIFO, AHEAD)
     except PermissionError:
@@ -49,7 +49,7 @@ def ahead_of_all() -> Iterator[None]:
 
 @contextmanager
 def flooded(one: Config, wanted: bool) -> Iterator[None]:
-    """Somebody who puts zeros on another source as fast as one process can."""
+    """Run a client that puts zeros on another source as fast as one process can."""
     if not wanted:
         yield
         return
@@ -100,5 +100,6 @@ def test_a_busy_machine_beside_a_quiet_one(real_time: bool, tmp_path: Path) -> N
         print(f"{name:26}{''.join(cells[:3])}   {''.join(cells[3:])}", flush=True)
         late[name] = sum(wait > 10_000 for wait in waits) / len(waits)
     if real_time:
-        # A period at most, but for what the machine itself loses. A flood takes what it gets.
+        # The limit is one period, apart from the time that the machine itself loses. A flood has no
+        # limit here, because it takes all the time it gets.
         assert max(late[name] for name, case in CASES.items() if not case.flood) < 0.05

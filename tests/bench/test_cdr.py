@@ -1,6 +1,8 @@
-"""How long CDR takes, beside rosbags in the same run: figures of two runs cannot be compared.
+"""Print the time of CDR encoding and that of rosbags in the same run.
 
-pytest -s tests/bench/test_cdr.py
+    pytest -s tests/bench/test_cdr.py
+
+Figures of two runs cannot be compared.
 """
 
 from __future__ import annotations
@@ -28,9 +30,9 @@ ROUNDS, CALLS = 41, 200
 def side_by_side(
     ours: Callable[[], object], theirs: Callable[[], object]
 ) -> tuple[float, float, float]:
-    """Median microseconds of each, and the median of their ratio round by round.
+    """Return the median microseconds of both, and the median of their ratios per round.
 
-    The two take turns within a round, so that what slows the machine slows both.
+    The two take turns within a round, so that a disturbance of the machine slows both.
     """
 
     def one(call: Callable[[], object]) -> float:
@@ -39,7 +41,7 @@ def side_by_side(
             call()
         return (perf_counter_ns() - began) / CALLS / 1000
 
-    one(ours), one(theirs)  # whatever is made on first use
+    one(ours), one(theirs)  # for everything that is built on first use
     rounds = [(one(ours), one(theirs)) for _ in range(ROUNDS)]
     return (
         median(mine for mine, _ in rounds),
@@ -63,7 +65,7 @@ def test_a_message_takes_the_time_printed_here(message: Message) -> None:
 
 
 def test_odometry_is_encoded_no_slower_than_by_rosbags() -> None:
-    """The oracle's message is made beforehand, its covariances as arrays: encoding alone."""
+    """The oracle's message is built beforehand, with covariances as arrays: encoding alone."""
     message = odometry("odom", "base_link")
     codec, name = Cdr(Odometry), ROS_NAMES[Odometry]
     theirs = built(message, name)

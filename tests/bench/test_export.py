@@ -1,8 +1,9 @@
-"""How long an hour's recording takes to export, and with how much memory.
+"""Print the time and the memory that the export of an hour's recording takes.
 
-pytest -s -m bench tests/bench/test_export.py
+    pytest -s -m bench tests/bench/test_export.py
 
-An hour of driving at 100 Hz in virtual time, the daemon's own program over the file.
+The recording is an hour of driving at 100 Hz in virtual time. The daemon's own program exports the
+file.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ BATCH = 200
 HOUR_S, MINUTE_S = 3600.0, 60.0
 
 PAGE_MB = 120.0
-"""The page's server, with a calibration that somebody goes through."""
+"""The page's server, with a calibration in progress."""
 
 
 class Streamed:
-    """A black box that writes as it goes: an hour does not fit into memory."""
+    """A recorder that writes continuously, because an hour does not fit into memory."""
 
     status = Recording("file")
 
@@ -64,7 +65,7 @@ class Streamed:
 
 
 def recorded(path: Path, seconds: float) -> Path:
-    """Driving at 20 commands a second, another speed every half minute."""
+    """Drive at 20 commands a second, with another speed every half minute."""
     config = replace(Config(), record=replace(Config().record, directory=str(path.parent)))
     box = Streamed(path, config, START)
     world = World(config, recorder=box)
@@ -80,9 +81,9 @@ def recorded(path: Path, seconds: float) -> Path:
 class Cost(NamedTuple):
     seconds: float
     processor: float
-    """s of it; the rest is what others had."""
+    """Processor time, s. The rest of `seconds` went to other processes."""
     megabytes: float
-    """Resident at most."""
+    """Largest resident memory."""
 
 
 MEASURED = """\
@@ -93,11 +94,11 @@ assert main(sys.argv[1:]) == 0
 status = Path("/proc/self/status").read_text()
 print(time.process_time(), int(status.partition("VmHWM:")[2].split()[0]) / 1024)
 """
-"""Of a process the system tells the most it had since it became this program."""
+"""The kernel reports the process's largest memory since it became this program."""
 
 
 def cost(*words: str) -> Cost:
-    """Of one run of the program."""
+    """Return the cost of one run of the program."""
     ended = finish([sys.executable, "-c", MEASURED, *words], ROOT, within=1500.0)
     assert ended.code == 0, ended
     processor, megabytes = map(float, ended.out.splitlines()[-1].split())
@@ -106,7 +107,7 @@ def cost(*words: str) -> Cost:
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A minute and an hour."""
+    """Return recordings of a minute and of an hour."""
     where = tmp_path_factory.mktemp("hour")
     return recorded(where / "minute.mcap", MINUTE_S), recorded(where / "hour.mcap", HOUR_S)
 

@@ -1,8 +1,8 @@
-"""What a viewer of all topics costs: `acsard foxglove`, and the daemon.
+"""Print the cost of a viewer of all topics for `acsard foxglove` and for the daemon.
 
-pytest -s -m bench tests/bench/test_foxglove.py
+    pytest -s -m bench tests/bench/test_foxglove.py
 
-Processor time by the kernel's own account; with and without a viewer take turns beside one daemon.
+Processor times are the kernel's own. Spans with and without a viewer alternate, with one daemon.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ ROUNDS, SPAN_S = 5, 3.0
 
 
 class Cost(NamedTuple):
-    """Of a span: % of a core, and what became of the daemon's periods."""
+    """The cost of a span in % of a core, and the daemon's periods."""
 
     bridge: float
     daemon: float
     periods: Periods
     waited_s: float
-    """The control loop, ready and without a core."""
+    """Time for which the control loop was ready but had no core."""
 
 
 def cost(daemon: Daemon, bridge: Shows, bus: Bus) -> Cost:
-    """What the next span takes."""
+    """Return the cost of the next span."""
     pids = bridge.pid, daemon.pid
     first, before = bus.state(), [cpu_seconds(pid) for pid in pids]
     waited = waited_for_a_core(daemon.pid)
@@ -71,6 +71,6 @@ def test_a_viewer_of_all_topics(tmp_path: Path) -> None:
         )
     assert rate > 0.9 * 4 * 100
     assert median(one.bridge for one in alone) < 0.2 * median(one.bridge for one in watched)
-    # Each period that was missed is one in which the machine had no core for the loop.
+    # Each missed period is one in which the machine had no core for the loop.
     missed, waited = sum(one.periods.missed for one in watched), sum(o.waited_s for o in watched)
     assert missed <= sum(one.periods.missed for one in alone) + 2 + waited / 0.01

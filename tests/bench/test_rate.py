@@ -1,10 +1,11 @@
-"""How high the control rate can go, and how late a period begins when others want the machine.
+"""Find the highest control rate, and print how late a period begins on a busy machine.
 
-pytest -s -m bench tests/bench/test_rate.py
+    pytest -s -m bench tests/bench/test_rate.py
 
-The rate: the whole daemon on a simulated microcontroller in another process, one subscriber of
-odometry, a line and a reply every period. `acsard.toml` allows 1000 Hz and what the baud rate
-carries; `unlimited.py` says how that is lifted. Sought by doubling, then by halving the interval.
+The rate is that of the whole daemon on a simulated microcontroller in another process, with one
+subscriber of odometry, and a line and a reply every period. `acsard.toml` allows at most 1000 Hz
+and the rate that the baud rate carries; `unlimited.py` describes how these limits are lifted. The
+search doubles the rate, then halves the interval.
 """
 
 from __future__ import annotations
@@ -26,21 +27,22 @@ MADE_FOR = 100.0
 """Hz."""
 
 TRIES = 3
-"""A stall of the whole machine must not decide: at 100 Hz one of 50 ms is more than `MISSED`."""
+"""One stall of the whole machine must not decide: at 100 Hz a stall of 50 ms is more than `MISSED`.
+"""
 
 PRIORITY = 50
-"""Of the daemon, below the simulated wire's."""
+"""SCHED_FIFO priority of the daemon, below that of the simulated wire."""
 
 
 def taken(running: Rig) -> tuple[float, int, int]:
-    """The time in s, periods missed and feedback lines heard so far, all of one moment."""
+    """Return the time in s, the periods missed and the feedback lines so far, all of one moment."""
     state = running.state()
     counters = state.counters
     return state.stamp.to_ns() / 1e9, counters.get("missed_periods", 0), counters["lines"]
 
 
 def scheduled(running: Rig, realtime: bool) -> None:
-    """In real time, or not even where the daemon would like to be."""
+    """Schedule the daemon as real-time, or take even its own real-time scheduling away."""
     policy, priority = (os.SCHED_FIFO, PRIORITY) if realtime else (os.SCHED_OTHER, 0)
     try:
         schedule(running.process.pid, policy, priority)
@@ -49,7 +51,7 @@ def scheduled(running: Rig, realtime: bool) -> None:
 
 
 def missed_share(rate: float, realtime: bool) -> float:
-    """Of all periods at this rate."""
+    """Return the share of missed periods at this rate."""
     words = (sys.executable, "-m", "tests.bench.unlimited", "--rate", str(rate))
     with rig(config(), words, wire_baud_rate=BAUD_RATE) as running:
         scheduled(running, realtime)
@@ -79,7 +81,7 @@ def test_the_highest_control_rate(realtime: bool) -> None:
         middle = (good + bad) / 2
         good, bad = (middle, bad) if holds(middle) else (good, middle)
     print(f"  {good:.0f} Hz")
-    # Others on the machine decide how much more when nothing keeps them back.
+    # Without real-time scheduling, other processes on the machine limit how much higher it gets.
     assert good >= (5 * MADE_FOR if realtime else MADE_FOR)
 
 
@@ -98,5 +100,5 @@ def test_the_lateness_of_a_period_idle_and_busy(realtime: bool) -> None:
             f"{'SCHED_FIFO' if realtime else 'normal'} scheduling: p50 {late.p50:.0f}, "
             f"p99 {late.p99:.0f}, max {late.max:.0f} us; {missed} periods missed"
         )
-        # What was asked for is what was measured.
+        # The rate of the measurement is the requested one.
         assert late.count + missed > 900

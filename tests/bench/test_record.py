@@ -1,11 +1,11 @@
-"""What the black box costs the loop: processor and lateness, recording on and off in turn.
+"""Print the recorder's cost for the loop, in processor time and lateness, on and off in turn.
 
-pytest -s -m bench tests/bench/test_record.py
+    pytest -s -m bench tests/bench/test_record.py
 
-Lateness: ten rounds of two daemons, one after the other, each driven at 20 commands a second; the
-one that comes first changes. Processor: twenty pairs of new processes, two at once, so that
-whatever else the machine does costs both alike; its time is the kernel's own account, of all
-threads. Then one at rest. Nine minutes.
+Lateness: ten rounds of two daemons, one after the other in alternating order, each driven at 20
+commands a second. Processor time: twenty pairs of new processes, two at once, so that other work of
+the machine costs both alike. It is the kernel's own account, of all threads. A last measurement is
+at rest. The benchmark takes nine minutes.
 """
 
 from __future__ import annotations
@@ -27,28 +27,31 @@ ROUNDS, SPAN_S, SETTLES_S, REST_S = 10, 9.0, 1.0, 30.0
 PAIRS = 20
 
 SHARE = 0.15
-"""Of what the daemon takes without, on this machine as it is: a median is sure enough of that."""
+"""Share of the daemon's processor time without recording, on this machine as it is.
+
+The median is reliable enough for that.
+"""
 
 MORE = 0.4
 """Points of a core that recording may take."""
 
 DRIVING, IDLE = 400e6, 60e6
-"""Bytes a day that it may write."""
+"""Bytes per day that the recorder may write."""
 
 
 class Cost(NamedTuple):
     processor: float
-    """% of a core."""
+    """Processor time, % of a core."""
     p50: float
     p99: float
-    """us from when a period was due to its step."""
+    """Time from when a period was due to its step, us."""
     missed: int
     bytes_: float
-    """Of recordings, a second."""
+    """Bytes of recordings per second."""
 
 
 def processor_s(pid: int) -> float:
-    """Of all threads there are now, to the ns."""
+    """Return the processor time of all current threads, to the ns."""
     tasks = Path(f"/proc/{pid}/task").glob("*/schedstat")
     return sum(int(task.read_text().split()[0]) for task in tasks) / 1e9
 
@@ -58,7 +61,7 @@ def size(where: Path) -> int:
 
 
 def cost(where: Path, records: bool) -> Cost:
-    """Of one daemon that drives."""
+    """Return the cost of one daemon that drives."""
     where.mkdir(parents=True)
     words = ["--record", str(where / "record")] if records else []
     with Daemon(where, words=words) as daemon, Bus(daemon.endpoint) as bus:
@@ -76,7 +79,7 @@ def cost(where: Path, records: bool) -> Cost:
 
 
 def pair(where: Path, first: bool) -> tuple[float, float]:
-    """% of a core without and with recording, of two daemons that drive at once."""
+    """Return % of a core without and with recording, of two daemons that drive at once."""
     with ExitStack() as stack:
         pids: dict[bool, int] = {}
         for records in (first, not first):
@@ -112,7 +115,7 @@ def test_recording_makes_no_period_late(tmp_path: Path) -> None:
             costs[records].append(cost(tmp_path / f"{number}-{records}", records))
     off, on = costs[False], costs[True]
     print(f"\n{told('without', off)}\n{told('recording', on)}")
-    # Within what two like it differ by, on this machine now.
+    # The bound is the difference between two equal daemons on this machine now.
     noise = max(one.p99 for one in off) - min(one.p99 for one in off)
     assert median(one.p99 for one in on) <= median(one.p99 for one in off) + noise
     assert 0 < median(one.bytes_ for one in on) * 86_400 < DRIVING
@@ -124,7 +127,7 @@ def test_recording_takes_little_of_the_processor(tmp_path: Path) -> None:
     error = stdev(more) / PAIRS**0.5
     print(f"\nrecording takes {mean(more):+.2f} +- {2 * error:.2f} points of a core", end=" ")
     print(f"(twice the standard error of {PAIRS} pairs; each +- {stdev(more):.2f}, ", end="")
-    # A busy machine makes both dearer: where the one without takes 3 %, it is quiet.
+    # A busy machine makes both slower. It is quiet if the daemon without recording takes 3 %.
     print(f"median {median(more):+.2f}) beside {mean(off for off, _ in pairs):.2f} without")
     assert mean(more) - 2 * error < MORE
     assert median(more) < SHARE * mean(off for off, _ in pairs)

@@ -1,13 +1,12 @@
-"""acsard beside the original's way, in turns on the same rig in the same minute.
+"""Compare acsard with the original driver's method, in turns on the same rig in the same minute.
 
-pytest -s -m bench tests/bench/test_side_by_side.py
+    pytest -s -m bench tests/bench/test_side_by_side.py
 
-With ACSARD_BESIDE=DIRECTORY:DIRECTORY the acsard of other checkouts takes its turns as well.
-
-Asserted are ratios and counts; the figures themselves are printed. The polled program
-(`polled.py`) waits for its 100 Hz tick, half a period on average, and once a reply has been late it
-is a line behind for ever; draining mends that, and is shown as well. A busy machine adds the same
-wake-up times to both, so that its ratios are smaller: the assertions leave room for that.
+With ACSARD_BESIDE=DIRECTORY:DIRECTORY the acsard of other checkouts takes its turns as well. The
+test asserts ratios and counts, and prints the figures themselves. The polled program (`polled.py`)
+waits for its 100 Hz tick, half a period on average. Once a reply has been late, it is a line behind
+for ever; draining fixes that, and is measured as well. A busy machine adds the same wake-up times
+to both, which makes the ratios smaller; the assertions leave room for that.
 """
 
 from __future__ import annotations
@@ -37,10 +36,10 @@ pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 ROUNDS, SECONDS = 4, 6.0
 
 PROMISED = 10.0
-"""Times better at p50, on a quiet machine."""
+"""Factor by which acsard is faster at p50, on a quiet machine."""
 
 ASSERTED = 3.0
-"""What is left of that when others use the machine as well."""
+"""The asserted part of that factor, for a machine that other programs use as well."""
 
 Turns = dict[str, list[list[float]]]
 
@@ -53,7 +52,7 @@ def line(name: str, values: list[float]) -> str:
 
 
 def ratio(what: str, ours: list[list[float]], theirs: list[list[float]]) -> float:
-    """The median of the ratios of the medians of each round; printed."""
+    """Return the median of the rounds' ratios of medians, and print it."""
     by_round = [median(b) / median(a) for a, b in zip(ours, theirs, strict=True) if a and b]
     rounds = ", ".join(f"{one:.1f}" for one in by_round)
     print(f"{what}: {median(by_round):.1f} times better at p50 (by round {rounds})")
@@ -101,14 +100,14 @@ def test_what_a_commanded_robot_costs_beside_polled() -> None:
             f"  {name:10}{100 * median(shares):5.1f} % of a core, {ratios[name]:.2f} times polled "
             f"(by round {', '.join(f'{one:.2f}' for one in by_round)})"
         )
-    # What no decision can save is the wake-ups' and the hand-over's.
+    # Even a driver without decisions needs the time of the wake-ups and of the hand-over.
     assert ratios["by events"] < ratios["acsard"] < 5.0
 
 
 def standing(waiting: list[int], per_second: int) -> list[int]:
-    """The backlog that stays: the least number of newer lines waiting in each second.
+    """Return the standing backlog: the least number of newer lines waiting in each second.
 
-    A stall of the whole machine makes lines wait once; a backlog is what is not caught up.
+    A stall of the whole machine makes lines wait once; a backlog is never caught up.
     """
     seconds = [waiting[i : i + per_second] for i in range(0, len(waiting), per_second)]
     return [min(second) for second in seconds if len(second) == per_second]

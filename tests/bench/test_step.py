@@ -1,12 +1,10 @@
-"""What odometry that can be believed costs a step: beside the simplest there is, in the same run.
+"""Compare the step time of the full odometry with that of the simplest, in the same run.
 
-pytest -s -m bench tests/bench/test_step.py
-
-Added is all that the time of every line, snapping, covariance, witness and gyro take: session and
-odometry of today less a reader, a decoder, an arc by arrival and a covariance of first order. The
-link's keeping counts as added too, though it is older. A step is the control loop's on a line that
-came, with odometry encoded for one subscriber; the bus itself is not in it. Processor time is
-compared, which a busy machine does not change.
+The added time is that of sample times, quantization, covariance, the consistency check and the
+gyro. It is today's session and odometry less a reader, a decoder, an arc by arrival time and a
+first-order covariance. The link's bookkeeping counts as added too, though it is older. A step is
+the control loop's step on a received line, with odometry encoded for one subscriber; the bus itself
+is not included. The test compares processor time, which a busy machine does not change.
 """
 
 from __future__ import annotations
@@ -35,10 +33,10 @@ pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]
 ROUNDS, SECONDS = 7, 10.0
 
 ALLOWED, STEP = 15.0, 63.0
-"""us that a step may have grown by, and that it took before."""
+"""Time that a step may have gained, and its time before, us."""
 
 ASSERTED = 2.0
-"""Times the rest of the step that the parts may take, as they are."""
+"""Allowed ratio of the added parts to the rest of the step, as measured."""
 
 ALL = Config(
     odometry=OdometryConfig(
@@ -50,11 +48,11 @@ ALL = Config(
     ),
     sim=SimConfig(encoder_counts=400, track_multiplier=1.6, gyro_bias=0.01, gyro_noise=0.005),
 )
-"""Every part has work: four parameters, a gyro at 100 Hz, counts that the lines show."""
+"""Every part has work: four parameters, a gyro at 100 Hz, and counts that the lines show."""
 
 
 class Timed:
-    """A method of one object, how often it was called, and how long that took in all, ns."""
+    """A method of one object, the number of its calls, and their total time, ns."""
 
     def __init__(self, owner: object, name: str) -> None:
         self._call: Callable[..., object] = getattr(owner, name)
@@ -71,7 +69,7 @@ class Timed:
 
 
 class Simplest:
-    """A line's speeds since the line before came, along an arc; a covariance of first order."""
+    """Integrate a line's speeds along an arc since the previous line; first-order covariance."""
 
     def __init__(self) -> None:
         self._lines, self._codec = LineReader(), Codec(WheelMap())
@@ -102,11 +100,12 @@ class Simplest:
 
 
 class Run:
-    """A robot that drives at random, and how long its steps with a line take."""
+    """A robot that drives at random, and the time of its steps with a line."""
 
     def __init__(self, config: Config) -> None:
         self.world = made = World(config)
-        # By its own clock, so that it divides by what its period should be and counts show.
+        # The board reports by its own clock, so that the daemon estimates the period, and counts
+        # show.
         self.reports = ExitStack()
         self.reports.enter_context(made.mcu.unprompted(0.01))
         made.run(1.5)
@@ -145,7 +144,7 @@ class Run:
         setattr(made.loop, "step", timed)  # noqa: B010
 
     def drive(self, seed: int) -> dict[str, float]:
-        """us a line of a step that has one, and of each part in it; over `SECONDS`."""
+        """Return us per line of a step that has one, and of each part in it, over `SECONDS`."""
         self.took, calls = dict.fromkeys(self.took, 0), self.lines.calls
         chance, left = random.Random(seed), SECONDS
         while left > 0.0:
@@ -158,7 +157,7 @@ class Run:
 
 
 def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
-    """What it may is not reached; what is asserted keeps it from growing further."""
+    """The time stays below the allowed one. The asserted bound keeps it from growing further."""
     run, rounds = Run(ALL), []
     for seed in range(ROUNDS):
         found = run.drive(seed)

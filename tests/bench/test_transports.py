@@ -1,10 +1,10 @@
-"""What the feedback costs the daemon: by transport, by number of subscribers, by number of robots.
+"""Print the daemon's cost of feedback, by transport and by number of subscribers and robots.
 
-pytest -s -m bench tests/bench/test_transports.py
+    pytest -s -m bench tests/bench/test_transports.py
 
-Processor time of the daemon's process per control cycle, by the kernel's own account; the ways
-take turns within one daemon. The simulated microcontroller is another process, except where many
-robots run: there each daemon has its own inside.
+The figure is the processor time of the daemon's process per control cycle, by the kernel's own
+account. The transports take turns within one daemon. The simulated microcontroller is another
+process, except with many robots: there each daemon has its own inside.
 """
 
 from __future__ import annotations
@@ -38,26 +38,26 @@ from tests.unit.messages.test_cdr import odometry
 
 FEEDBACK = ("odom", "tf", "wheel_states")
 ON_THE_BRIDGE = ("odom", "tf", "joint_states")
-"""The same three, under their ROS names."""
+"""The ROS names of the same three messages."""
 
 
 @contextmanager
 def listening(one: Config, keys: Sequence[str], sessions: int = 1) -> Iterator[None]:
-    """So many clients that subscribe to all the keys, each with a connection of its own."""
+    """Run this number of clients that subscribe to all the keys, each with its own connection."""
     with ExitStack() as stack:
         for _ in range(sessions):
             session = client_session(one.bus.listen[0])
             stack.callback(session.close)
             for key in keys:
                 session.declare_subscriber(key, direct(lambda _: None))
-            # On one link all is in order: what is answered now was asked behind the subscription.
+            # Messages on one link stay in order. An answer received now follows the subscription.
             alive = session.liveliness().get(full_key(one.robot.id, "alive"), timeout=3.0)
             assert len(list(alive)) == 1
         yield
 
 
 def cycle_us(running: Rig, one: Config, seconds: float) -> float:
-    """Processor time of the daemon per control period."""
+    """Return the processor time of the daemon per control period."""
     pid = running.process.pid
     began_ns, used_ns = clock.mono_ns(), processor_ns(pid)
     time.sleep(seconds)
@@ -117,12 +117,13 @@ def test_the_cost_of_more_subscribers() -> None:
         print(f"  {name:>3}{us:7.0f}   {us / 100:.1f} % of a core")
     each = (costs["16"] - costs["1"]) / 15
     print(f"  each further client {each:.0f} us")
-    # It is built and encoded once for all of them: a further one only has it sent.
+    # The message is built and encoded once for all of them: a further subscriber only costs the
+    # sending.
     assert each < (costs["1"] - costs["0"]) / 2
 
 
 def missed_and_due(running: Rig) -> tuple[int, float]:
-    """Periods missed so far, and those due since 1970: both of one moment."""
+    """Return the periods missed so far, and those due since 1970, both of one moment."""
     state = running.state()
     return state.counters.get("missed_periods", 0), state.stamp.to_ns() / 1e9 * config().rate_hz
 
@@ -160,15 +161,15 @@ def test_the_cost_of_more_robots() -> None:
             f"{100 * len(os.sched_getaffinity(0))} % together; "
             f"{missed} of {periods:.0f} periods missed ({100 * missed / periods:.2f} %)"
         )
-    # They share nothing: each costs about what one alone costs.
+    # The robots share nothing: each costs about as much as a single one.
     assert shares[4] < 3 * shares[1]
 
 
-# what nobody listens to
+# the cost without subscribers
 
 
 class Nobody:
-    """No loop to wake."""
+    """A stand-in without a loop to wake."""
 
     def command(self) -> None: ...
 
@@ -178,7 +179,7 @@ class Nobody:
 def encoded(
     monkeypatch: pytest.MonkeyPatch, keys: Sequence[str], one: Config, count: int
 ) -> Counter[str]:
-    """How often each encoding was made for `count` odometry messages with such listeners."""
+    """Return how often each encoding was made for `count` messages with these subscribers."""
     made: Counter[str] = Counter()
 
     def counting(message: Message, form: encodings.Format) -> bytes:
@@ -202,8 +203,8 @@ def encoded(
         )
         async with bus:
             with listening(one, keys, 1 if keys else 0):
-                made.clear()  # what is kept for late comers
-                while len(made) < len(keys):  # Zenoh tells of each listener when it comes to it
+                made.clear()  # messages kept for late subscribers
+                while len(made) < len(keys):  # Zenoh reports each subscriber in its own time
                     bus.publish("odom", odometry("odom", "base_link"))
                     bus.flush()
                     await asyncio.sleep(0.01)

@@ -1,4 +1,4 @@
-"""What the robot's page costs, and how long a command takes through it: figures, and ratios."""
+"""Print the cost of the robot's page, and the time of a command through it: figures, and ratios."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ async def main():
 
 asyncio.run(main())
 """
-"""Programs that take what an open page takes, and say how many frames a second that is."""
+"""Programs that subscribe like an open page, and print the number of frames per second."""
 
 SECONDS, RATE_HZ = 10.0, 100.0
 
 TIMEOUT_MS = 250.0
-"""Of source teleop."""
+"""Timeout of source teleop, ms."""
 
 
 COMMANDS = 300
@@ -80,13 +80,13 @@ COMMANDS = 300
 
 @pytest.fixture
 def peer(tmp_path: Path) -> Iterator[Peer]:
-    """A serial peer that is not ours."""
+    """Run an independent serial peer."""
     with Peer(tmp_path / "mcu") as peer:
         yield peer
 
 
 def subscribed() -> list[tuple[str, int]]:
-    """What an open page subscribes to, whatever its view: keys and rates."""
+    """Return the subscriptions of an open page, whatever its view: keys and rates."""
     script = (PAGE / "main.js").read_text()
     pairs = re.findall(r'\["([\w/]+)", (\d+)\]', script)
     pairs += re.findall(r'link\.subscribe\("([\w/]+)", (\d+)', script)
@@ -95,7 +95,7 @@ def subscribed() -> list[tuple[str, int]]:
 
 
 def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, float]:
-    """Share of a core and kB of the page, periods and lateness (us, p99) of the daemon."""
+    """The page's share of a core and kB, the daemon's periods and lateness (us, p99)."""
     first, cpu, at = bus.state(), cpu_seconds(page.pid), time.monotonic()
     time.sleep(SECONDS)
     share = (cpu_seconds(page.pid) - cpu) / (time.monotonic() - at)
@@ -105,15 +105,17 @@ def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, 
 
 
 SHARE, MEMORY_KB = 0.10, 120_000
-"""Of a core, and of memory, that the page may take for twenty viewers."""
+"""Share of a core, and memory, that the page may take for twenty viewers."""
 
 LATER = 2.0
-"""Times as late as without viewers: so much do two rounds differ on a machine at work."""
+"""Allowed factor of lateness compared with no viewers: two rounds differ by that on a busy machine.
+"""
 
 
 def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
     rounds: dict[int, list[tuple[int, float]]] = {}
-    for count in (0, 20, 1, 0, 20):  # a daemon each, since lateness is of the last minute
+    # each case gets its own daemon, because lateness covers the last minute
+    for count in (0, 20, 1, 0, 20):
         with Daemon(tmp_path) as daemon, Page(daemon, tmp_path) as page, Bus(daemon.endpoint) as b:
             b.linked()
             told = [f"{page.here}/ws", str(count), json.dumps(subscribed())]
@@ -133,19 +135,19 @@ def test_twenty_viewers_cost_the_page_and_not_the_robot(tmp_path: Path) -> None:
             assert share < SHARE
     alone, watched_by_all = rounds[0], rounds[20]
     assert min(late for _, late in watched_by_all) < LATER * max(late for _, late in alone)
-    # One in a thousand more is the machine's.
+    # One in a thousand more may come from the machine.
     most = max(missed for missed, _ in alone) + SECONDS * RATE_HZ / 1000
     assert min(missed for missed, _ in watched_by_all) <= most
 
 
 def lines_with(peer: Peer, speed: float, after: float) -> float | None:
-    """When the first line with this wheel speed came."""
+    """Return when the first line with this wheel speed came."""
     want = f"ap{speed:05.2f},".encode()
     return next((h.at for h in peer.lines[-50:] if h.at >= after and h.line.startswith(want)), None)
 
 
 async def measured(peer: Peer, send: Callable[[float], object]) -> list[float]:
-    """ms from a command to its first byte's line on the port, commands at 20 Hz."""
+    """Return the ms from a command to its line's first byte on the port, for commands at 20 Hz."""
     found = []
     for n in range(COMMANDS):
         linear = 0.2 if n % 2 else 0.25
@@ -161,7 +163,7 @@ async def measured(peer: Peer, send: Callable[[float], object]) -> list[float]:
 
 
 def told(what: str, times: list[float]) -> float:
-    """Prints the spread; the median."""
+    """Print the spread, and return the median."""
     times.sort()
     p50, p99 = statistics.median(times), times[int(len(times) * 0.99)]
     print(f"\n{what}: {len(times)} commands, p50 {p50:.2f} ms, p99 {p99:.2f} ms")
@@ -196,17 +198,17 @@ FINGER = """for (const kind of ["pointerdown", "pointermove", "pointerup"])
     document.getElementById("stick").addEventListener(kind, (event) => {
         window.finger = performance.timeOrigin + event.timeStamp;
     }, true);"""
-"""Notes when the finger did what it did, ms since 1970."""
+"""Notes the time of the finger's events, ms since 1970."""
 
 
 class Finger:
-    """On the page's stick, in a real browser; its times are beside those of the port's far end."""
+    """A finger on the page's stick, in a real browser, timed against the far end of the port."""
 
     def __init__(self, browser: Browser, peer: FarPeer) -> None:
         self.browser, self.peer = browser, peer
 
     def waited(self, does: Callable[[], object], wanted: Callable[[float], bool]) -> float:
-        """ms from what it does to the first byte of a line with a wheel speed that is wanted."""
+        """Return the ms from an action to the first byte of a line with a wanted wheel speed."""
         begun, wall = time.monotonic(), time.time()
         does()
         at = float(self.browser.js("window.finger")) / 1000 - wall + begun
@@ -218,18 +220,18 @@ class Finger:
         return 1000 * (until(line, 5.0, "the finger's line") - at)
 
     def moved_to(self, y: float, speed: float) -> float:
-        """ms until the wheels are told to turn about so fast."""
+        """Push the stick there; return the ms until the wheels are commanded to this speed."""
         return self.waited(lambda: self.browser.push(0, y), lambda told: abs(told - speed) < 0.5)
 
     def press(self) -> None:
-        """Down and forwards."""
+        """Put the finger down and push forwards."""
         self.browser.push(0, 0, "Start")
         self.browser.push(0, 90)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
 def test_a_finger_on_the_stick_is_soon_on_the_port(tmp_path: Path) -> None:
-    """The browser says what is wished 20 times a second, and at once that it was let go."""
+    """The browser sends the wanted speed 20 times a second, and a release at once."""
     fast = dict.fromkeys(("linear_acceleration", "linear_deceleration"), 100.0)
     fast["linear_stop_deceleration"] = 100.0
     with (

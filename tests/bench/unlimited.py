@@ -2,9 +2,9 @@
 
     python -m tests.bench.unlimited --config FILE --port DEVICE --rate HZ
 
-The configuration file is read and checked as always; the rate and the baud rate are put in
-afterwards, where no check sees them (a frozen struct checks its values when it is decoded, not
-when it is copied). All that runs then is the product.
+The configuration file is read and checked as always. The rate and the baud rate are set afterwards,
+where no check sees them: a frozen struct checks its values when it is decoded, not when it is
+copied. Everything that runs then is the product.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from acsard.host.logs import Log
 from acsard.runtime import daemon
 
 BAUD_RATE = 4_000_000
-"""The fastest a terminal can be set to: 33 bytes in 0.08 ms."""
+"""The highest speed to which a terminal can be set: 33 bytes in 0.08 ms."""
 
 
 def main() -> None:
-    """Until a signal."""
+    """Run until a signal."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--config")
     parser.add_argument("--port")

@@ -1,6 +1,7 @@
 """The board on the bench: the firmware's machine code in libsimavr, and a host at its port.
 
-No parser of acsard's is used here. Every wait has a deadline; the process is ended by its own id.
+No parser of acsard's is used here. Every wait has a deadline, and the process is ended by its own
+id.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ ROOT = Path(__file__).resolve().parents[2]
 FIRMWARE = ROOT / "deploy" / "firmware"
 
 ANSWER_S = 10.0
-"""A command to the runner takes a millisecond; this is for a machine that is busy."""
+"""A command to the runner takes a millisecond; this limit is for a busy machine."""
 
 LATE_S = 0.1
-"""A host this late has not kept its pace."""
+"""A host that is this late has not kept its pace."""
 
 Speeds = tuple[float, float, float, float]
 
@@ -35,11 +36,11 @@ STOP = b"ap00.00,bp00.00,cp00.00,dp00.00"
 
 
 class UnavailableError(Exception):
-    """This machine cannot do it; why."""
+    """This machine cannot run the firmware; the message says why."""
 
 
 def missing() -> str:
-    """What the real firmware needs and is not here; "" when nothing is."""
+    """Return the tools that the real firmware needs and that are missing here, or ""."""
     tools = [tool for tool in ("make", "gcc", "avr-gcc", "avr-size") if shutil.which(tool) is None]
     if tools:
         return f"no {', '.join(tools)} (Debian: make gcc gcc-avr avr-libc binutils-avr)"
@@ -62,20 +63,20 @@ def _run(words: Sequence[str | Path], cwd: Path) -> str:
 
 
 def build_firmware(where: Path, *defines: str) -> Path:
-    """The ELF, made as the README says; prints its size."""
+    """Return the ELF, made as the README says; prints its size."""
     out = _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}"], FIRMWARE)
     print(*(line for line in out.splitlines() if "Full" in line), sep="\n")
     return where / "firmware.elf"
 
 
 def build_library(where: Path, *defines: str) -> Path:
-    """What of the firmware is not hardware, for this machine."""
+    """Build the hardware-independent part of the firmware for this machine."""
     _run(["make", f"BUILD={where}", f"DEFINES={' '.join(defines)}", "host"], FIRMWARE)
     return where / "libfirmware.so"
 
 
 def build_runner(where: Path) -> Path:
-    """The bench."""
+    """Build the bench."""
     source = Path(__file__).with_name("runner.c")
     flags = ["-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror"]
     flags += [f"-I{place}/simavr" for place in _INCLUDES if Path(place, "simavr").exists()]
@@ -85,20 +86,20 @@ def build_runner(where: Path) -> Path:
 
 
 class Motor(NamedTuple):
-    """The truth of one motor."""
+    """The true state of one motor."""
 
     duty: float
-    """-1 to 1, as the bridge gives it."""
+    """-1 to 1, as the bridge applies it."""
     speed: float
     """rad/s"""
     counts: int
-    """Of its encoder since power on, 64 bits."""
+    """Counts of its encoder since power on, 64 bits."""
     since_reset: int
-    """The same since the firmware began to count."""
+    """Counts of its encoder since the firmware began to count."""
     flips: int
-    """How often the bridge changed direction."""
+    """Number of times that the bridge changed direction."""
     flip_duty: float
-    """The highest duty at which it ever did, 0 to 1."""
+    """The highest duty at which the bridge ever changed direction, 0 to 1."""
 
 
 class Wire(NamedTuple):
@@ -106,46 +107,46 @@ class Wire(NamedTuple):
 
     bytes: int
     lines: int
-    """Put on it whole, whatever became of them there; empty ones are not counted."""
+    """Lines put on it whole, even if they were damaged there; empty ones are not counted."""
     lost: int
-    """Bytes."""
+    """Bytes lost on it."""
     damaged: int
-    """Bytes."""
+    """Bytes damaged on it."""
     last: str
     """The last whole line on it."""
 
 
 class Status(NamedTuple):
-    """The true state of the board; `*_ns` of the board's own time unless it says otherwise."""
+    """The true state of the board. `*_ns` are in the board's own time unless noted."""
 
     virtual_ns: int
     wall_ns: int
     """The monotonic clock of this machine, now."""
     base_ns: int
-    """Add this to a virtual time to have the monotonic clock's."""
+    """Add this to a virtual time to get the monotonic clock's."""
     skipped_ns: int
-    """What this machine was too slow for."""
+    """Virtual time for which this machine was too slow."""
     load: float
-    """Share of its time the processor did not sleep."""
+    """Share of its time in which the processor did not sleep."""
     resets: int
     running: bool
-    """Some motor has voltage."""
+    """Whether some motor has voltage."""
     on_ns: int
-    """When the motors last got voltage after having had none."""
+    """When the motors last got voltage after having none."""
     off_ns: int
-    """When they last lost it all."""
+    """When the motors last lost all voltage."""
     heard_ns: int
     """When the board last received a byte."""
     answer_ns: int
-    """From a byte it received to the first of its next line: how long it took to answer."""
+    """Time from a received byte to the first byte of the board's next line: its time to answer."""
     wanted_ns: int
-    """When the firmware last wanted a motor to turn, whatever it had for that."""
+    """When the firmware last wanted a motor to turn, whatever the reason."""
     set_points: int
-    """How often the speeds the firmware wants of the motors have changed."""
+    """Number of changes of the speeds that the firmware wants of the motors."""
     wrong: int
-    """How many of those are in none of the lines the host has sent just before."""
+    """Number of those changes that are in none of the lines which the host has just sent."""
     wrong_one: Sequence[int]
-    """The last such, hundredths of a rad/s."""
+    """The last such speeds, hundredths of a rad/s."""
     open: bool
     motors: tuple[Motor, ...]
     to_board: Wire
@@ -153,13 +154,13 @@ class Status(NamedTuple):
 
 
 class Board:
-    """A board that has booted when entered; leaving ends it, whatever happened."""
+    """A board that has booted when entered. Leaving it ends it in any case."""
 
     def __init__(self, runner: Path, firmware: Path, *options: str) -> None:
         self._words = [str(runner), *options, str(firmware)]
         self._held = b""
         self.path = ""
-        """Its port."""
+        """The path of its port."""
 
     def __enter__(self) -> Board:
         self._errors = tempfile.TemporaryFile()
@@ -168,7 +169,7 @@ class Board:
         )
         try:
             self.path = self._answer()["pty"]
-            # Whoever opens the port in the middle of the boot line gets the end of it.
+            # A host that opens the port in the middle of the boot line gets the end of it.
             until(lambda: self.status().from_board.last, ANSWER_S, "it has booted")
         except BaseException:
             self.__exit__()
@@ -188,7 +189,7 @@ class Board:
                 stream.close()
 
     def command(self, words: str) -> dict[str, Any]:
-        """Tell the runner something; its commands are listed in runner.c."""
+        """Send the runner a command; runner.c lists them."""
         assert self.process.stdin is not None
         self.process.stdin.write(words.encode() + b"\n")
         self.process.stdin.flush()
@@ -197,12 +198,12 @@ class Board:
         return answer
 
     def plug(self) -> str:
-        """A new port, instead of the old one if there is one; its path."""
+        """Open a new port, in place of any old one; return its path."""
         self.path = self.command("plug")["pty"]
         return self.path
 
     def status(self) -> Status:
-        """The truth."""
+        """Return the true state."""
         told = self.command("status")
         told["motors"] = tuple(Motor(**motor) for motor in told["motors"])
         told["to_board"] = Wire(**told["to_board"])
@@ -210,7 +211,7 @@ class Board:
         return Status(**told)
 
     def _answer(self) -> dict[str, Any]:
-        # libsimavr prints what it loads on the same standard output: not ours.
+        # libsimavr prints the names of loaded files on the same standard output. Skip those lines.
         stdout = self.process.stdout
         assert stdout is not None
         deadline = time.monotonic() + ANSWER_S
@@ -233,7 +234,7 @@ class Board:
 
 
 def speeds_line(speeds: Sequence[float]) -> bytes:
-    """A plain line without its end."""
+    """Return a plain line without its end."""
     return ",".join(
         f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
         for letter, speed in zip("abcd", speeds, strict=True)
@@ -241,13 +242,13 @@ def speeds_line(speeds: Sequence[float]) -> bytes:
 
 
 def checked(line: bytes, sequence: int, letters: str = "") -> bytes:
-    """The line with its suffix."""
+    """Return the line with its suffix."""
     line += b"#%02X" % sequence + letters.encode()
     return line + b"*%04X" % binascii.crc_hqx(line, 0)
 
 
 class Identity(NamedTuple):
-    """Who the board says it is, and what it has counted since it booted."""
+    """The board's identity, and its counters since it booted."""
 
     counts: int
     watchdog_ms: int
@@ -261,7 +262,7 @@ class Identity(NamedTuple):
 
 
 def read_identity(line: bytes) -> Identity:
-    """The identity in a line; fails unless all of it is there, in its order."""
+    """Return the identity in a line. Fails unless all of it is there, in its order."""
     name, version, *words = line.decode().split(" ")
     assert (name, version) == ("!acsard-mcu", "1"), line
     told = dict(word.split("=") for word in words)
@@ -272,21 +273,21 @@ def read_identity(line: bytes) -> Identity:
 
 
 class Reply(NamedTuple):
-    """What the board said."""
+    """A reply of the board."""
 
     at: float
-    """Monotonic s when it was read here."""
+    """Monotonic time when it was read here, s."""
     line: bytes
     speeds: Speeds
     """rad/s of motors a to d."""
     sequence: int | None
     milliseconds: int | None
     counts: tuple[int, ...]
-    """Modulo 65536; none without the sample fields."""
+    """Counts modulo 65536; empty without the sample fields."""
 
 
 def read_reply(line: bytes, at: float = 0.0) -> Reply:
-    """The reply in a line; fails unless it is right to the byte."""
+    """Return the reply in a line. Fails unless it is right to the byte."""
     plain, mark, suffix = line.partition(b"#")
     assert len(plain) == 31, line
     speeds = [float(plain[i + 2 : i + 7]) for i in range(0, 32, 8)]
@@ -309,7 +310,7 @@ def read_reply(line: bytes, at: float = 0.0) -> Reply:
 
 
 class Host:
-    """A program at the board's port, as a test wants it."""
+    """A program at the board's port that a test controls."""
 
     def __init__(self, path: str) -> None:
         self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -317,7 +318,7 @@ class Host:
         self._sequence = 0
         self._stopped = False
         self.sent_ns = 0
-        """Monotonic time when the last line was handed to the port."""
+        """Monotonic time when the last line was written to the port."""
 
     def __enter__(self) -> Host:
         return self
@@ -326,18 +327,18 @@ class Host:
         os.close(self._fd)
 
     def send(self, line: bytes, end: bytes = b"\r\n") -> None:
-        """One line."""
+        """Send one line."""
         self.write(line + end)
 
     def write(self, data: bytes) -> None:
-        """Bytes as they are."""
+        """Send bytes unchanged."""
         while data:
             select.select([], [self._fd], [], ANSWER_S)
             data = data[os.write(self._fd, data) :]
         self.sent_ns = time.monotonic_ns()
 
     def lines(self, wait: float = 0.0) -> list[tuple[float, bytes]]:
-        """The lines that have come, without their ends; waits that long for the first."""
+        """Return the received lines without their ends. Waits up to that time for the first."""
         while select.select([self._fd], [], [], wait)[0]:
             data = os.read(self._fd, 65536)
             if not data:
@@ -349,7 +350,7 @@ class Host:
         return [(now, line.removesuffix(b"\r")) for line in ends]
 
     def says(self, text: bytes, within: float = 3.0) -> bytes:
-        """The first line that comes and holds `text`."""
+        """Return the first line that contains `text`."""
         deadline = time.monotonic() + within
         heard: list[bytes] = []
         while time.monotonic() < deadline:
@@ -370,10 +371,7 @@ class Host:
         raise AssertionError(f"no answer within {within:g} s to {line!r}")
 
     def identity(self) -> Identity:
-        """What the board says of itself when asked.
-
-        Asked again if half a reply to another host was before it.
-        """
+        """Ask for the board's identity; again if half a reply to another host came before it."""
         self.lines()
         while True:
             self.send(b"?")
@@ -382,7 +380,7 @@ class Host:
                 return read_identity(line)
 
     def stop(self, within: float = 3.0) -> None:
-        """Send stops until one is answered: after a boot the board takes nothing else."""
+        """Send stops until one is answered: after a boot the board accepts nothing else."""
         deadline = time.monotonic() + within
         self._stopped = False
         self.lines()
@@ -390,7 +388,7 @@ class Host:
             self.send(STOP)
             again = time.monotonic() + 0.2
             while not self._stopped and time.monotonic() < again:
-                # Before the answer there may be what the board said when it booted.
+                # The board's boot message may come before the answer.
                 self._stopped = any(len(line) == len(STOP) for _, line in self.lines(0.05))
             if self._stopped:
                 return
@@ -399,10 +397,10 @@ class Host:
     def drive(
         self, speeds: Speeds, seconds: float, letters: str = "S", period: float = 0.01
     ) -> list[Reply]:
-        """Send checked lines at an even pace for that long; all replies that came.
+        """Send checked lines at an even pace for that time; return all replies.
 
-        The first time it sends a stop before. Begins again when other work of this machine kept us
-        from it: the board would stop.
+        The first call sends a stop before. It starts again if other work of this machine delayed
+        it, because the board would stop.
         """
         replies: list[Reply] = []
         if not self._stopped:

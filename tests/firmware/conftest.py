@@ -1,4 +1,4 @@
-"""The firmware, its host library and the bench, each built once a session."""
+"""The firmware, its host library and the bench, each built once per session."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.firmware.board import (
 )
 
 FREE_SPEEDS = "50,45,55,48"
-"""rad/s: no motor is as the firmware's constants say."""
+"""Free speeds in rad/s: no motor is as the firmware's constants say."""
 
 
 @pytest.fixture(scope="session")
@@ -33,7 +33,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 @pytest.fixture(scope="session")
 def coarse_library(library: ctypes.CDLL, tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
-    """The same for an encoder of 96 counts a turn, said as a product."""
+    """The firmware's logic for an encoder of 96 counts a turn, given as a product."""
     where = tmp_path_factory.mktemp("coarse")
     return ctypes.CDLL(str(build_library(where, "'-DCOUNTS_PER_TURN=2 * 4 * 12'")))
 
@@ -49,7 +49,7 @@ def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def hanging_firmware(firmware: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same with lines that hang it."""
+    """The ELF with additional lines that make it hang."""
     return build_firmware(tmp_path_factory.mktemp("hanging"), "-DTEST_HANG")
 
 
@@ -64,7 +64,7 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def board(runner: Path, firmware: Path) -> Iterator[Board]:
-    """The board, just powered on, with four unlike motors."""
+    """The board, just powered on, with four different motors."""
     with Board(runner, firmware, "--free-speed", FREE_SPEEDS) as board:
         yield board
 

@@ -1,6 +1,6 @@
-"""The firmware's machine code on the bench: it keeps the contract, and says what is true.
+"""The firmware's machine code on the bench keeps the contract and reports true values.
 
-Judged by the board's own time; what the same takes by this machine's clock is printed beside it.
+The board's own time is judged. The time by this machine's clock is printed next to it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tests.system.harness import until
 pytestmark = [pytest.mark.firmware, pytest.mark.xdist_group("board")]
 
 KNOWN = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
-"""How the line begins with which it says who it is, whatever comes behind."""
+"""The beginning of the identity line, whatever follows."""
 
 POWERED_ON = KNOWN + b" lines=0 refused=0 trips=0 runaways=0 reset=power"
 
@@ -55,7 +55,7 @@ def is_off(status: Status) -> bool:
 
 
 def stays_off(board: Board, ms: int) -> Status:
-    """For that long of the board's time no motor gets any voltage."""
+    """Check that for this board time no motor gets any voltage."""
     before = board.status()
     assert is_off(before)
     end = before.virtual_ns + ms * MS
@@ -67,11 +67,12 @@ def stays_off(board: Board, ms: int) -> Status:
 
 
 def is_still(board: Board) -> Status:
-    """Wait until nothing turns any more."""
+    """Wait until no motor turns any more."""
 
     def look() -> Status | None:
         status = board.status()
-        # What runs out yet is far less than a count, or one more may come after any answer.
+        # The remaining motion must be far less than a count, or one more count may come after any
+        # answer.
         still = all(abs(motor.speed) < 1e-6 for motor in status.motors)
         return status if still and is_off(status) else None
 
@@ -83,7 +84,7 @@ def wrapped(counts: Sequence[int]) -> tuple[int, ...]:
 
 
 def difference(before: int, after: int) -> int:
-    """Of two counts modulo 65536."""
+    """Return the difference of two counts modulo 65536."""
     return (after - before + 32768) % 65536 - 32768
 
 
@@ -146,7 +147,7 @@ def test_a_reset_while_driving_stops_it_until_a_new_valid_line(board: Board, hos
     stays_off(board, 400)
     is_still(board)
     host.stop()
-    host.write(b"ap10.00,bp10.00,cp10.00,dp10.00")  # not whole yet
+    host.write(b"ap10.00,bp10.00,cp10.00,dp10.00")  # not yet a whole line
     stays_off(board, 100)
     host.write(b"\r\n")
     until(lambda: board.status().running, 3.0, "it drives again")
@@ -207,7 +208,10 @@ def test_garbage_does_not_keep_it_going(board: Board, host: Host) -> None:
 
 
 def test_after_a_boot_nothing_counts_but_a_stop_until_one_came(board: Board, host: Host) -> None:
-    """A host that has not noticed the reset goes on asking for speeds: it is told instead."""
+    """A host that has not noticed the reset still sends speeds.
+
+    The board answers with its identity.
+    """
     lines = (speeds_line(DRIVE), checked(speeds_line(DRIVE), 1, "S"), speeds_line((0, 0, 0, 0.01)))
     for refused, line in enumerate(lines):
         host.send(line)
@@ -255,7 +259,7 @@ def test_it_counts_lines_refusals_and_stops_for_silence(board: Board, host: Host
 
 
 def reached(board: Board, host: Host, speeds: Speeds, seconds: float = 1.0) -> list[Reply]:
-    """Drive; the replies once there."""
+    """Drive, and return the replies once the speed is reached."""
     host.drive(speeds, seconds)
     return host.drive(speeds, 0.5)
 
@@ -308,7 +312,7 @@ def test_a_bridge_changes_direction_only_at_zero_duty(board: Board, host: Host) 
 
 
 def test_a_cut_takes_the_voltage_before_the_direction(board: Board, host: Host) -> None:
-    """For a driver with one direction input low is reverse."""
+    """For a driver with one direction input, low means reverse."""
     for _ in range(3):
         host.drive((30.0, -30.0, 20.0, -40.0), 0.25)
         assert all(abs(motor.duty) > 0.3 for motor in board.status().motors)
@@ -389,7 +393,7 @@ def test_the_counts_are_the_true_counts(board: Board, host: Host) -> None:
     true = [motor.since_reset for motor in board.status().motors]
     print("counts", reply.counts, "true", true)
     assert reply.counts == wrapped(true)
-    # After a reset it counts from zero again.
+    # After a reset the board counts from zero again.
     board.command("reset")
     host.says(b"acsard")
     host.stop()
@@ -456,7 +460,7 @@ def test_the_counts_wrap_and_go_on(board: Board, host: Host) -> None:
 
 
 def test_damaged_and_lost_bytes_cost_lines_and_nothing_else(board: Board, host: Host) -> None:
-    """Every 83rd byte has a wrong bit, every 211th is lost: the checked rest drives on."""
+    """Every 83rd byte has a wrong bit, every 211th is lost: the valid checked lines drive on."""
     board.command("noise to 83")
     board.command("drop to 211")
     replies = host.drive(DRIVE, 2.0)
@@ -471,7 +475,7 @@ def test_damaged_and_lost_bytes_cost_lines_and_nothing_else(board: Board, host: 
 
 
 def test_a_host_that_never_pauses_is_answered_and_controlled(board: Board, host: Host) -> None:
-    """Lines back to back on the wire: more than it can answer, and still it keeps its time."""
+    """Lines back to back are more than the board can answer, and it still keeps its time."""
     line = checked(speeds_line(DRIVE), 0, "S") + b"\r\n"
     replies: list[Reply] = []
     host.stop()
@@ -515,7 +519,7 @@ def test_it_keeps_up_with_fast_wheels(runner: Path, firmware: Path, speed: float
 def test_an_overflow_costs_its_lines_and_spares_the_next(
     runner: Path, hanging_firmware: Path
 ) -> None:
-    """The main loop pauses for 60 ms, in which twice as much comes as it can hold."""
+    """The main loop pauses for 60 ms, in which twice as many bytes come as the buffer holds."""
     with Board(runner, hanging_firmware) as board, Host(board.path) as host:
         lines = b"".join(checked(ZERO, i) + b"\r\n" for i in range(12))
         host.write(b"!p\r\n" + lines)
@@ -542,7 +546,7 @@ def test_a_port_that_vanishes_stops_it_and_a_new_one_works(board: Board, host: H
 def test_opening_the_port_resets_a_board_that_is_wired_so(board: Board, host: Host) -> None:
     until(lambda: board.status().open, 3.0, "it is seen that the port is open")
     board.command("auto_reset 300")
-    with Host(board.path) as another:  # it is open already: nothing happens
+    with Host(board.path) as another:  # it is open already, so nothing happens
         another.drive(DRIVE, 0.1)
     assert board.status().resets == 0
     path = board.plug()
@@ -555,7 +559,7 @@ def test_opening_the_port_resets_a_board_that_is_wired_so(board: Board, host: Ho
 
 
 def test_the_bench_sees_a_speed_that_was_not_asked_for(board: Board, host: Host) -> None:
-    """A plain line takes a digit with a wrong bit for a digit."""
+    """A plain line accepts a digit with a wrong bit as another digit."""
     host.stop()
     board.command("noise to 37")
     lines = 0
@@ -599,7 +603,7 @@ def test_the_bench_can_mute_and_freeze_the_board(board: Board, host: Host) -> No
 
 
 def is_cut(board: Board, host: Host, speeds: Speeds, within: float) -> Status:
-    """Drive on until a wheel that does not do as told has cut all motors."""
+    """Drive on until a wheel that does not obey has cut all motors."""
     began = board.status().virtual_ns
     while (status := board.status()).running or not status.off_ns > began:
         assert (status.virtual_ns - began) / MS < 1000 * within, status.motors
@@ -608,7 +612,7 @@ def is_cut(board: Board, host: Host, speeds: Speeds, within: float) -> Status:
 
 
 def stays_cut(board: Board, host: Host) -> None:
-    """Lines are answered and move nothing, until the host was silent."""
+    """The board answers lines and moves nothing, until the host was silent."""
     before = board.status()
     replies = host.drive(DRIVE, 0.7)
     assert len(replies) >= 60
@@ -684,7 +688,7 @@ def test_a_reset_frees_motors_that_were_cut(board: Board, host: Host) -> None:
 
 
 def test_a_healthy_robot_is_never_cut(board: Board, host: Host) -> None:
-    """Quick reversals, wheels that are heavy, blocked and let go, knocked."""
+    """Quick reversals, and wheels that are heavy, blocked and released, or knocked."""
     host.drive(DRIVE, 0.2)
     for i, speed in enumerate((40.0, -40.0, 1.0, -1.0, 60.0, -60.0, 0.0, 99.0, -99.0, 0.2, -30.0)):
         board.command(f"load a {0.9 * (i % 2)}")
@@ -724,7 +728,7 @@ def test_coarse_encoders_are_driven_reported_and_never_cut(runner: Path, tmp_pat
 def test_at_the_lowest_pwm_frequency_the_duty_rises_to_the_top(
     runner: Path, tmp_path: Path
 ) -> None:
-    """Where duty and its rise together pass 16 bits."""
+    """Here the duty and its rise together exceed 16 bits."""
     slow = build_firmware(tmp_path, "-DPWM_HZ=250UL")
     with Board(runner, slow) as board, Host(board.path) as host:
         host.drive((49.0, -49.0, 49.0, 49.0), 0.4)

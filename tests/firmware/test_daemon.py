@@ -1,7 +1,7 @@
-"""The real daemon on the firmware's real machine code, behind a port, in real time.
+"""The real daemon drives the firmware's real machine code, behind a port, in real time.
 
-Judged by what the board itself has counted and by the true state of the simulated motors. Whoever
-drives is a plain client of the bus.
+The tests judge the board's own counts and the true state of the simulated motors. A plain client of
+the bus sends the commands.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ pytestmark = pytest.mark.firmware
 MS = 1_000_000
 
 RADIUS, TRACK = 0.05, 0.3
-"""m, as the daemon's configuration has them."""
+"""m, as in the daemon's configuration."""
 
 ANGLE = math.tau / 3200
 """rad a count."""
 
 COAST = 0.035
-"""m: what a wheel of 0.5 m/s rolls on without voltage is 25 mm."""
+"""m. A wheel at 0.5 m/s rolls 25 mm without voltage."""
 
 JITTER = 0.01
 """m at 0.5 m/s: the stamps of two samples may be 20 ms nearer than the samples were."""
 
 BOOT_NS = 1 * MS
-"""After a reset the memory still says for so long what was wanted before."""
+"""After a reset the memory still shows the earlier wish for this time."""
 
 Mcu = Mapping[str, object]
 
@@ -59,7 +59,7 @@ COUNTS: Mcu = {"link_check": "auto", "encoder_counts": 3200}
 STRICT: Mcu = {"link_check": "require", "encoder_counts": 3200}
 
 LEGS = [(0.6, 0.0), (0.6, 0.9), (0.0, 1.5), (0.8, -0.4), (-0.3, 0.0), (0.0, 0.0)]
-"""m/s and rad/s: ramps, arcs, a turn on the spot, back, a stop. Every wheel gets on by them."""
+"""m/s and rad/s: ramps, arcs, a turn on the spot, back, a stop. They move every wheel forward."""
 
 LEG_MS = 1200
 
@@ -76,7 +76,7 @@ class Rig(NamedTuple):
 
 @contextmanager
 def running(board: Board, where: Path, mcu: Mcu, port: Path | str = "") -> Iterator[Rig]:
-    """A daemon at the board's port and a client of it, with the link up."""
+    """Run a daemon at the board's port and a client of it, until the link is up."""
     config = {"mcu": mcu, "log": {"format": "json"}}
     with Daemon(where, port or board.path, config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
@@ -84,7 +84,7 @@ def running(board: Board, where: Path, mcu: Mcu, port: Path | str = "") -> Itera
 
 
 def passes(board: Board, ms: float) -> Status:
-    """The state when so much of the board's time has passed."""
+    """Return the state after this much of the board's time."""
     end = board.status().virtual_ns + ms * MS
     return until(
         lambda: status if (status := board.status()).virtual_ns >= end else None,
@@ -94,18 +94,18 @@ def passes(board: Board, ms: float) -> Status:
 
 
 def turns(board: Board, speed: float) -> Status | None:
-    """The state when all wheels have that speed, rad/s."""
+    """Return the state when all wheels have that speed, rad/s."""
     status = board.status()
     return status if all(abs(motor.speed - speed) < 0.1 for motor in status.motors) else None
 
 
 def drives(board: Board, linear: float = 0.5, within: float = 5.0) -> Status:
-    """The state when the robot goes straight at that speed."""
+    """Return the state when the robot goes straight at that speed."""
     return until(lambda: turns(board, linear / RADIUS), within, f"it drives at {linear} m/s")
 
 
 def stands(board: Board) -> Status:
-    """The state when no wheel turns any more, to the last count."""
+    """Return the state when no wheel turns any more, to the last count."""
 
     def look() -> Status | None:
         status = board.status()
@@ -116,15 +116,20 @@ def stands(board: Board) -> Status:
 
 
 def gives_way(bus: Bus, commander: Commander, linear: float = 0.5) -> None:
-    """The commander sends zeros until they count, a second of one whom only his key tells; then a
-    speed."""
+    """Send zeros until they count, then a speed.
+
+    The zeros of a sender that is known only by its key count after a second.
+    """
     commander.wish = ZERO
     until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
     commander.wish = twist(linear)
 
 
 def moves_nothing(board: Board, since: Status, ms: float) -> None:
-    """No motor was told to turn since then, nor is for so long; those that coast are braked."""
+    """Check that no motor was commanded to turn since then, nor is for this time.
+
+    Coasting motors are braked.
+    """
     status = passes(board, ms)
     assert status.wanted_ns < since.virtual_ns + BOOT_NS, "not for a moment"
     for before, after in zip(since.motors, status.motors, strict=True):
@@ -133,7 +138,7 @@ def moves_nothing(board: Board, since: Status, ms: float) -> None:
 
 
 def drive_about(board: Board, commander: Commander, length_s: float) -> None:
-    """Leg after leg, then neutral."""
+    """Drive leg after leg, then neutral."""
     end = board.status().virtual_ns + length_s * 1000 * MS
     for leg in itertools.cycle(LEGS):
         commander.wish = twist(*leg)
@@ -143,21 +148,21 @@ def drive_about(board: Board, commander: Commander, length_s: float) -> None:
 
 
 def skipped(status: Status) -> str:
-    """Words that explain a failure: a board that time is taken from is no real one any more."""
+    """Return the virtual time lost, in words for a failure: such a board is not realistic."""
     return f"{status.skipped_ns / MS:.0f} ms skipped for want of a faster machine"
 
 
 def account(board: Board) -> Identity:
-    """What the board has counted; nobody else may have its port open."""
+    """Return the board's counters. No other program may have its port open."""
     with Host(board.path) as host:
         return host.identity()
 
 
-# odometry beside the truth
+# odometry compared with the truth
 
 
 class Path2D(NamedTuple):
-    """How the robot went."""
+    """The path of the robot."""
 
     distance: float
     """m, forward less backward."""
@@ -166,13 +171,13 @@ class Path2D(NamedTuple):
 
 
 def pose(message: Any) -> tuple[float, float, float]:
-    """x, y and yaw of an odometry message."""
+    """Return x, y and yaw of an odometry message."""
     position, turn = message["pose"]["pose"]["position"], message["pose"]["pose"]["orientation"]
     return position["x"], position["y"], 2 * math.atan2(turn["z"], turn["w"])
 
 
 def went(odom: Sequence[Any]) -> Path2D:
-    """What the messages add up to, from the origin."""
+    """Return the sum of the messages' motion, from the origin."""
     distance = total = 0.0
     x, y, yaw = 0.0, 0.0, 0.0
     for message in odom:
@@ -186,14 +191,14 @@ def went(odom: Sequence[Any]) -> Path2D:
 
 
 def truly(status: Status) -> Path2D:
-    """The same by the simulated encoders."""
+    """Return the path by the simulated encoders."""
     a, b, c, d = (motor.counts * ANGLE * RADIUS for motor in status.motors)
     right, left = (a + d) / 2, (b + c) / 2
     return Path2D((right + left) / 2, (right - left) / TRACK)
 
 
 def leap(odom: Sequence[Any], fastest: float) -> float:
-    """By how many m the longest step between two messages exceeds what `fastest` m/s explains."""
+    """Return by how many m the longest step between two messages exceeds one at `fastest` m/s."""
     most = -math.inf
     for before, after in itertools.pairwise(odom):
         (x, y, _), (to_x, to_y, _) = pose(before), pose(after)
@@ -203,7 +208,7 @@ def leap(odom: Sequence[Any], fastest: float) -> float:
 
 
 class Errors(NamedTuple):
-    """Shares by which odometry is off the truth."""
+    """Relative errors of odometry."""
 
     distance: float
     yaw: float
@@ -219,7 +224,7 @@ class Errors(NamedTuple):
 
 
 def errors(odom: Following, wheels: Following, true: Status) -> Errors:
-    """What is said of a robot that stands by now, beside the truth."""
+    """Return the errors of odometry for a robot that now stands."""
     now = time.monotonic()
     odom.find(lambda message: True, 3.0, "odometry at rest", after=now)
     turned = wheels.find(lambda message: True, 3.0, "wheels at rest", after=now).value["position"]
@@ -312,17 +317,17 @@ def test_when_the_daemon_is_killed_the_motors_stop(
 
 
 def by_pin(board: Board) -> None:
-    """Somebody presses its button."""
+    """A person presses its button."""
     board.command("reset")
 
 
 def by_a_hang(board: Board) -> None:
-    """Its main loop stands still, until its own watchdog resets it."""
+    """Its main loop hangs, until its own watchdog resets it."""
     board.command("type !l")
 
 
 def unheard(board: Board) -> None:
-    """By its pin, and the line that says so is lost."""
+    """The reset pin resets it, and the boot line is lost."""
     lines = board.status().from_board.lines
     board.command("lose from 100")
     board.command("reset")
@@ -331,9 +336,10 @@ def unheard(board: Board) -> None:
 
 
 def resets(rig: Rig, how: Callable[[Board], None], unseen: float) -> None:
-    """The board resets while the robot drives and its commander goes on sending.
+    """The board resets while the robot drives and its commander continues.
 
-    `unseen` m of its way no line told of: it may miss them, but nothing else, and add none.
+    No line reported `unseen` m of its way: odometry may miss those, but nothing else, and may add
+    none.
     """
     board, _, bus = rig
     with bus.follow("odom") as odom:
@@ -411,7 +417,7 @@ def test_a_board_that_hangs_moves_nothing_before_neutral(
 def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
     board: Board, tmp_path: Path, mcu: Mcu, length_s: float
 ) -> None:
-    """Wrong bits in every sixth to fourth line, lost bytes in as many, each way."""
+    """Wrong bits in every sixth to fourth line, and lost bytes in as many, each way."""
     is_checked = mcu is STRICT
     with running(board, tmp_path, mcu) as (_, _, bus), bus.commanding(0.5) as commander:
         drives(board)
@@ -450,7 +456,7 @@ def test_a_bad_wire_costs_lines_and_no_wheel_a_wrong_speed(
 
 
 def rejects(bus: Bus) -> dict[str, int]:
-    """The lines it has refused, by reason."""
+    """Return the number of refused lines, by reason."""
     counters = bus.state()["counters"]
     return {name: count for name, count in counters.items() if name.startswith("line_")}
 
@@ -466,7 +472,7 @@ def test_a_lost_line_is_found_again_and_neutral_comes_first(
         with bus.follow("state") as states:
 
             def link(word: str, since: float) -> float:
-                """After how many ms the link was that."""
+                """Return the ms until the link had that state."""
                 seen = states.find(
                     lambda state: state["link"] == word, 3.0, f"link {word}", after=since
                 )

@@ -17,7 +17,7 @@ TOP = 400
 """PWM_TOP at 16 MHz and 20 kHz."""
 
 TICKS = 2_000_000
-"""Of the edge clock in a second."""
+"""Ticks of the edge clock per second."""
 
 COUNTS_PER_TURN = 3200
 
@@ -61,13 +61,13 @@ class SupervisorC(ctypes.Structure):
 
 @pytest.fixture(scope="session")
 def logic(library: ctypes.CDLL) -> ctypes.CDLL:
-    """The library with its types told."""
+    """The library with its types declared."""
     return told(library)
 
 
 @pytest.fixture(scope="session")
 def coarse(coarse_library: ctypes.CDLL) -> ctypes.CDLL:
-    """The same for a coarse encoder."""
+    """The library for a coarse encoder."""
     return told(coarse_library)
 
 
@@ -131,7 +131,7 @@ def test_a_tripped_watchdog_stays_so_when_the_clock_comes_round(logic: ctypes.CD
 def readings(
     rate: float, every: float, seconds: float, start: int = 0, jitter: float = 0.0
 ) -> Iterator[tuple[int, int, int]]:
-    """Count, time of its last edge, and time, of a wheel that turns at `rate` counts a second."""
+    """Return count, time of its last edge, and time, for a wheel at `rate` counts a second."""
     rng = random.Random(1)
     now, count, edge = 0.0, 0, 0.0
     while now < seconds:
@@ -193,7 +193,7 @@ def test_the_first_edges_after_a_rest_make_no_spike(logic: ctypes.CDLL) -> None:
 
 
 def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> list[tuple[int, int]]:
-    """When the count of such an angle (in counts) became what."""
+    """Return the time and the new count of each edge of such an angle (in counts)."""
     found, last = [], math.floor(angle(0.0))
     for i in range(round(seconds / step)):
         now = math.floor(angle(i * step))
@@ -206,7 +206,7 @@ def edges_of(angle: Callable[[float], float], seconds: float, step: float) -> li
 def said_of(
     library: ctypes.CDLL, edges: Iterable[tuple[int, int]], windows: Iterable[int], start: int = 0
 ) -> Iterator[tuple[int, float, int, int]]:
-    """Counts turned, what is said, the window, and the time, of counts that became so."""
+    """Yield counts turned, reported speed, window and time, for a wheel with these edges."""
     wheel = SpeedC()
     at = ctypes.addressof(wheel)
     waiting = list(edges)[::-1]
@@ -234,7 +234,7 @@ PITCH = math.tau / COUNTS_PER_TURN
 def test_whatever_the_edges_no_more_is_said_than_the_window_allows(
     logic: ctypes.CDLL, steps: list[tuple[int, int]], windows: list[int], start: int
 ) -> None:
-    """Edges at random times, some reversing, some microseconds apart."""
+    """Edges come at random times, some reversing, some microseconds apart."""
     times = itertools.accumulate(step for step, _ in steps)
     counts = itertools.accumulate(way for _, way in steps)
     before, way = 0.0, 0
@@ -254,7 +254,7 @@ def test_whatever_the_edges_no_more_is_said_than_the_window_allows(
 
 
 CHATTER = [(9_900 + 20_000 * i + 200 * j, 1 - j) for i in range(40) for j in (0, 1)]
-"""An edge crossed and crossed back after 100 us, on either side of the end of a window."""
+"""The wheel crosses an edge and returns after 100 us, on either side of the end of a window."""
 
 
 @pytest.mark.parametrize(
@@ -272,8 +272,10 @@ CHATTER = [(9_900 + 20_000 * i + 200 * j, 1 - j) for i in range(40) for j in (0,
 def test_a_wheel_that_trembles_is_not_said_to_race(
     logic: ctypes.CDLL, edges: list[tuple[int, int]], most: float
 ) -> None:
-    """No more than the fastest it truly is, and one count in a window; `most` in counts, as of a
-    sine its amplitude times its frequency."""
+    """The speed is at most the fastest true speed plus one count per window.
+
+    `most` is in counts; for a sine it is amplitude times frequency.
+    """
     for window in (10_000, 20_000, 40_000):
         said = [value for _, value, _, _ in said_of(logic, edges, [window] * 200)]
         assert max(map(abs, said)) <= (most * math.tau + TICKS / window) * PITCH
@@ -286,7 +288,7 @@ def test_a_wheel_that_trembles_is_not_said_to_race(
 def test_a_coarse_encoder_says_its_true_speed_however_slow(
     coarse: ctypes.CDLL, speed: float, every: float
 ) -> None:
-    """96 counts a turn: at 0.2 rad/s one in 330 ms."""
+    """With 96 counts a turn, 0.2 rad/s gives one count in 330 ms."""
     edges = edges_of(lambda t: speed / math.tau * 96 * t, 20.0, 1e-4)
     told = list(said_of(coarse, edges, [round(every * TICKS)] * round(20.0 / every)))
     settled = [value for _, value, _, now in told if now > 2.0 * TICKS]
@@ -305,7 +307,7 @@ def test_a_quick_start_is_not_hidden_by_the_time_waited(logic: ctypes.CDLL) -> N
 
 
 def test_after_a_rest_longer_than_the_clock_a_first_edge_is_no_race(logic: ctypes.CDLL) -> None:
-    """Its 32 bits come round in 36 minutes; then an edge long ago would look recent."""
+    """Its 32 bits wrap in 36 minutes; then an edge long ago would look recent."""
     rests = [2**32 // 32] * 32
     far = sum(rests)
     edges = [(1000, 1), (far + 15_000, 2), (far + 25_000, 3)]
@@ -338,7 +340,7 @@ def test_the_loop_settles_without_overshoot_and_forgets_a_jam(logic: ctypes.CDLL
         if tick == 199:
             assert speed == pytest.approx(20.0, rel=0.01)
     assert most < 20.0 * 1.03
-    for _ in range(1000):  # jammed: as hard as it can, and no further
+    for _ in range(1000):  # jammed: it pushes as hard as it can, and no further
         duty = logic.pi_step(at, 20.0, 0.0, False)
     assert duty == 1.0
     assert pi.integral <= 1.0
@@ -374,7 +376,7 @@ def test_at_rest_the_duty_leaks_away(logic: ctypes.CDLL) -> None:
 def test_a_bridge_reverses_at_rest_rises_slowly_and_falls_at_once(
     logic: ctypes.CDLL, steps: list[int | None]
 ) -> None:
-    """None = off, as by the watchdog: between two ticks, so it is none itself."""
+    """None means off, as by the watchdog, between two ticks and without a tick of its own."""
     bridge = BridgeC(0, 0, 0)
     at = ctypes.addressof(bridge)
     rested, driven = REVERSE_TICKS, 0
@@ -413,7 +415,7 @@ def test_a_bridge_goes_on_the_same_way_without_rest(logic: ctypes.CDLL) -> None:
 
 
 class Wheel:
-    """A motor under the firmware's control, a control period at a time, as main.c does it."""
+    """A motor under the firmware's control, one control period at a time, as in main.c."""
 
     def __init__(
         self,
@@ -427,9 +429,9 @@ class Wheel:
         self.library, self.lag, self.free_speed = library, lag, free_speed
         self.counts, self.encoder = counts, encoder
         self.force = 0.0
-        """From outside, a share of what stalls the motor."""
+        """Force from outside, as a share of the motor's stall force."""
         self.friction = 0.0
-        """The same, against whatever it does."""
+        """Friction against any motion, as a share of the motor's stall force."""
         self.speed, self.angle, self.duty, self.now = 0.0, 0.0, 0.0, 0
         self.count = self.edge = 0
         self.off_ms: int | None = None
@@ -441,7 +443,7 @@ class Wheel:
         self.limited = False
 
     def run(self, target: float, ms: int) -> bool:
-        """So long, or until its motor is switched off; True when it was."""
+        """Run for this time, or until the motor is switched off; return whether it was."""
         for _ in range(ms // 5):
             self._turn()
             if self._control(target):
@@ -526,7 +528,7 @@ def test_a_wheel_that_shows_no_counts_is_switched_off_after_a_second_of_full_vol
 
 
 def test_a_dead_channel_counts_as_a_dead_encoder(logic: ctypes.CDLL) -> None:
-    """It counts one up and one down."""
+    """The encoder counts one up and one down."""
     supervisor = SupervisorC()
     at = ctypes.addressof(supervisor)
     logic.supervise_start(at)
@@ -563,8 +565,11 @@ def test_a_healthy_wheel_is_never_switched_off(
     is_coarse: bool,
     actions: list[tuple[float, int, float, float | None]],
 ) -> None:
-    """Light or a whole robot's weight, stronger or weaker than it is said to be, with much
-    friction; driven, reversed, pushed with half of what stalls it, and knocked if light."""
+    """The wheel may be light or heavy, strong or weak, and has much friction.
+
+    A heavy one carries the whole robot; strong and weak compare with the specification. It is
+    driven, reversed, pushed with half of its stall force, and knocked if light.
+    """
     library, counts = (coarse, 96) if is_coarse else (logic, COUNTS_PER_TURN)
     wheel = Wheel(library, lag=lag, free_speed=free_speed, counts=counts)
     wheel.friction = friction

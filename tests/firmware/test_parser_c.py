@@ -1,4 +1,7 @@
-"""The firmware's parser, compiled for this machine, beside the host's: all of a line or nothing."""
+"""The firmware's parser takes all of a line or nothing, as the host's does.
+
+It is compiled for this machine.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ class RecordC(ctypes.Structure):
 
 
 class Command(NamedTuple):
-    """What a line said."""
+    """The contents of a line."""
 
     hundredths: tuple[int, ...]
     checked: bool = False
@@ -92,7 +95,7 @@ class Parser:
         self._command = CommandC()
 
     def parse(self, line: bytes) -> Command | None:
-        """The command in a line; a refused line leaves no trace in what was there before."""
+        """Return the command in a line. A refused line leaves the earlier contents unchanged."""
         command = self._command
         before = bytes(command)
         if not self._parse(line, len(line), ctypes.addressof(command)):
@@ -101,7 +104,7 @@ class Parser:
         return Command(tuple(command.hundredths), command.checked, command.sample, command.sequence)
 
     def lines(self, data: bytes) -> list[bytes]:
-        """The lines in a stream; the reader keeps what is not complete."""
+        """Return the lines in a stream; the reader keeps an incomplete one."""
         got = []
         for byte in data:
             length = self._feed(self._pointer, byte)
@@ -110,7 +113,7 @@ class Parser:
         return got
 
     def stream(self, data: bytes) -> list[Command]:
-        """The commands in a stream that begins afresh."""
+        """Return the commands in a stream that starts anew."""
         self._reader.length = 0
         self._reader.discarding = False
         found = [self.parse(line) for line in self.lines(data)]
@@ -124,7 +127,7 @@ class Parser:
         return int(self._reader.too_long)
 
     def identity(self, lines: int, refused: int, trips: int, runaways: int, reset: bytes) -> bytes:
-        """The line that says who it is, with its end."""
+        """Return the identity line, with its end."""
         record = RecordC(lines, refused, trips, runaways)
         out = ctypes.create_string_buffer(128)
         length = self._identity(out, ctypes.addressof(record), reset)
@@ -132,13 +135,13 @@ class Parser:
         return out.raw[:length]
 
     def counted_up(self, count: int) -> int:
-        """The next count."""
+        """Return the next count."""
         counter = ctypes.c_uint16(count)
         self._count_up(ctypes.addressof(counter))
         return counter.value
 
     def reply(self, command: Command, ms: int, counts: list[int], hundredths: list[int]) -> bytes:
-        """The answer, with its end."""
+        """Return the answer, with its end."""
         asked = CommandC((0,) * 4, command.checked, command.sample, command.sequence)
         reading = ReadingC(ms, tuple(counts), tuple(hundredths))
         out = ctypes.create_string_buffer(64)
@@ -156,8 +159,10 @@ FIGURE = re.compile(rb"[pn]\d\d\.\d\d(?!\d)")
 
 
 def said(line: bytes) -> tuple[int, ...] | None:
-    """Hundredths of a rad/s the host's own parser takes from a plain line, if its figures are as
-    the host writes them: the board takes no others."""
+    """Return the speeds that the host's own parser reads from a plain line, hundredths of a rad/s.
+
+    This requires numbers as the host writes them: the board accepts no others.
+    """
     if len(FIGURE.findall(line)) != 4:
         return None
     try:
@@ -167,7 +172,7 @@ def said(line: bytes) -> tuple[int, ...] | None:
     return tuple(round(speed * 100) for speed in speeds.as_tuple())
 
 
-# plain lines: the host's language, with figures of one form
+# plain lines: the host's language, with numbers of one form
 
 
 @pytest.mark.parametrize(("line", "motors"), ACCEPTED)
@@ -202,7 +207,7 @@ def _with(line: bytes, at: int, byte: int) -> bytes:
 
 
 def test_it_reads_the_host_s_language_and_no_other(parser: Parser) -> None:
-    """Valid lines with one to three changes: both parsers say the same of each."""
+    """Both parsers give the same result for valid lines with one to three changes."""
     rng = random.Random(1)
     taken = 0
     for _ in range(50_000):
@@ -240,7 +245,7 @@ def test_a_checked_line_is_taken_with_its_sequence_and_request(
 
 @given(st.binary(max_size=300))
 def test_lines_are_cut_as_the_host_cuts_them(parser: Parser, data: bytes) -> None:
-    data = data.replace(b"\x07", b"\n")  # more of them than chance would give
+    data = data.replace(b"\x07", b"\n")  # more of them than by chance
     reader = LineReader()
     parser.stream(b"\n")
     assert parser.lines(data) == [line for line, _ in reader.feed(data)]
@@ -301,7 +306,7 @@ def test_lower_case_and_a_wrong_check_are_refused(parser: Parser) -> None:
 
 
 def flipped(rng: random.Random, checked_lines: bool) -> tuple[bytes, list[tuple[int, ...]]]:
-    """Three lines as they are sent, one bit of the middle one wrong, and the values sent."""
+    """Return three lines, with one wrong bit in the middle one, and the values sent."""
     sent, data = [], []
     for i in range(3):
         hundredths = [rng.randrange(-9999, 10000) for _ in range(4)]
@@ -317,7 +322,7 @@ def flipped(rng: random.Random, checked_lines: bool) -> tuple[bytes, list[tuple[
 
 
 def wrong_values(parser: Parser, count: int, checked_lines: bool) -> int:
-    """How many of so many single-bit errors put a speed in force that was never sent."""
+    """Return how many of `count` single-bit errors put a speed in force that was never sent."""
     rng = random.Random(count)
     wrong = 0
     for _ in range(count):
@@ -344,8 +349,10 @@ def test_no_single_bit_error_in_checked_lines_puts_a_wrong_speed_in_force(
 
 
 def test_a_byte_that_becomes_a_line_end_leaves_no_valid_piece(parser: Parser) -> None:
-    """But one: where the check begins, which leaves the plain line. It takes two errors or more to
-    make a line end of `#`."""
+    """There is one exception: the start of the check, without which the plain line remains.
+
+    It takes two errors or more to turn `#` into a line end.
+    """
     for line in (checked(SEED_LINE, 7, "S"), checked(SEED_LINE + b",", 7), SEED_LINE):
         (whole,) = parser.stream(line + b"\r\n")
         for at in range(len(line)):
@@ -365,7 +372,7 @@ def test_no_single_bit_error_makes_a_line_end_where_the_rest_is_a_line(parser: P
                 assert parser.stream(bad + b"\r\n") == [], bad
 
 
-# who it is
+# the identity
 
 
 counters = st.one_of(st.integers(0, 1100), st.integers(0, 65535))

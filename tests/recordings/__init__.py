@@ -1,6 +1,5 @@
-"""Recorded drives, replayed by `tests/test_recordings.py`: each a file of `acsard run --record`.
+"""Recorded drives that `tests/test_recordings.py` replays, each a file of `acsard run --record`.
 
-A file of a robot that did something odd may lie here as it is. Those that are here were made by
-
-    python -m tests.recordings
+The file of a robot that behaved oddly may be stored here unchanged. `python -m tests.recordings`
+made those that are here now.
 """

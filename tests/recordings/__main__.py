@@ -1,4 +1,4 @@
-"""Writes the recordings anew: do it when a change of behaviour is wanted, and say why."""
+"""Rewrite the recordings. Do it when a change of behaviour is wanted, and give the reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHECKED = replace(
 
 
 def quiet(world: World) -> None:
-    """Two commanders, a stop and a clear."""
+    """Two clients command the robot, and it gets a stop and a clear."""
     world.drive(0.5, 0.3, 2.0, source="nav")
     world.drive(0.3, -0.8, 2.0, source="teleop")
     world.call("stop")
@@ -33,14 +33,14 @@ def quiet(world: World) -> None:
 
 
 def stuck(world: World) -> None:
-    """A wheel whose encoder stands: left out, then a fault."""
+    """A wheel's encoder stops counting: the wheel is left out, then a fault is reported."""
     world.drive(0.5, 0.0, 1.0)
     with world.mcu.stuck_encoder(0):
         world.hold(0.5, 0.4, seconds=3.0)
 
 
 def faults(world: World) -> None:
-    """The first dozen faults of the simulator, for half a second each."""
+    """Run through the first dozen faults of the simulator, half a second each."""
     drive_through_faults(world, 12.0)
 
 

@@ -1,4 +1,4 @@
-"""Programs that send commands over a network that may hold them back, by clocks that may be set."""
+"""Programs that send commands over a network with delays, stamped by clocks that may be set."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from tests.scenarios.world import World
 
 Way = Literal["client", "signed", "rmw", "header", "zenoh", "plain", "bridge"]
 FOREIGN: tuple[Way, ...] = ("signed", "rmw", "header", "zenoh")
-"""Roads whose stamps come from a wall clock. Our own client stamps by a steady clock."""
+"""Routes on which messages have wall-clock stamps. Our own client stamps by a steady clock."""
 STAMPED: tuple[Way, ...] = ("client", *FOREIGN)
 SHARED: tuple[Way, ...] = ("header", "plain", "bridge")
-"""Roads by which all programs on a key share one identity."""
+"""Routes on which all programs on a key share one identity."""
 
 AHEAD_NS = NS_PER_S // 2
-"""Zenoh replaces a timestamp that is further ahead of the receiver's clock by its own."""
+"""Zenoh replaces a timestamp that is further ahead of the receiver's clock than this."""
 
 
 class Speaker:
-    """One program that commands `app`; `ahead` is by how much its clock is ahead, s."""
+    """A program that commands `app`. Its clock is `ahead` seconds ahead."""
 
     def __init__(self, world: World, way: Way, name: str = "a", ahead: float = 0.0) -> None:
         self.world, self.way, self.name, self.ahead = world, way, name, ahead
         self.rate = 1.0
-        """How fast its clock goes, once it is slewed."""
+        """The rate of its clock while it is slewed."""
         self._slewed_ns = world.now_ns
         self._sent = 0
         self.key = "cmd/app"
@@ -45,24 +45,24 @@ class Speaker:
         return f"session of {self.name}"
 
     def slew(self, rate: float) -> None:
-        """From now on its clock goes so fast."""
+        """Set the rate of its clock from now on."""
         self.ahead += (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
         self.rate, self._slewed_ns = rate, self.world.now_ns
 
     @property
     def gained(self) -> float:
-        """By how much it is ahead of where it was when its slewing began, s."""
+        """The seconds that its clock has gained since its slewing began."""
         return (self.rate - 1.0) * (self.world.now_ns - self._slewed_ns) / NS_PER_S
 
     def message(self, linear: float) -> tuple[float, int, int]:
-        """What it sends now: speed, stamp by its clock, number."""
+        """Return its current message: speed, stamp by its clock, number."""
         self._sent += 1
         world = self.world
         slewed = (self.rate - 1.0) * (world.now_ns - self._slewed_ns)
         return linear, int(world.instant.wall_ns + self.ahead * NS_PER_S + slewed), self._sent
 
     def deliver(self, message: tuple[float, int, int], angular: float = 0.0) -> None:
-        """It arrives now."""
+        """Deliver the message now."""
         linear, stamp_ns, number = message
         world, way = self.world, self.way
         twist = Twist(Vector3(linear), Vector3(z=angular))
@@ -89,17 +89,17 @@ class Speaker:
         world.bus.arrivals.append(arrival)
 
     def send(self, linear: float) -> None:
-        """It sends, and that arrives at once."""
+        """Send a message that arrives at once."""
         self.deliver(self.message(linear))
 
     def hold(self, linear: float, seconds: float, hz: float = 20.0) -> None:
-        """It sends so often, for so long."""
+        """Send at this rate for this time."""
         for _ in range(round(seconds * hz)):
             self.send(linear)
             self.world.run(1 / hz)
 
     def open(self, linear: float = 0.4, hz: float = 20.0) -> None:
-        """Zeros for a second, then on from there until it drives."""
+        """Send zeros for a second, then drive on until the robot does."""
         self.hold(0.0, 1.0, hz)
         self.hold(linear, 1.0, hz)
         assert self.world.state.mode == "driving", (self.way, self.world.state.reason)
@@ -156,13 +156,13 @@ def over(
 
 
 def moved(world: World, since_ns: int) -> bool:
-    """A line that turns a wheel went out since then."""
+    """Return whether a line that turns a wheel went out since then."""
     still = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
     return any(at_ns >= since_ns and line != still for at_ns, line in world.port.sent)
 
 
 def backlog(dice: random.Random, speaker: Speaker, age: float, span: float, poured: float) -> None:
-    """What was sent in `span` seconds, the last of it `age` seconds ago, pours in."""
+    """Deliver the messages of `span` seconds, the last of them `age` seconds old."""
     world, hz = speaker.world, dice.choice((10.0, 20.0, 50.0))
     now_ns, held = world.now_ns, []
     zeros = pauses = 0

@@ -25,7 +25,7 @@ from acsard.values import Inputs, Outputs, Recording
 from tests.scenarios.world import START, World
 
 BATCH = 200
-"""Steps; about a second."""
+"""Number of steps; about a second."""
 
 WITH_ARGUMENTS: dict[str, tuple[float, ...]] = {
     "stuck_encoder": (0,), "frozen_encoder": (1,), "dead_motor": (2,), "reversed_motor": (3,),
@@ -33,18 +33,18 @@ WITH_ARGUMENTS: dict[str, tuple[float, ...]] = {
     "swapped_encoders": (2, 3), "swapped_wheels": (1, 2), "bias": (0, 1.2), "other_baud": (57600,),
     "pushed": (0.2,), "stalls": (0.5, 0.12),
 }  # fmt: skip
-"""A case of every fault that needs arguments."""
+"""An instance of every fault that needs arguments."""
 
 
 class Tape:
-    """A black box in memory."""
+    """A recorder in memory."""
 
     def __init__(self, every: int = 0) -> None:
-        """`every`: how many steps lie between two states that it takes by itself."""
+        """`every` is the number of steps between two states that it records without being asked."""
         self._every = every
         self.taken: list[Taken] = []
         self.states: dict[int, bytes] = {}
-        """The robot before the step of that number, of those asked for by `cut`."""
+        """The robot before the step of that number, for the steps that `cut` requests."""
         self.cut = False
         self.status = Recording("memory")
 
@@ -61,12 +61,12 @@ class Tape:
     def died(self, inputs: Inputs) -> None: ...
 
     def steps(self, first: int = 0) -> list[Step]:
-        """What a recording from that step on says."""
+        """Return the steps of a recording from that step on."""
         starts = range(first, len(self.taken), BATCH)
         return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
 
     def write(self, path: Path, config: Config, first: int = 0) -> None:
-        """The file that the daemon would have written, from the start or from a state it has."""
+        """Return the file that the daemon would have written, from the start or from a state."""
         now = self.taken[first].inputs.now
         text = "\n".join(document(effective(config))) + "\n"
         about = About(
@@ -93,7 +93,7 @@ class Tape:
 
 
 def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
-    """Where each chunk's record of a file begins and ends, by the format's own words."""
+    """Return where each chunk's record of a file begins and ends, as the format itself says."""
     found, at = [], 8
     while at < len(data) - 8:
         opcode, length = struct.unpack_from("<BQ", data, at)
@@ -104,7 +104,7 @@ def chunks(data: bytes | bytearray) -> list[tuple[int, int]]:
 
 
 def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
-    """The tape lived again, from the start or from a state it has."""
+    """Replay the tape, from the start or from one of its states."""
     state = thaw(tape.states[first]) if first else ()
     replay = Replay(config, *state)
     for step in tape.steps(first):
@@ -113,7 +113,7 @@ def replayed(tape: Tape, config: Config, first: int = 0) -> Replay:
 
 
 def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
-    """Each fault of the simulator as a `with` block to be."""
+    """Yield each fault of the simulator as a context manager."""
     plain = [(name, getattr(mcu, name)) for name in FAULTS]
     cases = WITH_ARGUMENTS.items()
     return plain + [
@@ -122,7 +122,7 @@ def every_fault(mcu: FakeMcu) -> list[tuple[str, Callable[[], Fault]]]:
 
 
 def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[str]:
-    """Drive with each fault in turn for half a second, then what else happens to a robot."""
+    """Drive with each fault in turn for half a second, then through all other happenings."""
     dice, end_ns, had = random.Random(seed), world.now_ns + int(seconds * 1e9), []
     while True:
         for name, fault in every_fault(world.mcu):
@@ -140,7 +140,7 @@ def drive_through_faults(world: World, seconds: float, seed: int = 1) -> list[st
 
 
 def happenings(world: World, dice: random.Random) -> None:
-    """Each once."""
+    """Cause each other happening once."""
     world.call("stop")
     world.hold(0.5, seconds=2.1)  # a clear that names no latch is refused for 2 s
     assert world.call("clear").success

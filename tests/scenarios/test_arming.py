@@ -25,7 +25,7 @@ def long(count: int) -> object:
 
 
 def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
-    """A world after `stop` and `clear`, and senders whose clocks it knows."""
+    """Provide a world after `stop` and `clear`, and senders whose clocks it knows."""
     world = quiet()
     speakers = [Speaker(world, way, name) for name in names]
     for speaker in speakers:
@@ -41,7 +41,7 @@ def cleared(way: Way, *names: str) -> tuple[World, list[Speaker]]:
 @pytest.mark.parametrize("count", [4, pytest.param(30, marks=pytest.mark.slow), long(100)])
 @pytest.mark.parametrize("way", get_args(Way))
 def test_the_zeros_of_one_program_never_release_another(way: Way, count: int) -> None:
-    """One sends zeros at 10 Hz, the other 0.5 m/s and never stopped: it moved 2.1 m in 5 s."""
+    """One client sends zeros at 10 Hz, the other always 0.5 m/s: it moved 2.1 m in 5 s."""
     for seed in range(count):
         dice = random.Random(seed)
         world = quiet()
@@ -76,7 +76,7 @@ def test_a_shared_sender_that_a_crowd_pushed_out_must_let_go_as_before(way: Way)
 @pytest.mark.parametrize("way", get_args(Way))
 @pytest.mark.parametrize("pause", [1.1, 5.0, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_a_pause_arms_nobody(way: Way, pause: float) -> None:
-    """As with `ros2 topic pub -r 10 /cmd_vel`, Ctrl-C, and the same line again: 2.0 m."""
+    """A user ran `ros2 topic pub -r 10 /cmd_vel`, Ctrl-C, and the same line again: 2.0 m."""
     world, (speaker,) = cleared(way, "a")
     since_ns = world.now_ns
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""A fresh command does not wait for the clock; the clock's lines stay as many as they were."""
+"""A fresh command does not wait for the next period, and adds no lines to those of the periods."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.scenarios.world import World
 
 MS = 1_000_000
 GAP_NS = 3_864_583
-"""33 bytes at 115200 baud and a millisecond."""
+"""The time of 33 bytes at 115200 baud, and a millisecond."""
 
 
 @pytest.fixture
@@ -30,12 +30,12 @@ def world() -> World:
 
 
 def sent_after(world: World, at_ns: int) -> list[int]:
-    """When lines left since `at_ns`, in ns after it."""
+    """Return when lines left since `at_ns`, in ns after it."""
     return [sent - at_ns for sent, _ in world.port.sent if sent >= at_ns]
 
 
 def between_ticks(world: World, ms: float) -> None:
-    """Go on to so many ms after a tick."""
+    """Run until this many ms after a tick."""
     world.run((world.next_period_ns - world.now_ns) / 1e9)
     world.run(ms / 1e3)
 
@@ -136,7 +136,7 @@ def test_no_timing_of_commands_makes_a_ramp_steeper_or_steps_more(
             world.ask("srv/deactivate")
         world.run(wait)
     for (before_ns, slower), (after_ns, faster) in pairwise(lines):
-        # Of a stall no more than MAX_DT is made up for; a line rounds to 0.01 rad/s.
+        # A stall is made up for by at most MAX_DT; a line rounds to 0.01 rad/s.
         assert faster - slower <= min(after_ns - before_ns, 50 * MS) * 1e-9 + 1e-3
     periods = (world.now_ns - began_ns) / (10 * MS)
     heard = world.loop.robot.session.good_lines - heard

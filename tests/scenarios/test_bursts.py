@@ -1,8 +1,8 @@
 """Bursts of lost lines in a drive of 450 m, from the simulated wheels to `state`, with counts.
 
-pytest -s -m soak tests/scenarios/test_bursts.py
+    pytest -s -m soak tests/scenarios/test_bursts.py
 
-What plain lines make of the same is in `unit/mcu/test_bursts.py`.
+`unit/mcu/test_bursts.py` has the same with plain lines.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ EVERY_S = 30.0
 
 
 def drive(seed: int, seconds: float) -> tuple[float, float, int]:
-    """m by which the pose is off in the end, m that were driven, and lines that were lost."""
+    """Return the error of the final pose in m, the m driven, and the number of lost lines."""
     mcu = McuConfig(link_check="require", encoder_counts=COUNTS)
     made = World(Config(sim=SimConfig(encoder_counts=COUNTS), mcu=mcu))
     chance = random.Random(seed)

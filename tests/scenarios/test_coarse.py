@@ -1,4 +1,4 @@
-"""A robot with coarse encoders drives about, and the daemon says what it found of them."""
+"""The daemon reports the coarseness of encoders that it found while a robot drives about."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.scenarios.world import World
 
 
 def driven(counts: int, reporting: bool) -> World:
-    """Ten seconds of driving about, and at rest again; reporting by its own clock or asked."""
+    """Drive about for ten seconds and stop. The board reports by its own clock or when prompted."""
     world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
     world.bus.wanted = set()
     with world.mcu.unprompted(0.01) if reporting else nullcontext():
@@ -26,7 +26,7 @@ def driven(counts: int, reporting: bool) -> World:
 
 
 def off(world: World) -> float:
-    """m from where it truly is."""
+    """Return the distance of the pose from the truth, m."""
     state, true = world.state, world.mcu.vehicle.pose
     return math.hypot(state.x - true.x, state.y - true.y)
 
@@ -39,7 +39,7 @@ def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -
     assert world.state.encoders == [counts] * 4
     assert "line_impossible" not in world.state.counters
     assert not [event for event in world.events if event.name in ("fault", "lines_dropped")]
-    # a count of each wheel at either end, twice that by the heading, and the shape of the arcs
+    # a count of each wheel at either end, twice that through the heading, and the shape of the arcs
     assert off(world) < 0.005 + 3 * math.tau / counts * 0.05
 
 

@@ -1,4 +1,4 @@
-"""Who commands, who waits, and what is refused; `state` always says why."""
+"""Clients command, wait or are refused; `state` always gives the reason."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_a_bad_command_is_refused_whole_and_counted(
     world.run(0.06)
     assert world.state.counters[f"command_{reason}"] == 1
     assert world.state.refused
-    assert world.state.mode == "ready"  # it refreshed nothing: the timeout has passed
+    assert world.state.mode == "ready"  # it extended nothing: the timeout has passed
 
 
 def test_a_backlog_of_stamped_commands_is_not_obeyed(world: World) -> None:
@@ -176,7 +176,7 @@ def test_a_backlog_of_stamped_commands_is_not_obeyed(world: World) -> None:
         world.run(0.05)
     world.run(2.0)
     obeyed = world.state.counters["commands"]
-    for stamp in stamps:  # what the network held back for two seconds pours in at once
+    for stamp in stamps:  # messages that the network delayed for two seconds arrive at once
         world.send(0.3, stamp_ns=stamp)
     world.run(0.05)
     assert world.state.counters["commands"] == obeyed
@@ -202,7 +202,7 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     assert world.state.reason.startswith("app is new here: it drives once its delays")
     assert "app is new here" in {s.name: s.waits_for for s in world.state.sources}["app"]
     assert world.state.counters["commands_first_contact"] == 4
-    # Which is how every sender begins: nothing is refused, and nothing warned of.
+    # Every sender begins like this: nothing is refused, and no warning is logged.
     assert not [name for name in world.state.counters if name.startswith("command_")]
     assert world.state.refused == ""
     (told,) = [event for event in world.events if event.name == "first_contact"][:1]
@@ -222,7 +222,7 @@ def test_stamps_that_zenoh_replaces_are_counted_and_no_matter(world: World) -> N
 
 
 def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(world: World) -> None:
-    """What ros2_control's hardware sends for ever, while Nav2 goes on."""
+    """ros2_control's hardware sends these zeros for ever, while Nav2 goes on."""
     world.send(0.0, source="nav")
     world.send(0.0, source="ros2_control")
     world.run(0.3)
@@ -233,7 +233,8 @@ def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(wor
             world.send(0.3, source="nav")
             world.run(0.05)
         assert ("held by ros2_control" in world.state.reason) == (second >= 3)
-    assert world.state.linear == 0.0  # it may be a person that holds it: nobody drives past
+    # a person may hold the robot by these zeros, so no other client drives past them
+    assert world.state.linear == 0.0
     assert world.state.reason == (
         "driving: held by ros2_control, which sends nothing but zeros for over 10 s; nav sends "
         "speeds and is kept waiting"
@@ -249,7 +250,7 @@ def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(wor
 
 @pytest.mark.parametrize("way", ["rmw", "bridge"])
 def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way) -> None:
-    """`ros2 topic pub -r 10 /cmd_vel`: a speed from the first message on."""
+    """`ros2 topic pub -r 10 /cmd_vel` sends a speed from the first message on."""
     Speaker(world, way).hold(0.5, 5.0, hz=10.0)
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
@@ -325,11 +326,11 @@ def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
     assert not world.call("activate").success
 
 
-# several people on one source, and networks that hold samples back
+# several people on one source, and networks that delay samples
 
 
 class Person:
-    """One who commands `nav` by one of the three ways; two of them are two senders."""
+    """A person who commands `nav` in one of the three ways. Two of them are two senders."""
 
     def __init__(self, world: World, via: Via, name: str) -> None:
         self.world, self.via, self.name = world, via, name
@@ -339,7 +340,7 @@ class Person:
         return encode(Twist(Vector3(linear), Vector3()), "cdr")
 
     def send(self, linear: float, late: float = 0.0) -> None:
-        """A Twist that was stamped so many seconds ago."""
+        """Send a Twist that was stamped `late` seconds ago."""
         self.put(self.twist(linear), late)
 
     def put(self, payload: bytes, late: float = 0.0, kind: str = "Twist") -> None:
@@ -361,7 +362,7 @@ class Person:
         self.world.bus.arrivals.append(arrival)
 
     def drive(self, linear: float) -> None:
-        """Zeros for a good second, then on from there at 20 Hz until it drives."""
+        """Send zeros for a good second, then a speed at 20 Hz until the robot drives."""
         for _ in range(24):
             self.send(0.0)
             self.world.run(0.05)
@@ -390,7 +391,7 @@ def test_the_zero_of_another_on_the_same_key_does_not_set_the_robot_off(
     for verb in ("stop", "clear"):
         holding.send(0.4)
         assert world.call(verb).success
-    # At rest first: what rolls out is none of its doing.
+    # Wait for rest first: the other sender does not cause the end of the ramp.
     for _ in range(40):
         holding.send(0.4)
         world.run(0.05)
@@ -459,10 +460,10 @@ def test_what_the_network_held_back_around_a_clear_does_not_set_the_robot_off(
     person.drive(0.4)
     world.call("stop")
     world.run(0.5)
-    # From here on the network holds all that is sent, at 20 Hz, for 0.6 s.
+    # From here on the network delays all messages, at 20 Hz, for 0.6 s.
     world.run(cleared_after)
     assert world.call("clear").success
-    person.send(0.4)  # one slips through, so that it was heard
+    person.send(0.4)  # one message gets through, so that the sender was seen
     world.run(0.6)
     for sent in range(12):
         person.send(0.4, late=0.6 - 0.05 * sent)
@@ -481,7 +482,7 @@ def test_a_network_that_lets_samples_in_by_heaps_makes_no_pause_of_them(
     world: World, via: Via
 ) -> None:
     person = Person(world, via, "a")
-    for _ in range(20):  # six at a time every 0.3 s: none later than the timeout
+    for _ in range(20):  # six at a time every 0.3 s: none is later than the timeout
         world.run(0.3)
         for late in (0.25, 0.2, 0.15, 0.1, 0.05, 0.0):
             person.send(0.4, late)
@@ -536,7 +537,7 @@ def test_wheel_speeds_that_cancel_out_do_not_arm_their_sender(world: World) -> N
         send(8.0, 8.0, 8.0, 8.0)
     assert world.state.mode == "ready"
     assert waits_for(world, "app").startswith("send a zero first")
-    for _ in range(25):  # others may look like it: for a good second
+    for _ in range(25):  # other clients may look like it, for a good second
         send(0.0, 0.0, 0.0, 0.0)
     for _ in range(10):
         send(8.0, 8.0, 8.0, 8.0)

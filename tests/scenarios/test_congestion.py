@@ -1,4 +1,4 @@
-"""A network that delays commands more and more, or by a constant time: old ones do not count."""
+"""Outdated commands do not count on a network with growing or constant delays."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def quiet() -> World:
 
 
 def bound(way: Way, seconds: float) -> float:
-    """The age of the oldest speed that may be obeyed of one who is congested for so long, s."""
+    """Return the largest age of a speed that may be obeyed after this much congestion, s."""
     forgiven = FORGIVE_NS / NS_PER_S + seconds / FORGIVE_RATE if way in FOREIGN else 0.0
     return BASE_S + TIMEOUT_S + forgiven + MARGIN_S
 
 
 def driven_over(way: Way, delay: Callable[[float], float], seconds: float) -> tuple[float, int]:
-    """A sender opens on a good link and drives, letting go for 0.5 s in every 5 s."""
+    """A sender opens on a good link and drives, with a pause of 0.5 s in every 5 s."""
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open()
@@ -73,7 +73,7 @@ def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
 @pytest.mark.slow
 @pytest.mark.parametrize("way", STAMPED)
 def test_no_shape_of_congestion_has_an_old_command_obeyed(way: Way) -> None:
-    """Growth of 1 to 10 % and plateaus of 0.5 to 30 s, after one another, with jitter."""
+    """Growth of 1 to 10 % and plateaus of 0.5 to 30 s follow one another, with jitter."""
     for seed in range(6):
         dice = random.Random(seed)
         share, plateau = dice.uniform(0.01, 0.1), dice.choice((0.5, 1.0, 3.0, 10.0, 30.0))
@@ -155,7 +155,7 @@ def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: 
 @pytest.mark.parametrize("timeout", [0.25, 5.0])
 @pytest.mark.parametrize("way", STAMPED)
 def test_an_older_command_behind_a_newer_one_is_not_obeyed(way: Way, timeout: float) -> None:
-    """It moved the robot 0.26 m, and 2.5 m at a timeout of 5 s."""
+    """The defect moved the robot 0.26 m, and 2.5 m at a timeout of 5 s."""
     world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, timeout),))))
     world.run(0.3)
     speaker = Speaker(world, way)
@@ -206,7 +206,7 @@ def test_numbers_alone_keep_the_order_too() -> None:
 
 @pytest.mark.parametrize("way", ["signed", "rmw"])
 def test_commands_that_were_lost_are_not_taken_for_a_pause(way: Way) -> None:
-    """Behind a loss of 2.2 s any constant delay was believed: commands 5 s old were obeyed."""
+    """After a loss of 2.2 s the daemon believed any constant delay, and obeyed commands 5 s old."""
     world = quiet()
     speaker = Speaker(world, way)
     speaker.open()

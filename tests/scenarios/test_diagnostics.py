@@ -1,4 +1,4 @@
-"""What a person with rqt_robot_monitor sees, while the robot lives."""
+"""A person with rqt_robot_monitor sees the robot's condition while it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot is driven; what the MCU hears and what the bus says."""
+"""A robot is driven; the tests check the lines to the MCU and the messages on the bus."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_a_motor_mounted_the_other_way_round_is_signed_once() -> None:
 
 def test_slip_is_undone_by_the_wheel_separation_multiplier() -> None:
     world = World(Config(drive=DriveConfig(wheel_separation_multiplier=1.25)))
-    # The vehicle's own track holds the multiplier; take it out as slip of the real base.
+    # The vehicle's own track contains the multiplier; remove it, as slip of the real base.
     world.mcu.vehicle.turn_slip = 0.0
     world.run(0.2)
     world.drive(0.0, 1.0, seconds=3.0)

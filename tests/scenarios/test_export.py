@@ -1,7 +1,7 @@
-"""An export says what was said: message for message what the bus had while it was recorded.
+"""An export has the messages that the bus had during the recording, one for one.
 
-Twice: what the export makes of a recording, message by message; and its file, byte by byte and as
-readers of others decode it.
+It is checked twice: as the messages that the export makes of a recording, and as a file, byte by
+byte and as independent readers decode it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ Said = dict[str, list[Any]]
 
 
 def driven(config: Config) -> tuple[World, Tape]:
-    """A drive with faults and all that happens to a robot, and who listened to everything."""
+    """Drive with faults and everything else that happens to a robot.
+
+    The client in it subscribed to everything.
+    """
     tape = Tape()
     world = World(config, recorder=tape)
     world.bus.publish("tf_static", world.loop.report.tf_static())
@@ -83,7 +86,7 @@ def exported(recording: Recording) -> Said:
     ],
 )
 def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A drive, and the file of it."""
+    """A drive, and its recording."""
     world, tape = driven(request.param)
     path = tmp_path_factory.mktemp("export") / "drive.mcap"
     tape.write(path, request.param)
@@ -92,7 +95,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 @pytest.fixture(scope="module")
 def both(recorded: Any) -> Any:
-    """What was published, and what the export says."""
+    """The published messages, and those of the export."""
     world, tape, recording = recorded
     return world, tape, exported(recording)
 
@@ -107,7 +110,7 @@ def file(recorded: Any) -> Path:
 
 
 def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
-    """Message for message; names the first that is another."""
+    """Compare message for message; the failure names the first difference."""
     for number, (one, other) in enumerate(zip(then, now, strict=False)):
         assert one == other, f"message {number}"
     assert len(then) == len(now) > 0
@@ -138,11 +141,12 @@ def test_every_diagnostics_has_the_same_rows_but_those(both: Any) -> None:
 
 
 COUNTED = {"lines_rejected", "missed_periods", "command_refused", "first_contact"}
-"""`events` has what goes on and on in one row, with how often in all; the log a line each time."""
+"""Events that repeat. `events` has them in one row with a total, and the log has a line each time.
+"""
 
 
 def happened(world: World) -> list[Any]:
-    """Each event once."""
+    """Return each event once."""
     told: list[Any] = []
     for events in world.bus.published["events"]:
         assert isinstance(events, Events)
@@ -182,12 +186,12 @@ def test_every_command_is_there_by_its_source_with_the_time_it_came(both: Any) -
 
 
 def commanded(source: str) -> str:
-    """The topic of what it commands."""
+    """Return the topic of a source's commands."""
     return CMD_VEL_IN.topic("", source)
 
 
 def live(world: World, tape: Tape) -> Said:
-    """What a stranger had of each topic but the log, in the shape that ROS has it."""
+    """Return an independent client's messages of each topic except the log, in ROS's form."""
     found: Said = defaultdict(list)
     for key in BY_KEY:
         found[BY_KEY[key].topic("")] = [_as_told(one) for one in world.bus.published[key]]
@@ -201,7 +205,7 @@ def live(world: World, tape: Tape) -> Said:
 
 
 def _as_told(message: Message) -> Any:
-    """Without what the daemon measures of itself."""
+    """Return the message without the daemon's measurements of itself."""
     if isinstance(message, DiagnosticArray):
         left_out = MEASURED | {"acsard: recording"}
         rows = [row for row in message.status if row.name not in left_out]
@@ -234,14 +238,14 @@ def test_the_file_has_each_message_that_was_published_to_the_byte(
 
 
 def by_mcap_ros2(path: Path, reader: Any) -> Iterator[tuple[str, Any]]:
-    """Topic and message, decoded by the definitions in the file; by the library of MCAP."""
+    """Return topics and messages, decoded by the definitions in the file, with the MCAP library."""
     with path.open("rb") as stream:
         for one in reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
             yield one.channel.topic, one.decoded_message
 
 
 def by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
-    """The same by another library, that knows no type before."""
+    """Return the same by another library that knows no type beforehand."""
     store: Any = get_typestore(Stores.EMPTY)
     with path.open("rb") as stream:
         for schema, channel, message in NonSeekingReader(stream).iter_messages():
@@ -257,7 +261,7 @@ def fields(kind: type[msgspec.Struct]) -> tuple[str, ...]:
 
 
 def same(told: Any, ours: Any) -> bool:
-    """Field by field, down to the numbers."""
+    """Compare field by field, down to the numbers."""
     if isinstance(ours, msgspec.Struct):
         return all(same(getattr(told, name), getattr(ours, name)) for name in fields(type(ours)))
     if isinstance(ours, (list, tuple)):
@@ -286,7 +290,8 @@ def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
 
 
 def test_it_is_the_definitions_in_the_file_that_they_read_by(file: Path, tmp_path: Path) -> None:
-    # They are in the chunks, which are compressed, and behind them, where who seeks looks first.
+    # The definitions are in the compressed chunks and after them, where a seeking reader looks
+    # first.
     whole = file.read_bytes()
     other = tmp_path / "other.mcap"
     other.write_bytes(whole.replace(b"string child_frame_id", b"string child_grame_id"))

@@ -1,4 +1,4 @@
-"""A skid-steer robot with a gyro: the heading is the gyro's, and what becomes of it is told."""
+"""A skid-steer robot takes its heading from the gyro, and reports the gyro's state."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def world(
     learned_track: bool = False,
     recorder: BlackBox | None = None,
 ) -> World:
-    """A robot that has stood for a while."""
+    """Return a robot that has stood for a while."""
     odometry = OdometryConfig(gyro=True, learned_track=learned_track)
     made = World(Config(odometry=odometry, sim=sim), recorder=recorder)
     made.gyro_dead = not gyro
@@ -33,7 +33,7 @@ def world(
 
 
 class Drive:
-    """What was turned, in truth and by odometry, whole turns counted."""
+    """The rotation in truth and by odometry, with whole turns counted."""
 
     def __init__(self, made: World) -> None:
         self.world, self.told, self.all = made, 0.0, 0.0
@@ -50,12 +50,12 @@ class Drive:
 
     @property
     def error(self) -> float:
-        """Of the heading, as a share of all that was turned."""
+        """The error of the heading, as a share of the whole rotation."""
         return abs(self.told - (self._true - self._begun)) / self.all
 
 
 def wandering(made: World, seed: int, seconds: float = 60.0) -> Drive:
-    """A drive at random with a stop now and then, and at rest in the end."""
+    """Drive at random with a stop now and then, and end at rest."""
     chance, drive, left = random.Random(seed), Drive(made), seconds
     made.drive(0.0, 0.0, 0.2)
     while left > 0.0:
@@ -189,7 +189,7 @@ def test_without_the_setting_nobody_listens_to_a_gyro() -> None:
 
 
 def gone_silent(made: World, seed: int) -> Drive:
-    """The gyro teaches for a while and dies; then the wheels are alone."""
+    """The gyro teaches for a while and dies; then only the wheels remain."""
     made.bus.wanted = {"odom"}
     wandering(made, seed, seconds=30.0)
     made.gyro_dead = True
@@ -213,7 +213,7 @@ def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> N
 
 @pytest.mark.slow
 def test_the_covariance_knows_how_well_the_track_is_known() -> None:
-    """All to one side, where no error of the track is made up for."""
+    """All turns go to one side, so that an error of the track does not cancel out."""
     made = world(learned_track=True)
     wandering(made, 12, seconds=30.0)
     made.gyro_dead = True

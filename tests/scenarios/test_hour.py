@@ -1,7 +1,7 @@
 """Two minutes, ten and an hour of a robot, in virtual time, end the same way every time.
 
-The trace covers every line the MCU heard and everything the bus said at the end. It changes only
-when the behaviour does; then look at why, and write it anew with
+The trace covers every line that the MCU received and all values on the bus at the end. It changes
+only when the behaviour does. Then find the reason, and rewrite it with
 
     python -m tests.scenarios.test_hour
 """
@@ -22,13 +22,14 @@ from tests.scenarios.world import World
 
 GOLDEN = Path(__file__).parent.parent / "vectors" / "golden_hour.json"
 SHORT, SLOW, LONG = 2, 10, 60
-"""Minutes; the hour is for the soak runs, since it costs half a minute of real time."""
+"""Minutes. The hour is for the soak runs, since it takes half a minute of real time."""
 
 
 def live(minutes: int) -> dict[str, object]:
-    """Drive, turn, stop, unplug, reset, stutter: a different minute each minute, no chance."""
+    """Drive, turn, stop, unplug, reset, stutter: each minute differs, and nothing is random."""
     world = World()
-    world.bus.wanted = {"state"}  # what is sent has its own tests; this is about behaviour
+    # published messages have their own tests; this one is about behaviour
+    world.bus.wanted = {"state"}
     dice = random.Random(2026)
     trace = 0
 

@@ -32,7 +32,7 @@ def turn_rate(world: World) -> float:
 
 
 def published(world: World, tape: Tape) -> Iterator[bytes]:
-    """Everything that the daemon shows: messages, answers, the log and the recording."""
+    """Return everything that the daemon shows: messages, answers, the log and the recording."""
     for messages in world.bus.published.values():
         yield from {encode(message, "json") for message in messages}
     for replies in world.bus.replies.values():
@@ -56,7 +56,7 @@ def asked_everything(world: World) -> None:
 
 
 def names(texts: list[bytes]) -> list[str]:
-    """Every word, and every run of characters between quotes, that may be a sender's id."""
+    """Return every word, and every quoted run of characters, that may be a sender's id."""
     found: dict[str, None] = {}
     for text in texts:
         decoded = text.decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""Stops and faults against clears that a network delays: no clear releases a stop it did not know.
+"""A clear that a network delays never releases a stop or a fault that its sender did not know.
 
 The clients here read `state`, and their clear names the latch that they read there.
 """

@@ -1,4 +1,4 @@
-"""What the host's delays and lost lines cost the pose, from the simulated wheels to `state`."""
+"""The host's delays and lost lines change the pose little, from the simulated wheels to `state`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from acsard.values import Pose
 from tests.scenarios.world import World
 
 FINE = SimConfig(encoder_counts=20_000)
-"""So that the two decimals of a line are what limits it."""
+"""Fine encoders, so that the two decimals of a line limit its accuracy."""
 
 COUNTS = 3200
 
@@ -33,7 +33,7 @@ class Drive:
         made.drive(0.0, 0.0, 0.2)
 
     def error(self, stall: float = 0.0, lost: float = 0.0) -> float:
-        """m by which the pose is off in the end, with stalls or bursts of lost lines of s."""
+        """Return the final pose error in m, with stalls or bursts of lost lines of these s."""
         made, chance = self.world, random.Random(4)
         with self.faults:
             for _ in range(8):
@@ -51,7 +51,7 @@ class Drive:
 
     @property
     def floor(self) -> float:
-        """m by which every line with its true time is off, of those reported each 10 ms."""
+        """Return the pose error in m with every line at its true time, for reports each 10 ms."""
         path = Path()
         for line in self.world.bus.published["wheel_states"]:
             assert isinstance(line, JointState)
@@ -61,7 +61,7 @@ class Drive:
         return self.off(path.pose)
 
     def off(self, told: RobotState | Pose) -> float:
-        """m from where the robot truly is."""
+        """Return the distance of the pose from the robot's true place, m."""
         true = self.world.mcu.vehicle.pose
         return math.dist((told.x, told.y), (true.x, true.y))
 
@@ -91,7 +91,7 @@ def test_an_adapter_that_batches_and_stalls_costs_a_reporting_mcu_nothing(
 def test_an_adapter_that_batches_and_stalls_costs_a_prompted_mcu_little(
     every: float, stall: float
 ) -> None:
-    """Also where the link is lost in each stall, and the answers come before they are due."""
+    """This holds although each stall loses the link, and answers come before they are due."""
     drive = Drive(World(Config(sim=FINE)), reports=False, batched=True)
     drive.faults.enter_context(drive.world.mcu.stalls(every, stall))
     assert drive.error() < 0.010

@@ -36,7 +36,7 @@ T = TypeVar("T", bound=Message)
 
 
 def current(world: World, key: str, kind: type[T]) -> T:
-    """The value that a query of this key gets now."""
+    """Return the value that a query of this key gets now."""
     message = world.loop.report.current(key, world.loop._look)
     assert isinstance(message, kind)
     return message
@@ -264,7 +264,7 @@ def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> 
     world.drive(0.5, seconds=1.0)
     world.port.blocked = True
     world.hold(0.5, seconds=0.2)
-    # A zero that did not leave is tried again with the next period, not with the next 10 Hz.
+    # A zero that did not leave is sent again in the next period, and not with the next 10 Hz.
     assert 20 <= world.state.counters["lines_superseded"] <= 22
     heard = len(world.mcu.heard)
     world.port.blocked = False
@@ -359,7 +359,7 @@ def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_block
 def test_a_line_that_the_loop_stood_still_over_is_superseded_and_the_next_one_goes(
     world: World,
 ) -> None:
-    world.drive(0.5, seconds=0.2)  # on the way up each line says another speed
+    world.drive(0.5, seconds=0.2)  # on the way up each line has another speed
     made: list[bytes | None] = []
     world.watch = lambda outputs: made.append(outputs.line) if outputs.due else None
     sent = len(world.port.sent)
@@ -383,7 +383,7 @@ def test_a_zero_goes_however_long_the_loop_stood_still_over_it(world: World) -> 
 
 def test_a_torn_line_moves_nothing_and_spoils_none_behind_it(world: World) -> None:
     world.drive(0.5, seconds=1.0)
-    world.run(0.005)  # the last one is heard
+    world.run(0.005)  # the last one arrives
     valid, heard = world.mcu.valid_lines, len(world.mcu.heard)
     world.port.takes = 10
     world.run(0.1)

@@ -53,7 +53,7 @@ def moving(lines: list[bytes]) -> list[bytes]:
 
 
 def check_of(world: World) -> str:
-    """What the diagnostics say of the check in force."""
+    """Return the check in force, by the diagnostics."""
     message = world.loop.report.current("diagnostics", world.loop._look)
     assert isinstance(message, DiagnosticArray)
     (link,) = [status for status in message.status if status.name == "acsard: serial link"]
@@ -69,12 +69,12 @@ def texts(world: World, name: str) -> list[str]:
 
 
 def off_by(world: World) -> float:
-    """How far the pose is from where the robot really is, as a share of the way."""
+    """Return the distance of the pose from the robot's true place, as a share of the way."""
     at, true = world.state, world.mcu.vehicle.pose
     return math.hypot(at.x - true.x, at.y - true.y) / math.hypot(true.x, true.y)
 
 
-# who is at the other end
+# the firmware at the other end
 
 
 @pytest.mark.parametrize("check", ["auto", "require"])
@@ -161,7 +161,7 @@ def test_require_never_drives_old_firmware_and_says_why(firmware: str, comma: bo
         assert (world.state.mode, world.state.link) == ("waiting", "booting")
         assert 'mcu.link_check = "require"' in world.state.reason
         assert len(texts(world, "link_check")) == 1
-    world.run(0.5)  # new firmware has been put in
+    world.run(0.5)  # a person has installed new firmware
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
 
@@ -220,7 +220,7 @@ def test_a_reset_is_found_by_the_clock_when_its_announcement_is_lost() -> None:
     world.drive(0.5, seconds=1.0)
     x = world.state.x
     world.mcu.reset(world.now_ns, 30 * MS)
-    world.mcu._events.clear()  # neither noise nor name comes through
+    world.mcu._events.clear()  # neither noise nor identity gets through
     world.hold(0.5, seconds=2.0)
     assert any("its clock went back" in text for text in texts(world, "mcu_restarted"))
     assert world.state.mode == "ready"
@@ -301,7 +301,7 @@ def flips(line: bytes) -> Iterator[bytes]:
 
 
 def accepted_by_the_mcu(data: bytes, understand: object = protocol.whole) -> list[object]:
-    """What an MCU that cuts its input at line feeds makes of these bytes."""
+    """Return the commands that an MCU reads from these bytes if it cuts its input at line feeds."""
     assert callable(understand)
     found = [understand(piece + b"\n") for piece in data.split(b"\n")[:-1]]
     return [command.values for command in found if command is not None]
@@ -333,7 +333,7 @@ def test_of_single_bit_errors_none_changes_a_value_on_a_checked_link(count: int)
         command = text + protocol.suffix(text, sequence, ()) + b"\r\n"
         said, meant = codec.decode(text), protocol.whole(plain)
         assert meant is not None
-        # An end of line more, so that no accident reaches the next one.
+        # There is one line end more, so that no damage reaches the next line.
         for data in flips(reply):
             tried["reply"] += 1
             got = accepted_by_the_host(data + b"\n", codec, checked=True)
@@ -361,7 +361,7 @@ def test_of_single_bit_errors_none_changes_a_value_on_a_checked_link(count: int)
 
 
 def lossy_drive(check: str, counts: int) -> World:
-    """20 % of the lines lost in either direction, on a way with curves."""
+    """20 % of the lines are lost in either direction, on a way with curves."""
     world = started(config(check, counts))
     with world.mcu.lost_replies(every=5), world.mcu.lost_commands(every=5):
         for turn in (0.0, 0.6, -0.6, 0.3, 0.0):
@@ -381,7 +381,7 @@ def test_with_counts_lost_lines_lose_no_distance() -> None:
 
 
 class LatePort(VirtualPort):
-    """A port whose bytes are read late, in bunches, by up to 60 ms: a busy host."""
+    """A port whose bytes are read late, in bunches, by up to 60 ms, as on a busy host."""
 
     world: World
     dice = random.Random(5)
@@ -427,7 +427,7 @@ def test_when_the_host_reads_the_lines_does_not_bend_the_pose() -> None:
 def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
     fine = replace(config("require", 40_000), sim=SimConfig(encoder_counts=40_000))
     world = World(fine)
-    world.mcu._on_ns -= 60 * NS_PER_S  # on for a minute: the clock wraps 5 s from now
+    world.mcu._on_ns -= 60 * NS_PER_S  # run for a minute: the clock wraps in 5 s
     world.run(0.3)
     world.bus.wanted = set()
     last = (0.0, 0.0)
@@ -505,7 +505,7 @@ TROUBLE = ("mute", "noise", "partial_line", "slow_reply", "no_check", "no_sample
 
 
 def trouble(world: World, dice: random.Random) -> None:
-    """Something goes wrong for a while, under a commander that does not let go."""
+    """A fault occurs for a while, while a commander keeps sending."""
     name, seconds = dice.choice(TROUBLE), dice.choice((0.03, 0.12, 0.4, 1.3))
     match name:
         case "reset":
@@ -547,7 +547,8 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
                 assert world.loop.robot.session.negotiation.checked
             for estimate in outputs.estimates:
                 here = [estimate.pose.x, estimate.pose.y]
-                # 0.6 m/s for as long as counts bridge at most, and what the motors run on
+                # the longest time that counts bridge, at 0.6 m/s, and the distance that the motors
+                # run on
                 assert math.dist(here, last) < 0.6
                 last[:] = here
 
@@ -563,7 +564,7 @@ def test_whatever_happens_no_unchecked_line_moves_a_wheel_and_the_pose_never_jum
 
 
 class Echo(FakeMcu):
-    """No microcontroller at all: what is sent comes back 5 ms later, or as the adapter likes."""
+    """A port without a microcontroller: bytes come back 5 ms later, or as the adapter likes."""
 
     def receive(self, now_ns: int, data: bytes) -> None:
         self._schedule(now_ns + 5 * MS + self.extra_delay_ns, "sent", data)
@@ -603,7 +604,7 @@ def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
     echo.extra_delay_ns, echo.latency_ns = delay_ms * MS, latency_ms * MS
     world.port.plug(echo)
     world.run(0.5)
-    assert world.state.link == "up"  # at rest nobody can tell
+    assert world.state.link == "up"  # at rest it makes no difference
     world.drive(0.5, seconds=2.0)
     assert (world.state.mode, world.state.link) == ("waiting", "stale")
     assert "TX and RX are joined, or the terminal echoes" in world.state.reason

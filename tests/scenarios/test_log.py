@@ -1,4 +1,4 @@
-"""What the log says of a day: who asked, what changed and why, and never too much of it."""
+"""The log of a day has each caller, and each change with its reason, and never too many lines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from acsard.values import NS_PER_S, Event, EventName
 from tests.scenarios.world import World
 
 LINES_A_SECOND = 6
-"""Of one name, at the worst: a burst of five, and the one that is due."""
+"""Most lines of one name: a burst of five, and the one that is due."""
 
 
 @pytest.fixture
@@ -32,17 +32,17 @@ def told(world: World, name: EventName) -> list[Event]:
 
 
 def signed(name: str) -> bytes:
-    """The attachment of one who says who he is."""
+    """Return the attachment of a client that states its name."""
     return msgspec.json.encode({"sender": f"{name}/s3cret"})
 
 
 def shown(name: str) -> str:
-    """The name that the log has for it."""
+    """Return the name that the log has for that client."""
     return f"{public_name(f'{name}/s3cret')} (native)"
 
 
 def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> None:
-    """A service called by somebody, ahead of which a stop comes as the bus hands it over."""
+    """Call a service as some client. A stop comes ahead of it, as the bus delivers it."""
     key, at_ns = f"srv/{service}", world.now_ns
     if service == "stop":
         world.bus.arrivals.append(
@@ -56,7 +56,7 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
     world.run(0.03)
 
 
-# who asked
+# the callers
 
 
 @pytest.mark.parametrize("service", [key.removeprefix("srv/") for key in VERBS])
@@ -111,7 +111,7 @@ def test_a_put_on_stop_is_told_with_its_name_or_the_session_that_stamped_it(worl
     ]
 
 
-# what changed, and why
+# the changes and their reasons
 
 
 def test_a_drive_is_the_mode_and_its_commander(world: World) -> None:
@@ -190,7 +190,7 @@ def test_a_wire_full_of_noise_is_a_line_a_second_and_none_is_missing(world: Worl
 
 
 def most_lines(world: World) -> int:
-    """The most lines of one name since the last call."""
+    """Return the most lines of one name since the last call."""
     most = max(Counter(event.name for event in world.events).values(), default=0)
     world.events.clear()
     return most
@@ -227,7 +227,7 @@ def test_commanders_that_take_turns_all_the_time_are_some_lines_a_second(world: 
         world.send(0.0, source=("teleop", "app")[turn % 2])
         world.run(0.3)
     assert told(world, "commander")
-    # A turn every 0.3 s for 60 s.
+    # The commanders take turns every 0.3 s for 60 s.
     assert len(told(world, "commander")) <= 60 + LINES_A_SECOND
     assert counted(told(world, "commander")) == 200
 

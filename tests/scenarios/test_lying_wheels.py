@@ -1,4 +1,4 @@
-"""An encoder lies while the robot drives: the pose goes on right, and `state` says which wheel."""
+"""When an encoder fails in motion, the pose stays right, and `state` names the wheel."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from tests.scenarios.world import World
 def world(
     gyro: bool = False, sim: SimConfig | None = None, fault_time: float = 0.0, share: float = 1.0
 ) -> World:
-    """Without the latched fault, so that there is something to drive on with.
+    """Return a world without the latched fault, so that the robot drives on.
 
-    Its gyro tells this share of what it sees.
+    Its gyro reports this share of the true turn rate.
     """
     feedback = FeedbackConfig(fault_time=fault_time)
     made = World(
@@ -37,7 +37,7 @@ def world(
 
 
 def off(made: World) -> tuple[float, float]:
-    """m and rad between odometry and truth."""
+    """Return m and rad between odometry and truth."""
     pose, truth = made.state, made.mcu.vehicle.pose
     turn = math.remainder(pose.yaw - truth.yaw, math.tau)
     return math.dist((pose.x, pose.y), (truth.x, truth.y)), abs(turn)
@@ -162,7 +162,7 @@ def test_slip_makes_the_covariance_a_hundred_times_as_large() -> None:
     ],
 )
 def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
-    """Skidding, on a slippery floor, with coarse encoders and with hands now and then."""
+    """The robot skids on a slippery floor, has coarse encoders, and is sometimes pushed."""
     sim = SimConfig(encoder_counts=counts, track_multiplier=1.6, turn_slip=0.5)
     made, dice = world(sim=sim, fault_time=0.5), random.Random(counts)
     made.bus.wanted = set()
@@ -179,7 +179,7 @@ def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
     assert not [event for event in made.events if event.name == "wheels_doubted"]
 
 
-# gyros that are none
+# faulty gyros
 
 
 @pytest.mark.parametrize(

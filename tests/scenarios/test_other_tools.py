@@ -1,8 +1,8 @@
-"""Other people's tools against the neutral-first rule: the table in deploy/ros2/README.md.
+"""Other people's tools follow the neutral-first rule: the table in deploy/ros2/README.md.
 
-Each class publishes at the rates and with the zeros of the tool it is named after. Each test stops
-and clears the robot while the tool commands it, then does what the table tells a person to do. It
-shows that this is enough, and that less than this leaves the robot standing.
+Each class publishes at the rates and with the zeros of the tool after which it is named. Each test
+stops and clears the robot while the tool commands it, then does the table's steps for a person. It
+shows that these steps are enough, and that fewer steps leave the robot standing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ TOOLS = {
     "ros2_control",
     "Foxglove's Teleop panel",
 }
-"""The tools that are played here."""
+"""The tools that this module imitates."""
 
 by_each_road = pytest.mark.parametrize("road", ROADS)
 
@@ -65,7 +65,7 @@ def stop_and_clear(world: World, meanwhile: Callable[[], None]) -> None:
 
 
 def stands(world: World, act: Callable[[], None]) -> None:
-    """Check that the robot stands while the tool does this, and says that it wants a zero."""
+    """Check that the robot stands while the tool does this, and reports that it needs a zero."""
     since_ns = world.now_ns
     act()
     assert not moved(world, since_ns)
@@ -290,7 +290,7 @@ def test_topic_pub_once_of_a_zero_by_the_bridge_arms_after_a_second(world: World
 
 @by_each_road
 def test_drive_py_drives_at_once_after_a_clear(world: World, road: Road) -> None:
-    """Its zeros are as long as its file says."""
+    """It sends its opening zeros for the time that its file sets."""
     text = (ROS2 / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
     for number in range(2):
@@ -310,8 +310,8 @@ class Nav2(Speaker):
     """controller_server, velocity_smoother and collision_monitor at 20 Hz, by nav2_params.yaml.
 
     The controller sends speeds while it has a goal, and one zero at its end. The smoother ramps to
-    the last speed that it received. After `TIMEOUT_S` without one it ramps to zero, publishes that
-    zero and falls silent. The monitor passes on what it receives, but zeros only for 2 s.
+    the last speed that it received. If it receives none for `TIMEOUT_S` it ramps to zero, publishes
+    that zero and falls silent. The monitor passes on all it receives, but zeros only for 2 s.
     """
 
     TIMEOUT_S, STEP, MONITOR_S = 0.25, 1.0 / 20.0, 2.0
@@ -471,7 +471,7 @@ class DiffDrive(Speaker):
     _last, _heard_ns, _wanted = 0.0, 0, 0.0
 
     def cycle(self, seconds: float, cmd_vel: float | None = None) -> None:
-        """Run for a while. Somebody sends `cmd_vel` at 50 Hz, or nobody does."""
+        """Run for a while. Some client sends `cmd_vel` at 50 Hz, or none does."""
         for _ in range(round(seconds * 50.0)):
             now_ns = self.world.now_ns
             if cmd_vel is not None:

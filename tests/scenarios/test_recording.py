@@ -1,4 +1,4 @@
-"""What was recorded is lived again, to the byte; and a change of anything shows."""
+"""A recording replays to the byte, and a change of anything shows."""
 
 from __future__ import annotations
 

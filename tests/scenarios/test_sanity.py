@@ -50,7 +50,7 @@ def test_a_lying_encoder_stops_the_robot_and_is_named(world: World, wheel: int, 
 
 
 def test_a_motor_wired_the_other_way_round_is_found_out() -> None:
-    # The simulator wires itself as configured, so its encoder alone is turned here.
+    # The simulator wires itself as configured, so this test reverses its encoder alone.
     world = World(Config(mcu=McuConfig(wheels=WheelMap(rear_left="-c"))))
     world.run(0.2)
     with world.mcu.bias(2, -1.0):
@@ -99,7 +99,7 @@ def told(world: World, name: str) -> list[str]:
 
 
 def enter(world: World, mode: str, dice: random.Random) -> None:
-    """Drive a bit and end in this mode at rest; "driving" is a commander that holds zero."""
+    """Drive a bit and end in this mode at rest. "driving" means a commander that holds zero."""
     world.drive(dice.choice((-1, 1)) * dice.uniform(0.2, 1.0), dice.uniform(-2, 2), seconds=0.6)
     world.send(0.0)
     if mode in ("stopped", "fault"):
@@ -118,7 +118,7 @@ def enter(world: World, mode: str, dice: random.Random) -> None:
 
 
 def leave(world: World, mode: str) -> None:
-    """Back to ready, whichever mode it was."""
+    """Return to ready, whatever the mode was."""
     if mode in ("stopped", "fault"):
         assert world.call("clear").success
     elif mode == "inactive":
@@ -128,7 +128,7 @@ def leave(world: World, mode: str) -> None:
 
 
 def shove(world: World, mode: str, dice: random.Random) -> None:
-    """Push it by hand once or a few times, as fast as hands do, and let go."""
+    """Push it by hand once or a few times, as fast as hands do, and release it."""
     for _ in range(dice.randint(1, 3)):
         for hands, seconds in ((True, dice.uniform(0.1, 3.0)), (False, dice.uniform(0.05, 0.4))):
             speed = dice.choice((-1, 1)) * dice.uniform(0.05, 1.0)
@@ -259,7 +259,7 @@ def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_spee
 def test_a_robot_that_does_not_stop_when_told_is_found_as_soon_as_it_stands_out(
     world: World, linear: float, way: str, within: float
 ) -> None:
-    """For the daemon, hands that hold it at the speed it had are motors that do not obey."""
+    """For the daemon, hands that keep the robot at its speed look like motors that do not obey."""
     world.drive(linear, seconds=2.0)
     began_ns = world.now_ns
     with world.mcu.pushed(linear):
@@ -275,7 +275,7 @@ def test_a_robot_that_does_not_stop_when_told_is_found_as_soon_as_it_stands_out(
 
 
 def test_a_robot_found_rolling_after_a_lost_link_is_still_a_runaway(world: World) -> None:
-    """It was driven and has not been seen at rest since: an MCU without a watchdog drives on."""
+    """It was driven and has not been at rest since, and an MCU without a watchdog drives on."""
     world.drive(0.5, seconds=1.0)
     mcu = world.mcu
     with mcu.no_watchdog(), mcu.pushed(0.5):

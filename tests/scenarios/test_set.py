@@ -1,4 +1,4 @@
-"""Settings changed in the middle of what the robot does: at a step's edge, safely, told."""
+"""Settings change in the middle of the robot's work: at a step's edge, safely, and logged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def config(world: World) -> Config:
 
 
 def applied(world: World) -> list[tuple[float, float]]:
-    """When each line from now on was made, s, and its speed, m/s."""
+    """Return when each line from now on was made, s, and its speed, m/s."""
     found: list[tuple[float, float]] = []
 
     def note(outputs: Outputs) -> None:
@@ -50,7 +50,7 @@ def applied(world: World) -> list[tuple[float, float]]:
 
 
 def slopes(lines: list[tuple[float, float]]) -> list[float]:
-    """m/s2 from each line to the next."""
+    """Return m/s2 from each line to the next."""
     return [(v - before) / (t - at) for (at, before), (t, v) in pairwise(lines)]
 
 
@@ -161,7 +161,7 @@ def test_a_longer_timeout_holds_and_a_new_one_wants_neutral_first(world: World) 
     assert sets(world, commands__sources__app__timeout=0.6).success
     world.hold(0.3, seconds=0.3)
     assert world.state.mode == "ready"
-    world.run(2.0)  # a pause is neutral too
+    world.run(2.0)  # a pause counts as neutral too
     world.drive(0.3, seconds=0.5)
     world.run(0.4)
     assert world.state.mode == "driving"

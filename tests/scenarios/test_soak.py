@@ -1,7 +1,7 @@
-"""What must not move does not, ten thousand times over, and for a day with a fault every minute.
+"""Nothing moves that must not, in ten thousand attempts, and for a day with a fault every minute.
 
-Each test prints its figure; the short versions run by default, those in `.ci/run` that are marked
-slow, the long ones with
+Each test prints its figure. The short versions run by default, and those marked slow run in
+`.ci/run`. The long ones run with
 
     pytest -m soak -s tests/scenarios/test_soak.py
 """
@@ -29,23 +29,23 @@ DAY_NS = 86_400 * NS_PER_S
 
 
 def slow(count: float) -> object:
-    """A run too slow for every day."""
+    """Return a run that is too slow for every day."""
     return pytest.param(count, marks=pytest.mark.slow)
 
 
 def long(count: int, seconds: int) -> object:
-    """A long run that may take so many seconds of real time."""
+    """Return a long run that may take this many seconds of real time."""
     return pytest.param(count, marks=[pytest.mark.soak, pytest.mark.timeout(seconds)])
 
 
 def quiet_bus(world: World) -> World:
-    """Nobody listens: what is published has its own tests."""
+    """Make the bus encode nothing, because the publications have tests of their own."""
     world.bus.wanted = set()
     return world
 
 
 def wheels(line: bytes) -> tuple[float, ...]:
-    """What a line we sent says, rad/s."""
+    """Return the wheel speeds of a line that we sent, rad/s."""
     return tuple(
         float(line[at + 2 : at + 7]) * (1 if line[at + 1 : at + 2] == b"p" else -1)
         for at in (0, 8, 16, 24)
@@ -53,7 +53,7 @@ def wheels(line: bytes) -> tuple[float, ...]:
 
 
 def speed(line: bytes) -> float:
-    """The fastest wheel of a line, rad/s, without its sign."""
+    """Return the fastest wheel of a line, rad/s, without its sign."""
     return max(map(abs, wheels(line)))
 
 
@@ -61,7 +61,7 @@ def speed(line: bytes) -> float:
 
 
 def refused(world: World, dice: random.Random) -> None:
-    """Something that must not count as a command."""
+    """Send something that must not count as a command."""
     match dice.randrange(4):
         case 0:
             world.put("cmd/it", b'{"linear": {"x": ')
@@ -75,7 +75,10 @@ def refused(world: World, dice: random.Random) -> None:
 
 
 def silence(world: World, dice: random.Random, timeout: float) -> float:
-    """Drive, fall silent; how long after the last command the wheels first slow down, s."""
+    """Drive, then fall silent.
+
+    Returns the time from the last command until the wheels first slow down, s.
+    """
     linear = dice.choice((-1, 1)) * dice.uniform(0.1, 1.0)
     angular = dice.uniform(-1.5, 1.5)
     pause = min(0.05, timeout * 0.6)
@@ -138,7 +141,7 @@ STARTS_OVER = (
 
 
 def start_over(world: World, kind: str, dice: random.Random) -> World:
-    """Let it happen while the commander goes on sending; the world that goes on after it."""
+    """Cause the event while the commander goes on sending; return the world that follows it."""
     fast = dice.uniform(-0.9, 0.9)
     match kind:
         case "restart":
@@ -186,7 +189,7 @@ def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) ->
     for trial in range(count):
         kind = STARTS_OVER[trial % len(STARTS_OVER)]
         source = dice.choice(("app", "nav", "teleop"))
-        # Fast enough for every kind of lying encoder to be found out.
+        # The speed is high enough to reveal every kind of encoder fault.
         linear = dice.choice((-1, 1)) * dice.uniform(0.4, 0.9)
         world.drive(linear, seconds=dice.uniform(0.5, 1.2))
         assert world.state.mode == "driving"
@@ -211,13 +214,14 @@ def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) ->
 # c. blackholes
 
 NORMAL_NS = 3_000_000
-"""The normal delay, and its drift over the longest hole: what a relative age cannot see."""
+"""The normal delay, and its drift over the longest hole, which a relative age cannot reveal."""
 
 
 def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int, int]:
-    """A network that holds everything back and then lets go: what was stale, obeyed, accepted.
+    """Run a network that holds everything back and then delivers it.
 
-    What is sent while it would be stale on arrival says backward, everything else forward.
+    Returns the numbers of stale, of backward (stale but obeyed), and of accepted commands. A
+    command that would be stale on arrival requests backward motion, every other one forward motion.
     """
     timeout_ns, pause_ns = NS_PER_S // 4, int(NS_PER_S / dice.choice((20, 30, 50)))
     world = quiet_bus(World())
@@ -227,7 +231,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
     start_ns = world.now_ns
     hole_ns = start_ns + dice.randrange(NS_PER_S // 2, NS_PER_S)
     end_ns = hole_ns + int(seconds * NS_PER_S)
-    # The drain lets through so many lines for each that is sent.
+    # For each line that is sent, the drain delivers this many.
     pace = dice.uniform(1.2, 6.0)
     next_ns, credit, stale, accepted, drained_ns = start_ns, 0.0, 0, 0, 0
     counters = world.loop.robot.counters
@@ -252,7 +256,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
                 drained_ns = world.now_ns
         world.run((max(next_ns, world.now_ns) - world.now_ns) / NS_PER_S + 1e-9)
     backward = sum(min(wheels(line)) < 0 for _, line in world.port.sent)
-    assert world.state.mode == "driving"  # by what is fresh again
+    assert world.state.mode == "driving"  # by the fresh commands
     return stale, backward, accepted
 
 
@@ -280,7 +284,7 @@ TROUBLES = (
 
 
 def trouble(world: World, kind: str, dice: random.Random) -> str:
-    """One fault, from begin to end; a word the reason must have held while it lasted, or ""."""
+    """One fault, from begin to end, and a word that the reason must contain meanwhile, or ""."""
     seconds, wheel, linear = dice.uniform(0.5, 4.0), dice.randrange(4), 0.5
     if kind == "mute":
         with world.mcu.mute():
@@ -337,7 +341,7 @@ def _word(world: World, word: str) -> str:
 
 
 def recover(world: World) -> None:
-    """Whatever it was: clear, a zero, and the robot drives; then it is ready."""
+    """Recover from any fault: after a clear and a zero the robot drives, and then it is ready."""
     world.run(3.0)  # a board that was reset boots for 2 s
     if world.state.mode in ("stopped", "fault"):
         assert world.call("clear").success
@@ -349,7 +353,7 @@ def recover(world: World) -> None:
 
 
 def empty(world: World) -> int:
-    """Drop what only the test keeps; the blocks of memory that are left in use."""
+    """Drop the objects that only the test keeps; return the memory blocks still in use."""
     for kept in (world.events, world.bus.replies, world.bus.finished, world.port.sent):
         kept.clear()
     world.mcu.heard.clear()
@@ -361,7 +365,8 @@ def empty(world: World) -> int:
 def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memory(
     minutes: int,
 ) -> None:
-    board = Config(mcu=McuConfig(port="/dev/a-board"))  # a silence is not that of a late simulator
+    # the silence is not that of a late simulator
+    board = Config(mcu=McuConfig(port="/dev/a-board"))
     dice, world, unexplained = random.Random(4), quiet_bus(World(board)), list[str]()
     kinds, modes = Counter[str](), Counter[str]()
     settled, faults = min(60, minutes // 2), minutes if minutes > 60 else len(TROUBLES)
@@ -450,7 +455,7 @@ def test_a_wall_clock_that_jumps_a_day_loses_no_tick_and_moves_no_odometry(count
 
 
 def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
-    """A backlog of one who has ended since comes in: it moves the robot."""
+    """Return whether the late backlog of a sender that has ended moves the robot."""
     world = quiet_bus(World())
     world.run(0.3)
     ahead = dice.choice((0.0, 0.3, -0.3, -2.0, 2.0, -3600.0, 86400.0))
@@ -466,9 +471,9 @@ def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
     while True:
         age, span, poured = (dice.uniform(*limits) for limits in ((0.3, 60), (0.3, 60), (0.1, 20)))
         if abs(span / poured - 1) > 0.011:
-            break  # else it is a clock that is behind, as far as can be told: the test below
+            break  # otherwise it looks like a clock that is behind: the test below
     since_ns = world.now_ns
-    # The backlog begins after the last command of before: stamps that go back are a clock set back.
+    # The backlog begins after the last earlier command: stamps that go back are a clock set back.
     world.run(age + span if running else 0.0)
     backlog(dice, speaker, age, span, poured)
     return moved(world, since_ns)
@@ -493,7 +498,10 @@ def test_no_backlog_moves_a_robot_that_never_heard_its_sender_nor_one_that_knows
 def test_a_replay_at_the_pace_it_was_sent_counts_of_one_never_heard_as_a_clock_that_is_behind(
     way: Way,
 ) -> None:
-    """Nothing tells the two apart; of one who is known, the zeros it opens with do not count."""
+    """Nothing distinguishes the two.
+
+    If the sender is known, the zeros with which it opens do not count.
+    """
     for known in (False, True):
         world = quiet_bus(World())
         world.run(0.3)
@@ -516,7 +524,7 @@ def test_a_replay_at_the_pace_it_was_sent_counts_of_one_never_heard_as_a_clock_t
 
 
 def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
-    """It sends speeds for so long, then zeros, then drives."""
+    """Return whether the robot drives after speeds for this time, zeros, and speeds again."""
     speaker.hold(0.4, within)
     # A zero of an identity that programs may share counts after a second. So does one whose stamp
     # Zenoh replaced because its clock is ahead.
@@ -529,7 +537,7 @@ def driving_again(world: World, speaker: Speaker, within: float = 3.0) -> bool:
 
 
 def drives_on_or_again(world: World, speaker: Speaker) -> bool:
-    """It drives on for 4 s; or it ceases to, and within 3 s, zeros and all, drives again."""
+    """The sender drives on for 4 s. If not, it drives again within 3 s, including its zeros."""
     for _ in range(40):
         speaker.hold(0.4, 0.1)
         if world.state.mode != "driving":
@@ -538,9 +546,9 @@ def drives_on_or_again(world: World, speaker: Speaker) -> bool:
 
 
 def stale_moves(world: World, speaker: Speaker, cut: float) -> bool:
-    """What a network held back for so many seconds, and says backward, moved the robot.
+    """Return whether backward commands that a network held for `cut` seconds moved the robot.
 
-    By a clock that is slewed it looks fresher by what that has gained.
+    By a slewed clock they look fresher by the seconds that the clock has gained.
     """
     held, end_ns = [], world.now_ns + int(cut * NS_PER_S)
     while world.now_ns < end_ns:
@@ -555,7 +563,10 @@ def stale_moves(world: World, speaker: Speaker, cut: float) -> bool:
 
 
 def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
-    """Its clock is set by `step` seconds while it drives and a cut follows; what went wrong."""
+    """Set the sender's clock by `step` seconds while it drives, then cut the network.
+
+    Returns the failure, or "".
+    """
     world = quiet_bus(World())
     world.run(0.3)
     speaker = Speaker(world, way, ahead=ahead)
@@ -563,7 +574,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
     speaker.ahead += step
     if not driving_again(world, speaker):
         return f"does not drive again: {world.state.reason}"
-    # What the network holds now is stale, whatever the clock was before.
+    # The commands that the network holds now are stale, whatever the clock was before.
     if stale_moves(world, speaker, dice.uniform(0.6, 8.0)):
         return "what was stale moved it"
     speaker.hold(0.4, 0.3)
@@ -629,14 +640,14 @@ def test_two_senders_never_arm_each_other_whatever_their_clocks(way: Way, ahead:
     assert not moved(world, since_ns)
 
 
-# h. what neutral is
+# h. the neutral-first rule
 
 RATES_HZ = (3.8, 5.0, 10.0, 50.0)
 KINDS = ("steady", "stalls", "cuts", "another")
 
 
 def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
-    """One who never lets go, through stop and clear, and then this: it moves the robot."""
+    """Return whether a sender that is never neutral, through stop and clear, moves the robot."""
     world = quiet_bus(World())
     world.run(0.3)
     speaker = Speaker(world, way)

@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Lock
@@ -43,8 +44,7 @@ seed, left = int(sys.argv[1]), float(sys.argv[2])
 while left > 0.0:
     result = played(made(seed))
     left -= result.cpu_s
-    answer = seed, result.promise, result.finding, result.cpu_s, result.simulated_s
-    print(json.dumps(answer), flush=True)
+    print(json.dumps([seed, result.promise, result.cpu_s]), flush=True)
     seed += 1
 """
 
@@ -88,27 +88,40 @@ def edited(fault: Fault) -> dict[str, str]:
 
 def hunt(fault: Fault, minutes: float) -> Row:
     """Plant the fault and play until it is found or the time is over."""
+    seed, cpu_s = FIRST_SEED, 0.0
     with tempfile.TemporaryDirectory() as name:
         plant(fault, Path(name))
-        environment = os.environ | {"PYTHONPATH": name, "PYTHONDONTWRITEBYTECODE": "1"}
-        child = subprocess.Popen(
-            [sys.executable, "-c", CHILD, str(FIRST_SEED), str(60 * minutes)],
-            stdout=subprocess.PIPE, text=True, cwd=name, env=environment,
-        )  # fmt: skip
-        assert child.stdout is not None
-        cpu_s = 0.0
-        try:
-            for line in child.stdout:
-                seed, promise, _, took_s, _ = json.loads(line)
+        while cpu_s < 60 * minutes:
+            for play in plays(Path(name), seed, 60 * minutes - cpu_s):
+                seed, promise, took_s = play
                 cpu_s += took_s
                 if promise and not played(made(seed)).finding:
-                    return Row(fault.name, fault.breaks, promise, str(seed), f"{cpu_s / 60:.2f}")
-        finally:
-            child.kill()
-            code = child.wait()
-    if code > 0:
-        raise SystemExit(f"{fault.name}: the process that plays ended with {code}")
+                    spent = f"{cpu_s / 60:.2f}"
+                    return Row(fault.name, fault.breaks, promise, str(seed), spent)
+            seed += 1
     return Row(fault.name, fault.breaks, "not found", "", f"{cpu_s / 60:.2f}")
+
+
+def plays(tree: Path, seed: int, seconds: float) -> Iterator[tuple[int, str, float]]:
+    """Yield the seed, the broken promise and the processor time of one run in `tree` after another.
+
+    Ends when the time is over, or early if somebody else ends the process.
+    """
+    environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(seed), str(seconds)],
+        stdout=subprocess.PIPE, text=True, cwd=tree, env=environment,
+    )  # fmt: skip
+    assert child.stdout is not None
+    try:
+        for line in child.stdout:
+            played_seed, promise, took_s = json.loads(line)
+            yield played_seed, promise, took_s
+    finally:
+        child.kill()
+        code = child.wait()
+    if code > 0:
+        raise SystemExit(f"{tree}: the process that plays ended with {code}")
 
 
 HEAD = """# Planted faults

@@ -1,4 +1,4 @@
-"""The robot's page as browsers and programs see it: `acsard web`, and hands that hold the stick."""
+"""The robot's page as browsers and programs use it: `acsard web`, and clients that drive."""
 
 from __future__ import annotations
 
@@ -31,11 +31,14 @@ NAME = socket.gethostname()
 
 
 class Page(Program):
-    """`acsard web` beside a daemon: by HTTP, and by HTTPS as others reach it."""
+    """`acsard web` for a daemon: over HTTP on the robot, and over HTTPS as other hosts reach it."""
 
     def __init__(self, daemon: Daemon, where: Path, *words: str, at: str = "", **more: str) -> None:
-        """`at` is the address that another host has of the one it runs on; `more` is for its
-        environment."""
+        """Start the server.
+
+        `at` is the address under which another host reaches this one; `more` is for its
+        environment.
+        """
         plain, secure = (free_endpoint().rpartition(":")[2] for _ in range(2))
         self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{at or NAME}:{secure}"
         self.state, self.tls = where / "state", where / "tls"
@@ -52,17 +55,17 @@ class Page(Program):
         return self
 
     def tokens(self, *words: str) -> str:
-        """What a call of it about tokens prints."""
+        """Return the output of an `acsard web` command about tokens."""
         done = finish(acsard("web", *self.told, *words), self.state.parent, env=self.env)
         assert done.code == 0, done
         return done.out
 
     def invite(self, role: Role, name: str) -> str:
-        """A token."""
+        """Invite a client and return its token."""
         return Vault(self.state / "acsard-web").invite(role, name, 1)[0]
 
     def client(self, token: str = "", address: str = "") -> aiohttp.ClientSession:
-        """A program that comes from elsewhere, with or without a token; by one of our addresses."""
+        """Open a session of a program from another host, with or without a token."""
         trusted = ssl.create_default_context(cafile=str(self.tls / "ca.pem"))
         told = {"Authorization": f"Bearer {token}"} if token else {}
         local = (address, 0) if address else None
@@ -70,7 +73,7 @@ class Page(Program):
         return aiohttp.ClientSession(connector=connector, headers=told)
 
     def refused(self) -> dict[str, float]:
-        """What was refused so far, by reason."""
+        """Return how many requests the page has refused so far, by reason."""
         with urllib.request.urlopen(f"{self.here}/metrics") as answer:
             told = answer.read().decode()
         found = {}
@@ -81,7 +84,7 @@ class Page(Program):
 
 
 class _Here(aiohttp.abc.AbstractResolver):
-    """Every name is this machine."""
+    """A resolver for which every name is this machine."""
 
     async def resolve(self, host: str, port: int = 0, family: int = 0) -> list[Any]:
         return [
@@ -90,17 +93,17 @@ class _Here(aiohttp.abc.AbstractResolver):
         ]  # fmt: skip
 
     async def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: the resolver holds no resources."""
 
 
 async def answer(url: str) -> tuple[int, str]:
-    """Status and body."""
+    """Return status and body."""
     async with aiohttp.ClientSession() as session, session.get(url) as got:
         return got.status, await got.text()
 
 
 async def text(url: str) -> str:
-    """What is there."""
+    """Return the body of a successful answer."""
     status, body = await answer(url)
     assert status == 200, body
     return body
@@ -121,14 +124,14 @@ class Hands:
         await self.say(cmd=wish, stamp=time.time() * 1e3 - late_ms)
 
     async def hold(self, linear: float, seconds: float, angular: float = 0.0) -> None:
-        """A finger on the stick, at 20 Hz."""
+        """Hold a finger on the stick, at 20 Hz."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             await self.drive(linear, angular)
             await asyncio.sleep(0.05)
 
     async def find(self, look: Callable[[Any], Any]) -> Any:
-        """The first message that it finds true."""
+        """Return the first message that `look` accepts."""
         async with asyncio.timeout(PATIENCE_S):
             while True:
                 message = await self.socket.receive()
@@ -143,12 +146,12 @@ class Hands:
         return await self.find(lambda said: said.get("answer") == name)
 
     async def state(self, look: Callable[[Any], Any]) -> Any:
-        """The first state that it finds true."""
+        """Return the first state that `look` accepts."""
         found = await self.find(lambda said: said.get("key") == "state" and look(said["value"]))
         return found["value"]
 
     async def until_driving(self, linear: float) -> None:
-        """Zeros until they count, then this speed until the robot has it."""
+        """Send zeros until they count, then this speed until the robot has it."""
         holding = asyncio.create_task(self.hold(0.0, 0.6))
         await holding
         holding = asyncio.create_task(self.hold(linear, PATIENCE_S))
@@ -160,7 +163,7 @@ class Hands:
 
 @asynccontextmanager
 async def hands(page: Page, token: str = "", **how: Any) -> AsyncIterator[Hands]:
-    """Connected: at the machine, or from elsewhere with a token."""
+    """Connect: on the robot's machine, or from another host with a token."""
     session = page.client(token) if token else aiohttp.ClientSession()
     place = page.away if token else page.here
     async with session, session.ws_connect(f"{place}/ws", **how) as opened:
@@ -168,7 +171,7 @@ async def hands(page: Page, token: str = "", **how: Any) -> AsyncIterator[Hands]
 
 
 def run(story: Callable[[], Awaitable[None]], within: float = 3 * PATIENCE_S) -> None:
-    """What happens, with a deadline."""
+    """Run the scenario with a deadline."""
     asyncio.run(_within(story, within))
 
 

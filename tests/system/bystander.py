@@ -1,8 +1,8 @@
-"""What the machine itself costs, measured beside a test: how late a bare process is.
+"""Measure how much time the machine itself takes during a test: how late a bare process is.
 
-A bound says what the program may take; a machine that is busy adds to that. What it added in that
-very time is what a process lost that only wakes up every 5 ms and looks how late it is. On a quiet
-machine this is next to nothing, and the bound is what it says.
+A bound limits the time that the program takes; a busy machine adds to that. A process that only
+wakes up every 5 ms and checks how late it is measures this extra time for any interval. On a quiet
+machine the extra time is close to zero, and the plain bound applies.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Iterator
 TICK_S = 0.005
 
 ROWS = 1 << 16
-"""Ticks that are kept: five minutes."""
+"""Number of ticks that are kept: five minutes."""
 
 ROW = struct.Struct("dd")
 
@@ -40,7 +40,7 @@ while True:
 
 
 class Bystander:
-    """The bare process, from now on until it is ended; `lost` is how late it was."""
+    """The bare process, which runs until it is ended. `lost` returns how late it was."""
 
     def __init__(self) -> None:
         with tempfile.NamedTemporaryFile() as file:
@@ -55,7 +55,7 @@ class Bystander:
         self._process.wait()
 
     def lost(self, since: float, to: float | None = None) -> float:
-        """How long it waited for a core between two times (now is the last), s."""
+        """Return how long it waited for a core between two times (default: until now), s."""
         end = time.monotonic() if to is None else to
         deadline = end + 10.0
         while (seen := ROW.unpack_from(self._book))[1] < end:
@@ -67,7 +67,7 @@ class Bystander:
             at, late = ROW.unpack_from(self._book, ROW.size * (1 + number % ROWS))
             if at < since:
                 break
-            # Of what it waited, what lies between the two.
+            # Count only the part of a wait that lies between the two times.
             total += max(0.0, min(at, end) - max(at - late, since))
         return total
 
@@ -77,7 +77,7 @@ _running: list[Bystander] = []
 
 @contextlib.contextmanager
 def standing_by() -> Iterator[None]:
-    """A bystander for `lost` while entered."""
+    """Run a bystander for `lost` while entered."""
     bystander = Bystander()
     _running.append(bystander)
     try:
@@ -88,5 +88,5 @@ def standing_by() -> Iterator[None]:
 
 
 def lost(since: float, to: float | None = None) -> float:
-    """What the machine took of the time between two moments (now is the last), s."""
+    """Return the time that the machine took between two moments (default: until now), s."""
     return _running[-1].lost(since, to)

@@ -1,6 +1,6 @@
-"""A headless Chromium, spoken to by its DevTools protocol: touch, keys, sizes, pictures.
+"""Drive a headless Chromium by its DevTools protocol: touch, keys, sizes, pictures.
 
-The browser is Debian's `chromium`; where there is none, tests skip.
+The browser is Debian's `chromium`; tests skip if it is not installed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ OPTIONS = (
 PHONE, SIDEWAYS, DESKTOP = (390, 844), (844, 390), (1280, 800)
 
 FINGER_PX = 44
-"""What is to be pressed is so wide and high at least."""
+"""Minimum width and height of an element that a finger presses."""
 
 _PRESSED = """[...document.querySelectorAll('button, a, input, select, #stick')]
     .filter(one => one.checkVisibility())
@@ -47,10 +47,13 @@ _PRESSED = """[...document.querySelectorAll('button, a, input, select, #stick')]
 
 
 class Browser:
-    """One page in a process of its own; calls come from the test's thread."""
+    """One browser in a process of its own. Calls come from the test's thread."""
 
     def __init__(self, where: Path, host: str = "", options: Sequence[str] = ()) -> None:
-        """`host` is another one than this, `options` are words more for its command line."""
+        """Start it.
+
+        `host` runs it on another host than this one; `options` extend its command line.
+        """
         self._where, self._options = where, options
         self._host = host
         self._loop = asyncio.new_event_loop()
@@ -60,14 +63,14 @@ class Browser:
         self._down: tuple[tuple[float, float], ...] = ()
         self.process: subprocess.Popen[bytes] | None = None
         self.tab = ""
-        """What the one that is spoken to is known by."""
+        """The target id of the current tab."""
         self.said: list[str] = []
-        """What the page wrote to its console, and errors."""
+        """Console messages and errors of the page."""
         self.received = 0
         """Bytes, of HTTP with its headers and over WebSockets, since `Network.enable`."""
 
     def start(self) -> None:
-        """Until it can be spoken to."""
+        """Wait until the browser accepts commands."""
         assert CHROMIUM is not None
         words = [CHROMIUM, *OPTIONS, *self._options, f"--user-data-dir={self._where}"]
         with self._there():
@@ -91,7 +94,7 @@ class Browser:
             return
         if hasattr(self, "_session"):
             self._wait(self._session.close())
-        with suppress(ProcessLookupError):  # somebody was faster
+        with suppress(ProcessLookupError):  # the process has already ended
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(10.0)
 
@@ -100,7 +103,7 @@ class Browser:
         await self._attend(next(iter(await self._tabs())))
 
     async def _tabs(self) -> dict[str, str]:
-        """Where each is spoken to; the one in front first."""
+        """Return the debugger addresses of the tabs, the front one first."""
         with self._there():
             async with self._session.get("/json") as answer:
                 pages = await answer.json()
@@ -116,16 +119,16 @@ class Browser:
             await self._ask(f"{domain}.enable", {})
 
     def another(self, **how: bool) -> str:
-        """One more tab, in front (or `background`, or a `newWindow`); what it is known by."""
+        """Open one more tab, in front (or `background`, or a `newWindow`); return its target id."""
         return str(self.ask("Target.createTarget", url="about:blank", **how)["targetId"])
 
     def attend(self, tab: str) -> None:
-        """Speak to that one from now on."""
+        """Send the following commands to that tab."""
         self._wait(self._attend(tab))
         self._down = ()
 
     def close(self, tab: str) -> None:
-        """Close that one."""
+        """Close that tab."""
         self.ask("Target.closeTarget", targetId=tab)
 
     async def _read(self) -> None:
@@ -147,7 +150,7 @@ class Browser:
                 self.received += len(told["params"]["response"]["payloadData"].encode())
 
     def ask(self, method: str, **params: object) -> Any:
-        """One command of the protocol; its result."""
+        """Run one command of the protocol and return its result."""
         return self._wait(self._ask(method, params))
 
     async def _ask(self, method: str, params: dict[str, object]) -> Any:
@@ -162,7 +165,7 @@ class Browser:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(20.0 + PATIENCE_S)
 
     def size(self, width: int, height: int, *, touch: bool = True, dark: bool = False) -> None:
-        """As this screen has it."""
+        """Set the size and the touch support of this screen."""
         self.ask(
             "Emulation.setDeviceMetricsOverride",
             width=width, height=height, deviceScaleFactor=1, mobile=touch,
@@ -172,39 +175,42 @@ class Browser:
         self.ask("Emulation.setEmulatedMedia", features=look)
 
     def open(self, url: str) -> None:
-        """Go there; returns when it is loaded."""
+        """Open the address; return when the page is loaded."""
         self.ask("Page.navigate", url=url)
         until(lambda: self.js("document.readyState") == "complete", 10.0, url)
 
     def js(self, text: str) -> Any:
-        """What this expression is worth in the page; a promise is waited for."""
+        """Return the value of a JavaScript expression in the page, after a promise is settled."""
         told = self.ask("Runtime.evaluate", expression=text, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in told, told["exceptionDetails"]
         return told["result"].get("value")
 
     def text(self, name: str) -> str:
-        """What stands in the element with this id; nothing while one page replaces another."""
+        """Return the text of the element with this id, or "" while one page replaces another."""
         return str(self.js(f"document.getElementById({name!r})?.textContent ?? ''"))
 
     def middle(self, name: str) -> tuple[float, float]:
-        """Where the element is, px."""
+        """Return the position of the element, px."""
         box = f"document.getElementById({name!r}).getBoundingClientRect()"
         found = self.js(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})")
         return found[0], found[1]
 
     def too_small(self) -> list[Any]:
-        """What is shown, is to be pressed and is too small for a finger: name, width, height."""
+        """Return the visible controls that are too small for a finger: name, width, height."""
         return list(self.js(_PRESSED.replace("LEAST", str(FINGER_PX - 0.5))))
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """`kind` is Start, Move, End or Cancel; the fingers that are down then."""
+        """Send a touch event (Start, Move, End or Cancel) with the fingers that are down."""
         self._down = points
         where = [{"x": x, "y": y, "id": n} for n, (x, y) in enumerate(points)]
         self.ask("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=where)
 
     def tap(self, name: str) -> None:
-        """A finger on the element and up again; one more finger is an event of the page's own,
-        because Chromium passes on no touch any more once two were emulated."""
+        """Tap the element.
+
+        A further finger is a synthetic event of the page, because Chromium no longer forwards any
+        touch after two were emulated.
+        """
         if self._down:
             self.js(
                 f"document.getElementById({name!r}).dispatchEvent(new PointerEvent('pointerdown',"
@@ -215,20 +221,22 @@ class Browser:
             self.touch("End")
 
     def lift(self) -> None:
-        """All fingers, if there are any; a page that has gone has taken them along."""
+        """Lift all fingers, if there are any. A page that has gone has taken them along."""
         if self._down:
             with suppress(AssertionError):
                 self.touch("End")
             self._down = ()
 
     def push(self, x: float, y: float, kind: str = "Move") -> None:
-        """The finger on the page's stick, from its middle, px; y up."""
+        """Put the finger on the page's stick, in px from its middle; y points up."""
         mx, my = self.middle("stick")
         self.touch(kind, (mx + x, my - y))
 
     def hold(self, drives: Callable[[], bool]) -> None:
-        """A finger pushes the stick forwards until it drives; it presses again where a busy
-        machine made the page let go."""
+        """Push the stick forwards until the robot drives.
+
+        Presses again if a busy machine made the page release it.
+        """
         told: list[str] = []
 
         def look() -> bool:
@@ -245,12 +253,12 @@ class Browser:
             raise AssertionError(f"{error}; it said {told}") from None
 
     def key(self, kind: str, code: str, key: str) -> None:
-        """`kind` is Down or Up."""
+        """Send a keyboard event. `kind` is Down or Up."""
         kind = "rawKeyDown" if kind == "Down" else "keyUp"
         self.ask("Input.dispatchKeyEvent", type=kind, code=code, key=key)
 
     def picture(self, path: Path, *, whole: bool = False) -> None:
-        """What a person sees, as PNG; or the `whole` page, down to its end."""
+        """Write a PNG of the visible page, or of the `whole` page down to its end."""
         told = self.ask(
             "Page.captureScreenshot",
             format="png",
@@ -266,7 +274,7 @@ class Browser:
 
 @contextmanager
 def browsing(host: str = "", options: Sequence[str] = ()) -> Iterator[Browser]:
-    """A browser of its own, killed in the end."""
+    """Run a browser, and kill it at the end."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as where:
         browser = Browser(Path(where), host, options)
         try:
@@ -274,4 +282,4 @@ def browsing(host: str = "", options: Sequence[str] = ()) -> Iterator[Browser]:
             yield browser
         finally:
             browser.end()
-            time.sleep(0.1)  # its children let go of the directory
+            time.sleep(0.1)  # its child processes still release the directory

@@ -15,12 +15,14 @@ from tests.system.harness import Bus, Daemon, Peer, until
 from tests.system.hosts import Hosts, two_hosts
 
 _before = cores.idle()
-"""When the test began that runs."""
+"""When the current test began."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What fails while no core was ever free is judged again, twice at most, and named at the end:
-    then the machine had other work. What fails on any other has failed."""
+    """If a test fails while no core was ever free, run it again, at most twice.
+
+    The machine was then busy with other work. The summary lists the test. Any other failure counts.
+    """
     again = pytest.mark.flaky(reruns=2, condition=lambda: cores.taken(_before, cores.idle()))
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent) and not item.get_closest_marker("soak"):
@@ -35,14 +37,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def bystander() -> Iterator[None]:
-    """Measures all the time what the machine costs: `bystander.lost`."""
+    """Measure all the time how much time the machine takes: `bystander.lost`."""
     with standing_by():
         yield
 
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A daemon on the simulator for tests that leave no mark on it."""
+    """A daemon on the simulator for tests that do not change it."""
     with Daemon(tmp_path_factory.mktemp("shared")) as daemon:
         yield daemon
 
@@ -51,21 +53,21 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 def bus(shared: Daemon) -> Iterator[Bus]:
     """A plain client of `shared`, with the link up."""
     with Bus(shared.endpoint) as bus:
-        # Asked instead of awaited on `state`, whose next message may be 0.1 s away.
+        # A query is faster than waiting for `state`, whose next message may be 0.1 s away.
         until(lambda: bus.state()["link"] == "up", 5.0, "link up")
         yield bus
 
 
 @pytest.fixture
 def peer(tmp_path: Path) -> Iterator[Peer]:
-    """A serial peer that is not ours, plugged in at `tmp_path/mcu`."""
+    """An independent serial peer, plugged in at `tmp_path/mcu`."""
     with Peer(tmp_path / "mcu") as peer:
         yield peer
 
 
 @pytest.fixture(scope="module")
 def hosts() -> Iterator[Hosts]:
-    """The robot's host and another one; skips where there can be none."""
+    """The robot's host and another one. Skips if the machine does not allow namespaces."""
     yield from two_hosts()
 
 
@@ -79,7 +81,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.fixture(scope="module")
 def page(daemon: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """Its page, by HTTP here and by HTTPS for others."""
+    """The page of that daemon, over HTTP here and over HTTPS for other hosts."""
     where = tmp_path_factory.mktemp("page")
     Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
     with Page(daemon, where) as page:

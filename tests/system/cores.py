@@ -1,4 +1,7 @@
-"""Were the machine's cores all taken, all the time? Then others had what a test judges."""
+"""Find out whether all cores of the machine were busy throughout a time.
+
+If so, other programs had the processor time whose lack a test reports as a failure.
+"""
 
 from __future__ import annotations
 
@@ -8,27 +11,30 @@ from pathlib import Path
 from typing import NamedTuple
 
 FREE = 0.03
-"""Of the time of all cores. Beside four busy loops none is free; in a run of the test command with
-nothing beside it about a fifth of each is."""
+"""Share of the time of all cores.
+
+With four busy loops running none is free. During a run of the test command alone about a fifth of
+each core is free.
+"""
 
 
 class Idle(NamedTuple):
-    """At some moment."""
+    """The idle time of the cores at some moment."""
 
     at: float
-    """By the monotonic clock, s."""
+    """Monotonic clock, s."""
     idle_s: float
-    """What all cores together have idled since the start of the machine."""
+    """Total idle time of all cores since the machine started."""
 
 
 def idle() -> Idle:
-    """Now."""
+    """Return the idle time up to now."""
     first, *_ = Path("/proc/stat").read_text().splitlines()
     _, _user, _nice, _system, idles, waits, *_ = first.split()
     return Idle(time.monotonic(), (int(idles) + int(waits)) / os.sysconf("SC_CLK_TCK"))
 
 
 def taken(before: Idle, after: Idle) -> bool:
-    """Was hardly a core free between the two?"""
+    """Return whether hardly any core was free between the two moments."""
     whole = (after.at - before.at) * (os.cpu_count() or 1)
     return after.idle_s - before.idle_s < FREE * whole

@@ -50,18 +50,19 @@ kept = [
 print("routing", flush=True)
 time.sleep(600)
 """
-"""A router with a configuration and changes to it; has no plugins, and acts like the storages."""
+"""A router with a configuration and changes to it. It loads no plugins, and acts like the storages.
+"""
 
 
 def certified(where: Path, *names: str) -> None:
-    """A fleet's authority below `where`, and a certificate for each name in a directory of it."""
+    """Make a fleet's authority below `where`, and a directory with a certificate for each name."""
     authority = Authority.make(where, "fleet", 1)
     for name in names:
         authority.issue(where / name, name, ["127.0.0.1"], 1.0)
 
 
 def tls_settings(own: Path) -> dict[str, object]:
-    """Zenoh's `transport/link/tls` of a client with the certificate in this directory."""
+    """Return Zenoh's `transport/link/tls` of a client with the certificate in this directory."""
     return {
         "root_ca_certificate": str(own / "ca.pem"),
         "connect_certificate": str(own / "certificate.pem"),
@@ -71,14 +72,14 @@ def tls_settings(own: Path) -> dict[str, object]:
 
 
 def for_two(where: Path) -> Path:
-    """The file that `acsard lan router` makes of router.json5 for both robots."""
+    """Write the file that `acsard lan router` makes of router.json5 for both robots."""
     file = where / "router.json5"
     file.write_text(router_file(ROUTER_FILE.read_text(), ROBOTS, {}))
     return file
 
 
 def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
-    """What differs from a router's file here: the address, the files, no plugins."""
+    """Return a router's settings that differ from its file here: address, files, no plugins."""
     config = zenoh.Config.from_file(str(file))
     tls = json.loads(config.get_json("transport/link/tls"))
     for key, value in tls.items():
@@ -92,7 +93,7 @@ def _changes(file: Path, where: Path, endpoint: str) -> dict[str, object]:
 
 
 def here(file: Path, where: Path, endpoint: str) -> Path:
-    """A router's file with this address and the certificates below `where`, without plugins."""
+    """Change a router's file to this address, the certificates below `where`, and no plugins."""
     config = zenoh.Config.from_file(str(file))
     for key, value in _changes(file, where, endpoint).items():
         config.insert_json5(key, json.dumps(value))
@@ -102,18 +103,18 @@ def here(file: Path, where: Path, endpoint: str) -> Path:
 
 
 def router(where: Path, endpoint: str) -> Program:
-    """Python's Zenoh as the router; says "routing"."""
+    """Run Python's Zenoh as the router. It prints "routing" when it is ready."""
     file = for_two(where)
     return Program(words(_ROUTER, file, json.dumps(_changes(file, where, endpoint))), where)
 
 
 def watched_router(where: Path, endpoint: str) -> Program:
-    """`acsard router` with the file; its log says when it listens."""
+    """Run `acsard router` with the file. Its log says when it listens."""
     return Program(acsard("router", str(here(for_two(where), where, endpoint))), where)
 
 
 def zenohd(where: Path, endpoint: str) -> Program:
-    """The real one, where it is on the PATH, without its plugins."""
+    """Run the real zenohd, if it is on the PATH, without its plugins."""
     program = shutil.which("zenohd")
     if program is None:
         pytest.skip("needs zenohd")

@@ -1,4 +1,4 @@
-"""Somebody who goes through a check or a calibration over the page's WebSocket."""
+"""Let a client go through a check or a calibration over the page's WebSocket."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class NoDaemon(Daemon):
 
 
 class Guided:
-    """What the child says, in order; pings go on as a browser's."""
+    """The messages of the child process, in order, while pings go on as a browser's do."""
 
     def __init__(self, ours: Hands, pinging: asyncio.Task[None] | None = None) -> None:
         self.ours, self._pinging = ours, pinging
 
     def falls_silent(self) -> None:
-        """No pings from now on; nothing closes."""
+        """Stop the pings from now on, without closing anything."""
         if self._pinging is not None:
             self._pinging.cancel()
 
@@ -40,7 +40,7 @@ class Guided:
         await self.ours.say(begin=what, **more)
 
     async def says(self, look: Callable[[Any], Any]) -> Any:
-        """The first of it that it finds true; fails when it has ended before."""
+        """Return the first message that `look` accepts. Fails if the procedure has ended before."""
 
         def found(said: Any) -> Any:
             found = "guide" in said and look(said["guide"])
@@ -50,7 +50,7 @@ class Guided:
         return (await self.ours.find(found))["guide"]
 
     async def asks(self, words: str = "") -> Any:
-        """The next question, which has these words."""
+        """Return the next question, which must contain these words."""
         question = await self.says(lambda said: "question" in said)
         assert words in question["words"], question
         return question
@@ -62,15 +62,15 @@ class Guided:
         return await self.says(lambda said: "ended" in said)
 
     async def starts(self, words: str = "") -> None:
-        """The next leg is begun."""
+        """Start the next leg."""
         await self.answer(await self.asks(words), "start")
 
     async def lifted(self) -> None:
-        """A check goes on."""
+        """Confirm that the check may go on."""
         await self.answer(await self.asks("lifted"), "lifted")
 
     async def sees(self, wheels: tuple[str, ...] = WHEELS) -> None:
-        """Which wheel each motor turns, all of them forward."""
+        """Answer which wheel each motor turns, all of them forward."""
         for wheel in wheels:
             await self.answer(await self.asks("which wheel"), wheel)
             await self.answer(await self.asks("which way"), "forward")
@@ -78,7 +78,7 @@ class Guided:
 
 @asynccontextmanager
 async def guiding(page: Page, *, pings: bool = True, token: str = "") -> AsyncIterator[Guided]:
-    """Connected, as a page that is looked at."""
+    """Connect as a page that somebody looks at."""
     async with hands(page, token) as ours:
         guided = Guided(ours, asyncio.create_task(_ping(ours)) if pings else None)
         try:
@@ -94,10 +94,10 @@ async def _ping(ours: Hands) -> None:
 
 
 def commands(page: Page) -> list[int]:
-    """The checks and calibrations that the page's server has started and that still run."""
+    """Return the running checks and calibrations that the page's server has started."""
     return children(page.pid, "--json-lines")
 
 
 def none_left(page: Page) -> None:
-    """They end."""
+    """Wait until they have ended."""
     until(lambda: not commands(page), 8.0, "no command runs any more")

@@ -1,8 +1,8 @@
-"""What the system tests share: programs as processes, an MCU that is not ours, a plain bus client.
+"""Run the system tests' programs, an independent MCU and a plain bus client.
 
-Nothing of acsard is imported here: the tests see what a stranger on the wire, on the bus or at the
-shell sees. Every wait has a deadline and waits for the thing itself; every process is ended by its
-own pid.
+Nothing of acsard is imported here: the tests see only what a stranger sees on the wire, on the bus
+or at the shell. Every wait has a deadline and waits for the thing itself. Every process is ended by
+its own pid.
 """
 
 from __future__ import annotations
@@ -41,11 +41,13 @@ T = TypeVar("T")
 ROOT = Path(__file__).resolve().parents[2]
 
 START_S = 15.0
-"""A start takes 0.2 s; this is for a machine that is busy with other things."""
+"""A start takes 0.2 s; this limit is for a machine that is busy with other work."""
 
 PATIENCE_S = 15.0
-"""What every wait gives a busy machine beyond the time that the thing takes on an idle one. A wait
-measures nothing: how long something took is compared with `bystander.lost`."""
+"""The extra time that every wait gives a busy machine, beyond the time on an idle one.
+
+A wait measures nothing: tests compare durations with `bystander.lost`.
+"""
 
 END_S = 5.0
 """A daemon that has not ended by then is killed, and the test fails by its exit code."""
@@ -56,7 +58,7 @@ ZERO = {"linear": {"x": 0.0}, "angular": {"z": 0.0}}
 
 
 def until(look: Callable[[], T | None], within: float, what: str) -> T:
-    """The first true value of `look`; fails with `what` was awaited."""
+    """Return the first true value of `look`. The failure message contains `what`."""
     deadline = time.monotonic() + within + PATIENCE_S
     while True:
         got = look()
@@ -68,19 +70,19 @@ def until(look: Callable[[], T | None], within: float, what: str) -> T:
 
 
 def twist(linear: float, angular: float = 0.0) -> dict[str, dict[str, float]]:
-    """A command as a stranger writes it."""
+    """Return a command as a stranger writes it."""
     return {"linear": {"x": linear}, "angular": {"z": angular}}
 
 
 def free_endpoint() -> str:
-    """A loopback address nobody listens on."""
+    """Return a loopback address on which no program listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def environment(**more: str) -> dict[str, str]:
-    """The environment of a shell that knows nothing of this test run."""
+    """Return the environment of a shell that knows nothing of this test run."""
     hidden = ("INVOCATION_ID", "ACSARD_CONFIG", "ACSARD_RECORD", "RUST_LOG", "STATE_DIRECTORY")
     env = {key: value for key, value in os.environ.items() if key not in hidden}
     paths = [str(ROOT), *filter(None, [env.get("PYTHONPATH")])]
@@ -100,21 +102,21 @@ def _states() -> str:
 
 
 def children(pid: int, words: str) -> list[int]:
-    """The children of all threads of a process whose command line has these words."""
+    """Return the children of all threads of a process whose command line contains these words."""
     born = [file.read_text().split() for file in Path(f"/proc/{pid}/task").glob("*/children")]
     found = []
     for child in itertools.chain.from_iterable(born):
         try:
             line = Path(f"/proc/{child}/cmdline").read_text().replace("\0", " ")
         except OSError:
-            continue  # gone meanwhile
+            continue  # it has ended meanwhile
         if words in line:
             found.append(int(child))
     return found
 
 
 class Program:
-    """A process whose output is collected while it runs; leaving ends it, whatever happened."""
+    """A process whose output is collected while it runs. Leaving it ends it in any case."""
 
     def __init__(
         self,
@@ -171,7 +173,7 @@ class Program:
         self.process.send_signal(number)
 
     def ended(self, within: float) -> int:
-        """The exit code; fails when it does not end in time."""
+        """Return the exit code. Fails if the process does not end in time."""
         try:
             code = self.process.wait(within + PATIENCE_S)
         except subprocess.TimeoutExpired:
@@ -181,7 +183,7 @@ class Program:
         return code
 
     def says(self, text: str, within: float = START_S) -> str:
-        """The first line on standard output that holds `text`."""
+        """Return the first line on standard output that contains `text`."""
 
         def look() -> str | None:
             found = next((line for line in list(self.out) if text in line), None)
@@ -208,12 +210,12 @@ def _collect(stream: Any, lines: list[str]) -> None:
 
 
 def acsard(*words: str) -> list[str]:
-    """The words that run the program under test."""
+    """Return the words that run the program under test."""
     return [sys.executable, "-m", "acsard", *words]
 
 
 class Finished(NamedTuple):
-    """What became of a program that was run to its end."""
+    """The result of a program that was run to its end."""
 
     code: int
     out: str
@@ -238,7 +240,7 @@ Tables = Mapping[str, Mapping[str, object]]
 
 
 def write_config(path: Path, tables: Tables) -> Path:
-    """A TOML file of plain tables; their values are written alike in JSON and TOML."""
+    """Write a TOML file of plain tables. TOML and JSON write their values alike."""
     lines = []
     for name, table in tables.items():
         lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
@@ -268,7 +270,7 @@ class Daemon(Program):
         given.setdefault("mcu", {}).setdefault("port", str(port))
         given.setdefault("bus", {}).setdefault("listen", [self.endpoint])
         self.states = where / f"{name}.states"
-        """Directory of the latch file; the next daemon of this name starts with its latches."""
+        """Directory of the latch file. The next daemon of this name starts with its latches."""
         given.setdefault("control", {}).setdefault("state_directory", str(self.states))
         self.config = write_config(where / f"{name}.toml", given)
         self._ready = ready
@@ -278,7 +280,7 @@ class Daemon(Program):
         if shell:
             run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
         super().__init__(run, where, **how)
-        # The way down takes 0.3 s; the tests that are about it send the signal themselves.
+        # A shutdown takes 0.3 s. The tests of the shutdown send the signal themselves.
         self._end_by = signal.SIGKILL
 
     def __enter__(self) -> Daemon:
@@ -294,7 +296,7 @@ class Daemon(Program):
         return self
 
     def door_opens(self, times: int = 1) -> None:
-        """The door to the network has been opened so often."""
+        """Wait until the TLS gateway has opened this number of times."""
         until(
             lambda: sum("door_open" in line for line in list(self.err)) >= times,
             START_S,
@@ -302,12 +304,12 @@ class Daemon(Program):
         )
 
     def events(self, name: str) -> list[dict[str, Any]]:
-        """The log lines of one event so far."""
+        """Return the log lines of one event so far."""
         found = [json.loads(line) for line in list(self.err) if line.startswith("{")]
         return [event for event in found if event["event"] == name]
 
 
-# what the system knows of a process
+# the kernel's figures for a process
 
 
 def resident_kb(pid: int) -> int:
@@ -317,12 +319,12 @@ def resident_kb(pid: int) -> int:
 
 
 def cpu_seconds(pid: int) -> float:
-    """Processor time of all its threads so far, s."""
+    """Return the processor time of all threads of a process so far, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-# the microcontroller that is not ours
+# the independent microcontroller
 
 Speeds = tuple[float, float, float, float]
 
@@ -333,7 +335,7 @@ Reply = Callable[[Speeds], bytes]
 def form(
     separator: str = ",", end: str = "\r\n", pad: int = 2, decimals: int = 2, comma: str = ""
 ) -> Reply:
-    """Replies that say the speeds asked for, in one of the forms of MCU.md section 1."""
+    """Build replies that report the requested speeds, in one of the forms of MCU.md section 1."""
 
     def reply(speeds: Speeds) -> bytes:
         width = pad + 1 + decimals
@@ -350,19 +352,19 @@ PLAIN = form()
 
 
 def silence(speeds: Speeds) -> bytes:
-    """Hears everything, answers nothing."""
+    """A microcontroller that receives everything and answers nothing."""
     return b""
 
 
 class Heard(NamedTuple):
-    """A line as it came, and when."""
+    """A line as it arrived, and the time of arrival."""
 
     at: float
     line: bytes
 
 
 class Session:
-    """All that came over one pty."""
+    """Everything that arrived over one pty."""
 
     def __init__(self) -> None:
         self.plugged = time.monotonic()
@@ -374,14 +376,14 @@ class Session:
         return b"".join(piece.line for piece in list(self.raw))
 
     def said(self) -> list[bytes]:
-        """The lines without their times."""
+        """Return the lines without their times."""
         return [heard.line for heard in list(self.lines)]
 
 
 class Peer:
-    """A serial peer at the other end of a pty: records every byte, answers each command line.
+    """A serial peer at the other end of a pty: records every byte and answers each command line.
 
-    It keeps a symbolic link at `path` for as long as it is plugged in, as udev does.
+    It keeps a symbolic link at `path` while it is plugged in, as udev does.
     """
 
     def __init__(self, path: Path, reply: Reply = PLAIN) -> None:
@@ -412,7 +414,7 @@ class Peer:
             self.unplug()
 
     def plug(self) -> None:
-        """A new pty under the same name."""
+        """Open a new pty under the same name."""
         master, slave = pty.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)
@@ -424,10 +426,11 @@ class Peer:
         self.path.symlink_to(os.ttyname(slave))
 
     def unplug(self) -> float:
-        """Pull the cable; when."""
+        """Pull the cable, and return the time."""
         assert self._ends is not None
         assert self._thread is not None
-        # The link first: the number of a closed pty goes to the next who asks for one.
+        # Remove the link first: the kernel gives the number of a closed pty to the next program
+        # that opens one.
         self.path.unlink()
         self._leave.set()
         self._thread.join()
@@ -438,7 +441,7 @@ class Peer:
 
     @contextmanager
     def deaf(self) -> Iterator[None]:
-        """Reads nothing while entered, so that the kernel keeps what comes."""
+        """Read nothing while entered, so that the kernel keeps the incoming bytes."""
         self._listens.clear()
         idle = self._idle
         until(lambda: self._idle > idle, 5.0, "it has stopped to listen")
@@ -448,7 +451,7 @@ class Peer:
             self._listens.set()
 
     def stuff(self) -> int:
-        """Fill what the kernel holds for us to read with ends of line; how many bytes it took."""
+        """Fill the kernel's buffer towards us with line ends; return the number of bytes."""
         assert self._ends is not None
         os.set_blocking(self._ends[1], False)
         taken = 0
@@ -459,18 +462,18 @@ class Peer:
             return taken
 
     def say(self, data: bytes) -> None:
-        """Send bytes unasked."""
+        """Send bytes without being asked."""
         assert self._ends is not None
         os.write(self._ends[0], data)
 
     def await_lines(self, count: int, within: float = 5.0) -> list[Heard]:
-        """The next `count` lines from now on."""
+        """Wait for the next `count` lines from now on."""
         start = len(self.session.lines)
         until(lambda: len(self.lines) >= start + count, within, f"{count} lines on the wire")
         return self.lines[start : start + count]
 
     def last_line(self) -> bytes:
-        """The last line ever, once the daemon has ended and all it left behind has been read."""
+        """Return the last line, once the daemon has ended and all its output has been read."""
         idle = self._idle
         until(lambda: self._idle > idle, 5.0, "the line falls silent")
         return self.session.said()[-1]
@@ -493,7 +496,8 @@ class Peer:
                 session.lines.append(Heard(now, line + b"\n"))
                 speeds = _speeds(line)
                 if speeds is not None:
-                    # Replies that equal the lines would be an echo, so the wheels lag.
+                    # Replies that equal the command lines would look like an echo, so the wheels
+                    # lag.
                     a, b, c, d = ((one + two) / 2 for one, two in zip(turning, told, strict=True))
                     answer, turning, told = self.reply((a, b, c, d)), told, speeds
                     if answer:
@@ -528,10 +532,11 @@ while True:
 
 
 class FarPeer(Program):
-    """A serial peer in a process of its own, ahead of all others: its times can be trusted.
+    """A serial peer in a process of its own, at a higher priority than all others.
 
-    Nothing this test run does (its interpreter lock, its load) makes a line look late. It answers
-    each command with the speeds asked for two lines before, that of wheel a 0.01 to 0.09 off.
+    Its times are reliable: nothing in this test run (its interpreter lock, its load) makes a line
+    look late. It answers each command with the speeds requested two lines before; the speed of
+    wheel a is 0.01 to 0.09 off.
     """
 
     def __init__(self, where: Path, name: str = "far_mcu") -> None:
@@ -546,11 +551,11 @@ class FarPeer(Program):
 
     @property
     def lines(self) -> list[Heard]:
-        """All lines so far, without their ends; "-" for an empty one."""
+        """Return all lines so far, without their ends; "-" stands for an empty one."""
         return list(self._all())
 
     def since(self, at: float, to: float = float("inf")) -> list[Heard]:
-        """The lines between two times."""
+        """Return the lines between two times."""
         heard = self._all()
         first, last = (bisect.bisect_right(heard, time, key=lambda h: h.at) for time in (at, to))
         return heard[first:last]
@@ -562,7 +567,7 @@ class FarPeer(Program):
         return self._heard
 
     def awaits(self, line: bytes, within: float = 5.0, after: float = 0.0) -> Heard:
-        """The first line that starts so after then."""
+        """Return the first line after that time that starts with this prefix."""
         return until(
             lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
             within,
@@ -571,7 +576,7 @@ class FarPeer(Program):
 
 
 def _speeds(line: bytes) -> Speeds | None:
-    """What a command line asks of the motors; None when it is not one."""
+    """Return the motor speeds that a command line requests, or None if it is not a command."""
     try:
         tokens = line.decode().strip().rstrip(",").split(",")
         values = [float(token[2:]) * {"p": 1, "n": -1}[token[1]] for token in tokens]
@@ -582,7 +587,7 @@ def _speeds(line: bytes) -> Speeds | None:
 
 
 def wheels(line: bytes) -> Speeds:
-    """The four speeds of a line that must be a command."""
+    """Return the four speeds of a line that must be a command."""
     speeds = _speeds(line)
     assert speeds is not None, line
     return speeds
@@ -592,7 +597,7 @@ def wheels(line: bytes) -> Speeds:
 
 
 def client_config(endpoint: str, mode: str = "client") -> zenoh.Config:
-    """The settings any Zenoh user writes to reach one address."""
+    """Return the settings that any Zenoh user writes to reach one address."""
     config = zenoh.Config()
     config.insert_json5("mode", json.dumps(mode))
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -602,7 +607,7 @@ def client_config(endpoint: str, mode: str = "client") -> zenoh.Config:
 
 
 def read(sample: zenoh.Sample) -> Any:
-    """A published payload as plain values, by its encoding."""
+    """Return a published payload as plain values, decoded by its encoding."""
     data = sample.payload.to_bytes()
     if str(sample.encoding).startswith("application/json"):
         return msgspec.json.decode(data)
@@ -610,7 +615,7 @@ def read(sample: zenoh.Sample) -> Any:
 
 
 class Seen(NamedTuple):
-    """A message, its encoding and when it arrived."""
+    """A message, its encoding and its time of arrival."""
 
     at: float
     value: Any
@@ -618,7 +623,7 @@ class Seen(NamedTuple):
 
 
 class Following:
-    """What comes on a key, from now on."""
+    """The messages that arrive on a key, from now on."""
 
     def __init__(self) -> None:
         self.seen: list[Seen] = []
@@ -634,7 +639,7 @@ class Following:
     def find(
         self, wanted: Callable[[Any], bool], within: float, what: str, after: float = 0.0
     ) -> Seen:
-        """The first message that is `wanted` and arrived `after` then."""
+        """Return the first message that is `wanted` and arrived after the time `after`."""
         deadline, looked = time.monotonic() + within + PATIENCE_S, 0
         with self._news:
             while True:
@@ -649,9 +654,11 @@ class Following:
 
 
 def broken(states: Following, since: float, to: float = float("inf")) -> bool:
-    """Whether the link was lost in that time, though nobody broke it: the machine kept the
-    microcontroller or the kernel's thread that carries its lines waiting. The robot rightly stands
-    then, and what it did tells nothing."""
+    """Return whether the link was lost in that time although no test broke it.
+
+    The machine then kept the microcontroller, or the kernel's thread that carries its lines,
+    waiting. The robot rightly stands in that case, and its behaviour proves nothing.
+    """
     return any(since <= seen.at <= to and seen.value["link"] != "up" for seen in states.seen)
 
 
@@ -678,19 +685,22 @@ class Bus:
         self.session.close()
 
     def put(self, key: str, value: object, sender: str = "") -> None:
-        """Put JSON without an encoding, as the smallest client does, with its sender id if any."""
+        """Put JSON without an encoding, as the smallest client does, with a sender id if given."""
         attachment = json.dumps({"sender": sender}) if sender else None
         self.session.put(f"{self.root}/{key}", json.dumps(value), attachment=attachment)
 
     def payload(self, key: str, payload: object) -> str | None:
-        """Return the payload of a query as JSON; a release without one names the latch."""
+        """Return the payload of a query as JSON.
+
+        A release without a latch is given the current one.
+        """
         if key in ("srv/clear", "srv/activate") and payload is None:
             states = self.ask("state")
             payload = {"latch": json.loads(states[0].payload)["latch"]} if states else None
         return None if payload is None else json.dumps(payload)
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
-        """All replies to a query; a release names the latch of `state`, as our tools do."""
+        """Return all replies to a query. A release names the latch of `state`, as our tools do."""
         data = self.payload(key, payload)
         found = []
         for reply in self.session.get(f"{self.root}/{key}", payload=data, timeout=5.0):
@@ -704,7 +714,10 @@ class Bus:
         return found
 
     def get(self, key: str, payload: object = None) -> Any:
-        """The one JSON reply to a query; a daemon that says it is asked too much is asked again."""
+        """Return the one JSON reply to a query.
+
+        Asks again if the daemon says that it is overloaded.
+        """
         deadline = time.monotonic() + 5.0
         answers = self.ask(key, payload)
         while [one.payload for one in answers] == [BUSY.encode()] and time.monotonic() < deadline:
@@ -718,15 +731,15 @@ class Bus:
         return self.get("state")
 
     def count(self, name: str) -> int:
-        """A counter of `state`; 0 before it first counts."""
+        """Return a counter of `state`, or 0 before it first counts."""
         return int(self.state()["counters"].get(name, 0))
 
     @contextmanager
     def follow(self, key: str) -> Iterator[Following]:
-        """Subscribe while entered; the daemon knows of it by then."""
+        """Subscribe while entered. The daemon knows the subscription by then."""
         following = Following()
         subscriber = self.session.declare_subscriber(f"{self.root}/{key}", following.add)
-        # On one link all is in order: what is answered now was asked behind the subscription.
+        # Messages on one link arrive in order. An answer received now follows the subscription.
         self.ask("info")
         try:
             yield following
@@ -739,8 +752,11 @@ class Bus:
             states.find(lambda state: state["link"] == "up", within, "link up")
 
     def comes_to(self, *modes: str) -> Any:
-        """The state in one of these modes: at once, or when a link that a busy machine kept
-        waiting for a tenth of a second is back."""
+        """Return the state in one of these modes.
+
+        This is immediate unless a busy machine kept the link waiting for a tenth of a second; then
+        it waits until the link is back.
+        """
 
         def look() -> Any:
             state = self.state()
@@ -751,7 +767,7 @@ class Bus:
         return state
 
     def at_rest(self, within: float = 5.0) -> Any:
-        """The state when the robot is ready, obeys nobody and its wheels stand."""
+        """Return the state when the robot is ready, obeys no client and its wheels stand."""
 
         def look() -> Any:
             state = self.state()
@@ -773,15 +789,15 @@ class Bus:
         neutral: bool = True,
         certificate: str = "",
     ) -> Iterator[Commander]:
-        """A commander at 20 Hz that opens with a zero, unless told to be rude, while entered."""
+        """Send commands at 20 Hz while entered. Opens with a zero unless told to be rude."""
         commander = Commander(self, command_key("cmd", source, certificate), linear, angular)
         if neutral:
             before, said = self.count("commands"), 0.0
 
             def heard() -> bool:
                 nonlocal said
-                # Whoever is stamped on the way, as by a router, shows its delays first; and what
-                # comes within a millisecond of another is left out.
+                # A sender that is stamped on the way, for example by a router, must show its delays
+                # first. A message that arrives within a millisecond of another one is dropped.
                 state = self.state()
                 counters, waits = state["counters"], self._waits_for(state, source)
                 neutral = waits.startswith("send a zero first")
@@ -804,7 +820,7 @@ class Bus:
 
 
 class Commander:
-    """Keeps sending, whatever happens to the robot, as commanders do."""
+    """A client that keeps sending commands, whatever happens to the robot."""
 
     def __init__(self, bus: Bus, key: str, linear: float, angular: float) -> None:
         self.key, self.sender = key, f"commander/{secrets.token_hex(16)}"
@@ -820,17 +836,18 @@ class Commander:
 
 
 class Periods(NamedTuple):
-    """What became of the control periods between two states."""
+    """The account of the control periods between two states."""
 
     elapsed: float
-    """By the stamps of the states, at 100 Hz."""
+    """Elapsed periods by the stamps of the states, at 100 Hz."""
     sent: int
     superseded: int
     missed: int
     commands: int
-    """Taken meanwhile: their lines go at once, in the place of a period's or beside it."""
+    """Commands taken meanwhile. Their lines go at once, in place of a period's line or in addition.
+    """
     latest: float
-    """How late the latest period since the start of the daemon began, in periods."""
+    """Lateness of the latest period since the start of the daemon, in periods."""
 
     @classmethod
     def between(cls, first: Any, last: Any) -> Periods:
@@ -847,57 +864,66 @@ class Periods(NamedTuple):
         return self.sent + self.superseded + self.missed
 
     def are_all_accounted_for(self) -> bool:
-        """A state falls anywhere within a period, at either end, or into one that is yet to begin:
-        what is due by its stamp is counted then."""
+        """Return whether every period sent a line or was counted as not doing so.
+
+        A state may fall anywhere within a period, at either end, or before one that is about to
+        begin. A period that is due by the stamp is counted then.
+        """
         return abs(self.accounted - self.elapsed) <= 2 + self.latest + self.commands
 
 
 def waited_for_a_core(pid: int) -> float:
-    """How long the first thread of a process, the control loop, was ready and had no core, s."""
+    """Return how long a process's first thread, the control loop, was ready without a core, s."""
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
 
 
 def waits_for_a_core(pid: int) -> dict[int, float]:
-    """How long each thread of a process was ready and had no core, s."""
+    """Return how long each thread of a process was ready without a core, s."""
     waits = {}
     for task in Path(f"/proc/{pid}/task").iterdir():
         try:
             waits[int(task.name)] = int((task / "schedstat").read_text().split()[1]) / 1e9
         except OSError:
-            pass  # a thread that has ended meanwhile
+            pass  # the thread has ended meanwhile
     return waits
 
 
 def kept_waiting(pid: int) -> float:
-    """How long all threads of a process were ready and had no core, s: one may hold up the others.
+    """Return how long all threads of a process were ready without a core, s.
 
-    A process that has to pass its interpreter from thread to thread waits longer on a busy machine
-    than a bystander that only looks at the clock.
+    One thread may delay the others. A process that passes its interpreter from thread to thread
+    waits longer on a busy machine than a bystander that only checks the clock.
     """
     return sum(waits_for_a_core(pid).values())
 
 
 def held_up(before: dict[int, float], after: dict[int, float], pid: int) -> float:
-    """How long the machine may have kept the first thread, the control loop, between two looks, s:
-    it waited for a core itself, or for the interpreter, which the one had that waited longest."""
+    """Return how long the machine may have delayed the first thread, the control loop, s.
+
+    The loop waited for a core itself, or for the interpreter, which the thread with the longest
+    wait held.
+    """
     waits = {thread: waited - before.get(thread, 0.0) for thread, waited in after.items()}
     return waits.pop(pid) + max(waits.values(), default=0.0)
 
 
 def silences(times: Sequence[float], longest: float = 0.2) -> float:
-    """What a robot may lose by silences of its commander, s: it ramps down and up once more."""
+    """Return the time that a robot may lose by pauses of its commander, s.
+
+    It ramps down and up once more for each.
+    """
     gaps = [after - before for before, after in itertools.pairwise(times)]
     return sum(gap + 0.3 for gap in gaps if gap > longest)
 
 
 def seconds(stamp: Mapping[str, int]) -> float:
-    """A stamp of a message as seconds since 1970."""
+    """Return a stamp of a message as seconds since 1970."""
     return stamp["sec"] + stamp["nanosec"] / 1e9
 
 
 @contextmanager
 def alive_at(endpoint: str, daemon: Program) -> Iterator[Any]:
-    """The alive tokens seen by a client of `endpoint`, where `daemon` is coming up."""
+    """Return the alive tokens seen by a client of `endpoint`, where `daemon` is starting."""
 
     def connect() -> zenoh.Session | None:
         assert daemon.process.poll() is None, f"ended with {daemon.process.returncode}\n{daemon}"

@@ -18,7 +18,7 @@ ROBOT_AT, STRANGER_AT = "198.18.77.1", "198.18.77.2"
 CARDS = {ROBOT_AT: "02:00:00:00:77:01", STRANGER_AT: "02:00:00:00:77:02"}
 
 NOBODY = "02:00:00:00:77:99"
-"""A network card that nobody has."""
+"""The address of a network card that does not exist."""
 
 CLONE_NEWNET = 0x40000000
 
@@ -26,7 +26,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 class Hosts:
-    """The robot's, and another one."""
+    """The robot's host and another host."""
 
     def __init__(self) -> None:
         tag = f"acsard{os.getpid()}"
@@ -44,7 +44,7 @@ class Hosts:
                 ip("-n", name, "link", "set", "cable", "address", CARDS[at])
                 ip("-n", name, "address", "add", f"{at}/24", "dev", "cable")
                 ip("-n", name, "link", "set", "cable", "up")
-                # Scouting goes only where there is a way for multicast.
+                # Scouting only works if there is a route for multicast.
                 ip("-n", name, "route", "add", "default", "dev", "cable")
         except BaseException:
             self.__exit__()
@@ -56,15 +56,15 @@ class Hosts:
             ip("netns", "delete", name, check=False)
 
     def cut(self) -> None:
-        """From now on each sends to a card that nobody has: nothing arrives, and nobody is told.
+        """Cut the network silently: from now on each host sends to a card that does not exist.
 
-        First what goes to the robot.
+        Nothing arrives, and no program gets an error. The way to the robot is cut first.
         """
         self._way(self.stranger, ROBOT_AT, NOBODY)
         self._way(self.robot, STRANGER_AT, NOBODY)
 
     def heal(self) -> None:
-        """As before."""
+        """Restore the network."""
         self._way(self.stranger, ROBOT_AT, CARDS[ROBOT_AT])
         self._way(self.robot, STRANGER_AT, CARDS[STRANGER_AT])
 
@@ -76,7 +76,7 @@ class Hosts:
 
 @contextmanager
 def inside(host: str) -> Iterator[None]:
-    """This thread, the processes and sockets that it makes, are on that host while entered."""
+    """Put this thread, and the processes and sockets that it makes, on that host while entered."""
     with open("/proc/thread-self/ns/net") as back, open(f"/run/netns/{host}") as there:
         _enter(there.fileno())
         try:
@@ -87,7 +87,7 @@ def inside(host: str) -> Iterator[None]:
 
 @contextmanager
 def on(host: str, program: P) -> Iterator[P]:
-    """A program that runs on that host."""
+    """Run a program on that host."""
     with ExitStack() as stack:
         with inside(host):
             stack.enter_context(program)
@@ -105,7 +105,7 @@ def ip(*arguments: str, check: bool = True) -> None:
 
 
 def two_hosts() -> Iterator[Hosts]:
-    """For a fixture: skips where there can be none."""
+    """Provide two hosts for a fixture. Skips if the machine does not allow it."""
     if shutil.which("ip") is None or os.geteuid() != 0:
         pytest.skip("needs ip and root, to make a second host")
     try:

@@ -1,4 +1,4 @@
-"""Who comes to the bus, and with what: plain clients, certificates of each role, and bad ones."""
+"""The identities of clients on the bus: plain clients, certificates of each role, and bad ones."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Identity = Literal[
 ]
 
 ADMITTED: tuple[Identity, ...] = ("local", "viewer", "operator", "maintainer")
-"""Plain TCP on this machine, and the certificates `acsard lan init` makes."""
+"""Plain TCP on this machine, and the certificates that `acsard lan init` makes."""
 
 STRANGERS: tuple[Identity, ...] = ("unlisted", "nobody", "foreign", "expired")
-"""A good certificate nobody listed; none at all; the operator's of another CA; one of yesterday."""
+"""A valid but unlisted certificate, no certificate, another CA's operator, and an expired one."""
 
 
 class Certificates:
-    """Those of one robot, and what strangers would hold, below a directory."""
+    """The certificates of one robot, and those that strangers would hold, below a directory."""
 
     def __init__(self, where: Path, *addresses: str) -> None:
         self.robot = where / "tls"
@@ -47,27 +47,27 @@ class Certificates:
         assert done.code == 0, done
 
     def issue(self, directory: Path, name: str, days: float) -> None:
-        """One more, by this robot's authority."""
+        """Issue one more certificate by this robot's authority."""
         Authority.load(self.robot, str).issue(directory, name, [], days)
 
     def config(self, who: Identity, plain: str, tls: str) -> zenoh.Config:
-        """The settings of a client that comes as `who`; all of them know the robot's CA."""
+        """Return the settings of a client with this identity; all of them know the robot's CA."""
         if who == "local":
             return client_config(plain)
         return self.shown(tls, self.own(who))
 
     def own(self, who: Identity) -> Path | None:
-        """The directory of their certificate."""
+        """Return the directory of the identity's certificate."""
         return self._client.get(who)
 
     def shown(self, endpoint: str, own: Path | None) -> zenoh.Config:
-        """The settings of a client that shows the certificate in `own`, or none."""
+        """Return the settings of a client that shows the certificate in `own`, or none."""
         config = client_config(endpoint)
         config.insert_json5("transport/link/tls", json.dumps(self.settings(own)))
         return config
 
     def settings(self, own: Path | None) -> dict[str, object]:
-        """Zenoh's `transport/link/tls` for it."""
+        """Return Zenoh's `transport/link/tls` for that client."""
         tls: dict[str, object] = {"root_ca_certificate": str(self.robot / "ca.pem")}
         if own is not None:
             tls["enable_mtls"] = True
@@ -77,5 +77,5 @@ class Certificates:
 
 
 def free_tls_endpoint() -> str:
-    """A loopback address nobody listens on, for TLS."""
+    """Return a loopback address for TLS on which no program listens."""
     return free_endpoint().replace("tcp/", "tls/")

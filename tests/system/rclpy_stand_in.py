@@ -1,8 +1,7 @@
-"""Stand-ins for rclpy and geometry_msgs, which come with ROS only: what `drive.py` needs of them.
+"""Stand-ins for rclpy and geometry_msgs, as far as `drive.py` needs them; both need ROS.
 
-As the real one: unless told otherwise, a signal ends the context under whoever still publishes.
-
-The messages go by the protocol of rmw_zenoh, or as a bridge puts them, into a real daemon.
+As in the real rclpy, a signal by default ends the context while a node may still be publishing. The
+messages go into a real daemon by the protocol of rmw_zenoh, or as a bridge puts them.
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ class Twist:
 
 
 def write(where: Path) -> None:
-    """Lay the packages there."""
+    """Write the stand-in packages there."""
     for name, text in {
         "rclpy/__init__.py": RCLPY,
         "rclpy/signals.py": SIGNALS,

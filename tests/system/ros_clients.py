@@ -66,7 +66,7 @@ PUBLISHED = {
     "diagnostics": (DIAGNOSTICS, 10, False),
     "cmd_vel_out": (STAMPED, 10, False),
 }
-"""What the robot publishes: type, depth, transient local."""
+"""The robot's publications: type, depth, transient local."""
 
 TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
 
@@ -95,7 +95,7 @@ QUICK = {
         "linear_stop_deceleration": 5.0,
     }
 }
-"""Limits under which a test of driving need not take long."""
+"""Limits under which a driving test is short."""
 
 
 # messages, by rosbags
@@ -113,22 +113,22 @@ for _name, _text in {
 
 
 def make(type_name: str, **fields: Any) -> Any:
-    """A message of rosbags."""
+    """Make a message of rosbags."""
     return _store.types[type_name](**fields)
 
 
 def encode(message: Any) -> bytes:
-    """CDR by rosbags, little endian."""
+    """Encode as CDR by rosbags, little endian."""
     return bytes(_store.serialize_cdr(message, message.__msgtype__))
 
 
 def decode(type_name: str, payload: bytes) -> Any:
-    """A message of rosbags from CDR."""
+    """Decode a message of rosbags from CDR."""
     return _store.deserialize_cdr(payload, type_name)
 
 
 def header(age: float | None = None, frame: str = "") -> Any:
-    """A header of so long ago, without a stamp when `age` is None."""
+    """Return a header stamped `age` seconds ago, or without a stamp if `age` is None."""
     sec, nanosec = (0, 0) if age is None else divmod(int((time.time() - age) * 1e9), 10**9)
     stamp = make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
@@ -171,7 +171,7 @@ def _floats(*values: float) -> Any:
 
 
 PAYLOADS: dict[str, Callable[[float], bytes]] = {TWIST: twist, STAMPED: stamped, JOINTS: joints}
-"""How a speed is asked for in each type."""
+"""How each type requests a speed."""
 
 EMPTY_REQUEST = b"\0\1\0\0\0"
 """A request without fields."""
@@ -186,12 +186,12 @@ def dds_name(type_name: str) -> str:
 
 
 def rmw_key(name: str, type_name: str, domain: int = 0) -> str:
-    """The key of a fully qualified name without its leading slash."""
+    """Return the key of a fully qualified name without its leading slash."""
     return f"{domain}/{name}/{dds_name(type_name)}/RIHS01_{HASHES[type_name]}"
 
 
 def gid_of(token: str) -> bytes:
-    """What rmw_zenoh makes of a liveliness token: low half first, each little endian."""
+    """Return rmw_zenoh's hash of a liveliness token: low half first, each little endian."""
     value = xxhash.xxh3_128_intdigest(token.encode())
     return struct.pack("<QQ", value & (2**64 - 1), value >> 64)
 
@@ -208,7 +208,7 @@ class Attached(NamedTuple):
 
     @classmethod
     def read(cls, data: bytes) -> Attached:
-        """Of the 33 bytes it must be."""
+        """Read the attachment, which must have 33 bytes."""
         assert len(data) == 33, data.hex()
         sequence, stamp_ns, length = struct.unpack_from("<qqB", data)
         assert length == 16, data.hex()
@@ -216,18 +216,18 @@ class Attached(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A sample as it came, and when."""
+    """A sample as it arrived, and the time of arrival."""
 
     at: float
     key: str
     payload: bytes
     attachment: bytes
     origin: str
-    """The clock id of the session that put it."""
+    """The clock id of the session that put the sample."""
 
 
 class Samples:
-    """What comes to a subscriber, from now on."""
+    """The samples that arrive at a subscriber, from now on."""
 
     def __init__(self) -> None:
         self.seen: list[Sample] = []
@@ -250,7 +250,7 @@ class Samples:
     def first(
         self, what: str, wanted: Callable[[Sample], bool] = lambda _: True, within: float = 5.0
     ) -> Sample:
-        """The first that is `wanted`."""
+        """Return the first sample that is `wanted`."""
         deadline, looked = time.monotonic() + within, 0
         with self._news:
             while True:
@@ -263,19 +263,19 @@ class Samples:
                     raise AssertionError(f"not within {within:g} s: {what}; {looked} others came")
 
     def has(self, count: int, within: float = 5.0) -> None:
-        """Wait for so many in all."""
+        """Wait for this total number of samples."""
         until(lambda: len(self.seen) >= count, within, f"{count} samples")
 
 
 class Called(NamedTuple):
-    """What came back of a service call."""
+    """The replies to a service call."""
 
     replies: list[Sample]
     errors: int
     seconds: float
 
     def trigger(self) -> tuple[bool, str]:
-        """The one reply, which must be a Trigger's."""
+        """Return the contents of the only reply, which must be a Trigger's."""
         assert len(self.replies) == 1, self
         assert self.errors == 0, self
         reply = decode("std_srvs/msg/TriggerReply", self.replies[0].payload)
@@ -283,7 +283,10 @@ class Called(NamedTuple):
 
 
 def released(ros: Client) -> None:
-    """Call `clear` until it is obeyed: a Trigger has no number, so it waits 2 s after a stop."""
+    """Call `clear` until it is obeyed.
+
+    A Trigger has no latch number, so it only works 2 s after a stop.
+    """
     until(lambda: ros.call("acsard/clear").trigger()[0], 5.0, "a plain clear is obeyed")
 
 
@@ -291,7 +294,7 @@ def released(ros: Client) -> None:
 
 
 class Client:
-    """What both have in common; `namespace` is in front of every name."""
+    """The common part of both kinds of client. `namespace` is put in front of every name."""
 
     def __init__(self, session: zenoh.Session, namespace: str = "") -> None:
         self.session = session
@@ -321,7 +324,7 @@ class Client:
 
     @contextmanager
     def follow_late(self, name: str, type_name: str, depth: int = 100) -> Iterator[Samples]:
-        """Subscribe as for transient local: with what was said before."""
+        """Subscribe as transient local, which includes earlier samples."""
         samples = Samples()
         subscriber = zenoh.ext.declare_advanced_subscriber(
             self.session,
@@ -352,7 +355,10 @@ class Client:
     def heard(
         self, bus: Bus, name: str, type_name: str, payload: bytes | Callable[[], bytes]
     ) -> None:
-        """Put it, made anew each time, until it is taken: a new sender must show its delays."""
+        """Put a command until it is accepted, built again each time.
+
+        A new sender must show its delays first.
+        """
         before = bus.count("commands")
 
         def taken() -> bool:
@@ -362,14 +368,14 @@ class Client:
         until(taken, 5.0, f"a command on {name}")
 
     def zeros(self, bus: Bus) -> None:
-        """A zero of every source, taken: from here on each could move the robot."""
+        """Put an accepted zero on every source. From here on each could move the robot."""
         for name in ("cmd_vel", "cmd_vel_teleop"):
             self.heard(bus, name, TWIST, twist(0.0))
         self.heard(bus, "joint_commands", JOINTS, lambda: joints(0.0))
 
     @contextmanager
     def driving(self, bus: Bus, name: str, type_name: str, speed: float) -> Iterator[None]:
-        """A zero, and then so fast at 20 Hz while entered."""
+        """Send a zero, and then this speed at 20 Hz while entered."""
         self.heard(bus, name, type_name, lambda: PAYLOADS[type_name](0.0))
         silenced = threading.Event()
         if not isinstance(self, RmwClient):
@@ -403,7 +409,7 @@ class RmwClient(Client):
         return rmw_key(self.full(name), type_name, self.domain)
 
     def attachment(self, age: float = 0.0) -> bytes:
-        """The next one, of so long ago."""
+        """Return the next attachment, stamped `age` seconds ago."""
         self._sequence += 1
         return Attached(self._sequence, time.time_ns() - int(age * 1e9), self.gid).pack()
 
@@ -448,7 +454,7 @@ class BridgeHalf(Client):
 
 @contextmanager
 def listed(session: zenoh.Session, pattern: str) -> Iterator[list[str]]:
-    """The liveliness tokens there are, kept up to date while entered."""
+    """Keep the liveliness tokens up to date while entered."""
     found: list[str] = []
 
     def on_token(sample: zenoh.Sample) -> None:
@@ -472,11 +478,11 @@ def session_at(endpoint: str) -> Iterator[zenoh.Session]:
         yield session
 
 
-# what becomes of commands
+# the results of commands
 
 
 def changes(before: Any, after: Any) -> dict[str, int]:
-    """The command counters that changed, by how much."""
+    """Return the command counters that changed, and by how much."""
     was, now = before["counters"], after["counters"]
     return {
         key: now[key] - was.get(key, 0)
@@ -504,9 +510,9 @@ def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said
 
 
 def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
-    """Wait until all that was put before is through: a link keeps order, and `send` is counted.
+    """Wait until all earlier messages are through: a link keeps order, and `send` is counted.
 
-    More than once, if need be: within 1 ms of another sample on its key it is dropped.
+    Sends again if necessary, because a sample within 1 ms of another one on its key is dropped.
     """
     before, sent = bus.count(f"command_{reason}"), 0.0
 
@@ -521,7 +527,10 @@ def behind(bus: Bus, send: Callable[[], None], reason: str) -> None:
 
 
 def settled(bus: Bus) -> None:
-    """At rest for good, which one reading of slow wheels cannot tell; then at the origin."""
+    """Wait until the robot is at rest, then put it at the origin.
+
+    One reading of slow wheels cannot tell rest.
+    """
 
     def look() -> bool:
         first = bus.at_rest()
@@ -540,7 +549,7 @@ def unharmed(daemon: Daemon) -> None:
         assert word not in daemon.stderr
 
 
-# an implementation of rmw_zenoh's protocol that is not ours
+# an independent implementation of rmw_zenoh's protocol
 
 SDK = """\
 import json, sys, time
@@ -680,7 +689,7 @@ for line in sys.stdin:
     print("answer", number, json.dumps(answer, default=plain), flush=True)
 manager.close()
 """
-"""Does by zenoh-ros2-sdk what it is told on standard input, one JSON list a line."""
+"""Executes commands from standard input with zenoh-ros2-sdk, one JSON list per line."""
 
 
 def bare_environment() -> dict[str, str]:
@@ -690,7 +699,7 @@ def bare_environment() -> dict[str, str]:
 
 
 class Sdk(Program):
-    """A process that uses zenoh-ros2-sdk, told what to do by `do`."""
+    """A process that uses zenoh-ros2-sdk; `do` sends it commands."""
 
     def __init__(self, endpoint: str, where: Path) -> None:
         port = endpoint.rpartition(":")[2]
@@ -715,7 +724,7 @@ class Sdk(Program):
         super().__exit__(*error)
 
     def do(self, verb: str, *args: object, **kwargs: object) -> Any:
-        """What the SDK answers, as plain values."""
+        """Return the SDK's answer as plain values."""
         self._number += 1
         stdin = self.process.stdin
         assert stdin is not None
@@ -932,11 +941,12 @@ got = call("clear")
 print("called clear", got.success, got.message, flush=True)
 sys.stdin.read()
 """
-"""A ROS node on DDS, as far as the bridge can tell: hears odometry, drives, comes late, calls."""
+"""A ROS node on DDS, as far as the bridge can tell: receives odometry, drives, joins late, calls.
+"""
 
 
 class Relay:
-    """Hands on what goes over TCP between a client and `target`, and counts what comes back."""
+    """A TCP relay between a client and `target` that counts the bytes of the replies."""
 
     def __init__(self, target: str) -> None:
         self.came = 0
@@ -954,7 +964,7 @@ class Relay:
             try:
                 end.shutdown(socket.SHUT_RDWR)
             except OSError:
-                pass  # the other end was first
+                pass  # the other end closed first
             end.close()
 
     def _accept(self) -> None:
@@ -975,7 +985,7 @@ class Relay:
                     self.came += len(data)
                 sink.sendall(data)
         except OSError:
-            pass  # one of the ends has gone
+            pass  # one of the ends has closed
 
 
 def _address(endpoint: str) -> tuple[str, int]:
@@ -987,7 +997,7 @@ class Bridge(Program):
     """The real zenoh-bridge-ros2dds as a client of `endpoint`, on a DDS domain of its own."""
 
     def __init__(self, program: str, where: Path, endpoint: str) -> None:
-        # A domain whose ports are below those the kernel gives away.
+        # Use a domain whose ports are below those that the kernel assigns.
         self.domain = 20 + os.getpid() % 80
         self.cyclone = where / "cyclone.xml"
         self.cyclone.write_text(CYCLONE)
@@ -1004,16 +1014,16 @@ class Bridge(Program):
 
     @property
     def environment(self) -> dict[str, str]:
-        """For it and for whoever is on its domain."""
+        """Return the environment for the bridge and for any node on its domain."""
         return bare_environment() | {"CYCLONEDDS_URI": f"file://{self.cyclone}"}
 
     @property
     def log(self) -> list[str]:
-        """What it said, without colours."""
+        """Return the bridge's log without colours."""
         return [re.sub(r"\x1b\[[0-9;]*m", "", line) for line in [*self.out, *self.err]]
 
     def logs(self, *texts: str, within: float = 10.0) -> str:
-        """The first line that has all of these."""
+        """Return the first log line that contains all of these."""
         return until(
             lambda: next((line for line in self.log if all(t in line for t in texts)), None),
             within,

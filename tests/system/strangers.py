@@ -1,4 +1,7 @@
-"""Programs of strangers: plain Zenoh and JSON, nothing of acsard. The text is what they run."""
+"""Programs of strangers: plain Zenoh and JSON, nothing of acsard.
+
+Each constant is the text of a program.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ print("first", time.monotonic(), sample.encoding, flush=True)
 session.close()
 """
 )
-"""Waits for the daemon, then for its first odometry; prints when that came."""
+"""Waits for the daemon, then for its first odometry; prints the time of its arrival."""
 
 DRIVE = (
     _OPEN
@@ -56,7 +59,7 @@ print("took", time.monotonic() - start, flush=True)
 session.close()
 """
 )
-"""One zero, `speed` m/s at 20 Hz for `seconds`, one zero."""
+"""Sends one zero, `speed` m/s at 20 Hz for `seconds`, then one zero."""
 
 STUCK = (
     _OPEN
@@ -68,7 +71,7 @@ sys.stdin.read()
 time.sleep(600)
 """
 )
-"""Subscribes to everything and stays, to be stopped with SIGSTOP."""
+"""Subscribes to everything and stays, until a test stops it with SIGSTOP."""
 
 
 FLOOD = (
@@ -93,7 +96,7 @@ print("flooded", count, flush=True)
 session.close()
 """
 )
-"""One zero, then `speed` m/s as fast as one process can for `seconds`."""
+"""Sends one zero, then `speed` m/s as fast as one process can for `seconds`."""
 
 DELETES = (
     _OPEN
@@ -105,7 +108,7 @@ while True:
     publisher.delete()
 """
 )
-"""DELETEs on `stop` as fast as one process can, for ever."""
+"""DELETEs `stop` as fast as one process can, for ever."""
 
 
 COMMANDER = (
@@ -134,9 +137,9 @@ while True:
     time.sleep(max(0.0, start + step / 20 - time.monotonic()))
 """
 )
-"""So many zeros, then `speed` m/s at 20 Hz for ever, stamped; says when, just before each put.
+"""Sends this number of zeros, then `speed` m/s at 20 Hz for ever, stamped.
 
-SIGUSR1 makes it return to neutral: it sends thirty zeros.
+Prints the time just before each put. On SIGUSR1 it returns to neutral: it sends thirty zeros.
 """
 
 STOP_AND_GO = (
@@ -190,9 +193,12 @@ print("sent", json.dumps(sent), flush=True)
 session.close()
 """
 )
-"""One zero, then as fast as one process can: each command says when it was written, by its speed
-`base + slope * t` m/s. Says of each in the end when it was written and when its first put was over:
-a process that floods a machine is itself held up between the two, and between two commands."""
+"""Sends one zero, then commands as fast as one process can.
+
+Each command encodes the time it was written as its speed, `base + slope * t` m/s. At the end it
+prints when each command was written and when its first put returned. A process that floods a
+machine is itself delayed between these two, and between two commands.
+"""
 
 HOARDER = (
     _OPEN.replace(
@@ -206,7 +212,7 @@ print("listening", flush=True)
 time.sleep(600)
 """
 )
-"""Subscribes to everything and promises to live for ten minutes, to be stopped with SIGSTOP."""
+"""Subscribes to everything and announces a lifetime of ten minutes, until SIGSTOP."""
 
 ROUTER = """\
 import json, signal, sys, time
@@ -222,11 +228,11 @@ time.sleep(600)
 """A Zenoh router at an address."""
 
 BUSY = "while True: pass"
-"""Uses up a core."""
+"""Keeps a core busy."""
 
 
 def words(program: str, *arguments: object) -> list[str]:
-    """The words that run such a program."""
+    """Return the words that run such a program."""
     return [sys.executable, "-c", program, *map(str, arguments)]
 
 
@@ -312,6 +318,9 @@ print("declared", flush=True)
 time.sleep(max(0.0, end - time.monotonic()))
 os._exit(0)
 """
-"""Somebody who is let in with some certificate: key expressions that take long to compare, many
-that take long to forget (`many@1500`: so many), what he may do without end, or all the sessions
-there are; goes after so many seconds."""
+"""A client that is admitted with some certificate and attacks.
+
+It uses key expressions that are slow to compare, many that are slow to remove (`many@1500` for 1500
+of them), endless permitted actions, or all available sessions. It leaves after the given number of
+seconds.
+"""

@@ -1,8 +1,8 @@
-"""Who may do what on the bus: every identity, verb and key against the table of SAFETY section 3.
+"""Every identity, verb and key has exactly the permissions in the table of SAFETY section 3.
 
-What counts is the effect. A put or delete counts when the robot obeys it or others take it for the
-robot's; a query when an answer comes; a subscription when a sample comes. What must not happen is
-never waited for: behind each attempt goes something that is answered.
+The tests judge effects. A put or delete counts if the robot obeys it, or if others take it for the
+robot's own message. A query counts if an answer comes, and a subscription if a sample comes. No
+test waits to see a forbidden effect stay away: a request that is answered follows each attempt.
 """
 
 from __future__ import annotations
@@ -59,29 +59,29 @@ CDR_TWIST, CDR_STAMPED = ros.twist(0.0), ros.stamped(0.0, age=None)
 
 
 def _cdr_wheels() -> bytes:
-    """Stamped, so made anew for each."""
+    """Return joint speeds in CDR. They are stamped, so each use needs new ones."""
     return ros.joints(0.0)
 
 
 class Try(NamedTuple):
-    """One row of the matrix: a key (expression), and who may."""
+    """One row of the matrix: a key (expression) and the identities that may use it."""
 
     key: str
     who: Who
     payload: bytes | Callable[[], bytes] = b""
     how: Literal["plain", "late", "token"] = "plain"
-    """How to subscribe: as anybody, as one who wants what was before, or to liveliness tokens."""
+    """How to subscribe: plainly, with history for late joiners, or to liveliness tokens."""
     stirred: bool = False
-    """Somebody has to send for there to be a sample."""
+    """Another client has to send for there to be a sample."""
 
     @property
     def data(self) -> bytes:
-        """What to put or to ask with."""
+        """The payload of the put or the query."""
         return self.payload if isinstance(self.payload, bytes) else self.payload()
 
     @property
     def label(self) -> str:
-        """What tells it from the other rows of its verb."""
+        """A name that is unique among the rows of its verb."""
         return self.key + ("" if self.how == "plain" else f" ({self.how})")
 
 
@@ -89,7 +89,7 @@ def _commands() -> Iterator[Try]:
     for source in SOURCES:
         for kind, payload in (("cmd", TWIST_JSON), ("wheel_cmd", WHEELS_JSON)):
             yield Try(f"{ME}/{kind}/{source}", HERE, payload)
-            # By TLS each certificate has keys of its own.
+            # Over TLS each certificate has keys of its own.
             for name in ("operator", "maintainer"):
                 yield Try(f"{ME}/{kind}/{source}/{name}", HERE | {name}, payload)
             yield Try(f"{ME}/{kind}/{source}/viewer", HERE, payload)
@@ -100,7 +100,7 @@ def _commands() -> Iterator[Try]:
     yield from (Try(f"{ME}/wheel_cmd/{key}", NOBODY, WHEELS_JSON) for key in ("ghost", "*", "**"))
     wild = ("*", "**", "*/app", "sto$*", "stop/**")
     yield from (Try(f"{ME}/{key}", NOBODY, TWIST_JSON) for key in wild)
-    # Who is at the machine may stop all robots at once; over TLS only exact keys pass.
+    # A client on the robot's machine may stop all robots at once. Over TLS only exact keys pass.
     yield Try("acsard/*/stop", HERE)
     wilder = ("acsard/*/cmd/app", "acsard/**", "**/stop", "**")
     yield from (Try(key, NOBODY, TWIST_JSON) for key in wilder)
@@ -135,7 +135,7 @@ def _ros_commands() -> Iterator[Try]:
 def _questions() -> Iterator[Try]:
     asked = (*VALUES, "info", "topics", "interfaces", "schema/Twist")
     yield from (Try(f"{ME}/{key}", ANYBODY) for key in asked)
-    # By wildcard at the machine only.
+    # Wildcards are allowed only on the robot's machine.
     yield from (Try(f"{key}/@adv/**", HERE) for key in (f"{ME}/tf_static", "tf_static", RMW_STATIC))
     yield Try(f"{ME}/config", KEEPERS)
     for role, who in (("viewer", ANYBODY), ("operator", DRIVERS), ("maintainer", KEEPERS)):
@@ -144,7 +144,7 @@ def _questions() -> Iterator[Try]:
     yield from (Try(f"{ME}/{key}", HERE) for key in ("*", "**", "schema/*", "stat$*"))
     services = ("srv/*", "srv/**", "srv/sto$*", "srv/ghost", "cmd/app")
     yield from (Try(f"{ME}/{key}", NOBODY) for key in services)
-    # The plain keys answer wildcards, so that nothing is answered twice.
+    # The plain keys answer wildcards, so that no client gets an answer twice.
     yield from (Try(f"{ME}/{key}", NOBODY) for key in ("json/*", "json/**"))
     wilder = ("acsard/*/state", "acsard/*/srv/stop", "acsard/**", "**")
     yield from (Try(key, NOBODY) for key in wilder)
@@ -181,7 +181,7 @@ def _subscriptions() -> Iterator[Try]:
     tokens = ("acsard/*/alive", "@ros2_lv/**", "@ros2_lv/0/**", "@/*/@ros2_lv/**")
     yield from (Try(key, HERE, how="token") for key in tokens)
     yield from (Try(key, NOBODY, how="token") for key in ("**", f"{OTHER}/alive"))
-    # At the machine any wildcard will do: what is published there is no secret there.
+    # On the robot's machine any wildcard is allowed: published data is no secret there.
     wild = (f"{ME}/*", f"{ME}/**", f"{ME}/json/*", "acsard/*/odom", "acsard/**", "**", "*", "0/**",
             "0/odom/**")  # fmt: skip
     yield from (Try(key, HERE) for key in wild)
@@ -203,11 +203,11 @@ ROWS: dict[Verb, tuple[Try, ...]] = {
 Outcome = dict[str, bool]
 
 
-# the robot and those who try
+# the robot and the clients that try to use it
 
 
 class Robot:
-    """A daemon with a plain and a TLS endpoint, somebody at the machine, and a witness."""
+    """A daemon with a plain and a TLS endpoint, a local client, and a witness on the bus."""
 
     def __init__(self, where: Path) -> None:
         self.certificates = Certificates(where)
@@ -237,7 +237,7 @@ class Robot:
             self._fooled.set()
 
     def fooled(self) -> bool:
-        """Whether the witness has since heard something that the robot did not say."""
+        """Return whether the witness has since received a message that the robot did not send."""
         self.witness.ask("info")
         was = self._fooled.is_set()
         self._fooled.clear()
@@ -247,7 +247,10 @@ class Robot:
         return self.certificates.config(who, self.plain, self.tls)
 
     def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
-        """Whether it becomes true within so many control periods, which is long on one machine."""
+        """Return whether `look` becomes true within this number of control periods.
+
+        Periods are long compared with a delivery on one machine.
+        """
         begun = self.here.count("lines_sent")
         while not (found := look()):
             if self.here.count("lines_sent") >= begun + steps:
@@ -255,22 +258,22 @@ class Robot:
         return found
 
     def settled(self) -> None:
-        """Some control periods later: whatever was sent before is long there."""
+        """Wait some control periods, until every message sent before has long arrived."""
         self.comes(lambda: False)
 
     def switched(self) -> None:
-        """Off and on, which are events."""
+        """Switch the robot off and on, which produces events."""
         assert self.here.get("srv/deactivate")["success"]
         assert self.here.get("srv/activate")["success"]
 
     def restored(self) -> None:
-        """Released and switched on."""
+        """Release the robot and switch it on."""
         if self.here.state()["mode"] == "stopped":
             assert self.here.get("srv/clear")["success"]
         assert self.here.get("srv/activate")["success"]
 
     def outcome(self, who: Identity, verb: Verb) -> Outcome:
-        """What became of every attempt."""
+        """Return the result of every attempt."""
         if (who, verb) not in self._outcomes:
             self._outcomes[who, verb] = self._tried(who, verb)
         return self._outcomes[who, verb]
@@ -290,14 +293,15 @@ class Robot:
                 self.restored()
                 return found
             attempt = one.followed if verb == "subscribe" else partial(one.sent, verb)
-            # All that should do nothing at once, and one by one only when something happened.
+            # Try all rows that should have no effect at once, and one by one only if something
+            # happened.
             idle = [row for row in rows if who not in row.who]
             quiet = idle if idle and not attempt(idle) else []
             return {row.label: row not in quiet and attempt([row]) for row in rows}
 
 
 class Visitor:
-    """One session at the robot, by whomever."""
+    """One session of some identity at the robot."""
 
     def __init__(self, robot: Robot, who: Identity) -> None:
         self._robot, self._who, self._sequence = robot, who, 0
@@ -316,21 +320,24 @@ class Visitor:
         return ros.Attached(self._sequence, time.time_ns(), bytes(range(16))).pack()
 
     def _behind(self) -> None:
-        """All that this session has sent is there. On one link all is in order."""
+        """Wait until all messages of this session have arrived: one link keeps them in order."""
         if self._who in ADMITTED:
             assert list(self._session.get(f"{ME}/info", timeout=5.0))
         else:
             self._robot.settled()
 
     def _patience(self, rows: Sequence[Try]) -> int:
-        """Control periods to wait for: what should come is given the time a busy machine takes."""
+        """Return the control periods to wait.
+
+        An expected effect gets the time that a busy machine takes.
+        """
         if not all(self._who in row.who for row in rows):
             return 5
-        # What was before is said again every 5 s, for those who cannot ask for it.
+        # Last values are sent again every 5 s, for clients that cannot ask for them.
         return 700 if any(row.how == "late" for row in rows) else 200
 
     def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
-        """Whether any of these puts or deletes had an effect."""
+        """Return whether any of these puts or deletes had an effect."""
         here = self._robot.here
         before = _heard(here.state())
         for row in rows:
@@ -351,7 +358,7 @@ class Visitor:
         return done
 
     def asked(self, rows: Sequence[Try]) -> Outcome:
-        """Which questions got an answer."""
+        """Return the queries that got an answer."""
         waiting = {}
         for row in rows:
             answers: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(64)
@@ -371,7 +378,7 @@ class Visitor:
             try:
                 reply = waiting[label].try_recv()
             except zenoh.ZError:
-                return True  # all answers are in
+                return True  # all answers have arrived
             found[label] = found[label] or (reply is not None and reply.ok is not None)
             return found[label]
 
@@ -383,13 +390,14 @@ class Visitor:
         return found
 
     def followed(self, rows: Sequence[Try]) -> bool:
-        """Whether any of these subscriptions brought anything."""
+        """Return whether any of these subscriptions received a sample."""
         came = threading.Event()
 
         def on_sample(sample: zenoh.Sample) -> None:
             came.set()
 
-        # On a session of its own: within one, every subscription gets what any of them asked for.
+        # Use a session of its own: within one session, every subscription gets the samples that any
+        # of them requested.
         with zenoh.open(self._robot.config(self._who)) as session:
             subscribers = [_subscribed(session, row, on_sample) for row in rows]
             if self._who in ADMITTED:
@@ -409,7 +417,10 @@ class Visitor:
 
 
 def _heard(state: Any) -> int:
-    """Commands that came as far as the arbiter: a new sender's do not count at once."""
+    """Return the number of commands that reached the arbiter.
+
+    A new sender's commands do not count at once.
+    """
     counters = state["counters"]
     return sum(counters.get(name, 0) for name in ("commands", "commands_first_contact"))
 

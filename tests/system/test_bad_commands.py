@@ -1,4 +1,4 @@
-"""Whatever is sent, over the real bus: refused whole, counted, said in words, and no motion."""
+"""Every bad command on the real bus is refused whole, counted and logged, and moves nothing."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ALL_JOINTS = [*JOINTS, "rear_right_wheel_joint"]
 
 
 class Bad(NamedTuple):
-    """What is put where, the reason it is counted under, and a word of what is said."""
+    """A payload, its key, the counter of its refusal, and a word of the logged reason."""
 
     payload: bytes
     reason: str
@@ -52,7 +52,7 @@ def pack(value: object) -> bytes:
 
 
 def stamped(seconds: float) -> bytes:
-    """A go that claims to be so old."""
+    """Return a speed that claims to be this old."""
     sec, nanosec = divmod(int((time.time() - seconds) * 1e9), 10**9)
     stamp = {"sec": sec, "nanosec": nanosec}
     return json.dumps({"header": {"stamp": stamp}, "twist": twist(0.5)}).encode()
@@ -127,8 +127,8 @@ BAD = {
 
 
 def refused_without_motion(bus: Bus, send: Callable[[], None], reason: str, said: str) -> None:
-    """`send` is counted once more under `reason`, told with `said`, and moves nothing."""
-    # The source may drive: had the bad command been taken, it would.
+    """Check that `send` counts once under `reason`, is logged with `said`, and moves nothing."""
+    # The source may drive: if the bad command were accepted, the robot would move.
     heard = bus.count("commands")
     bus.put("cmd/app", ZERO)
     until(lambda: bus.count("commands") > heard, 5.0, "the zero was heard")
@@ -194,12 +194,13 @@ def test_a_delete_on_every_source_is_no_command(bus: Bus) -> None:
 
 
 def test_wheel_speeds_without_end_are_held_to_the_limits(bus: Bus) -> None:
-    # Finite, so not refused: clamped. 1e308 on every wheel must not become NaN on the way.
+    # The value is finite, so it is clamped instead of refused. 1e308 on every wheel must not become
+    # NaN on the way.
     with bus.follow("cmd_vel_out") as applied:
         bus.at_rest()
         heard = bus.count("commands")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [0.0] * 4})
-        # What a test before sent may come in behind it.
+        # A message of an earlier test may still arrive after this point.
         until(lambda: bus.count("commands") >= heard + 1, 5.0, "the zero was heard")
         bus.put("wheel_cmd/app", {"name": ALL_JOINTS, "velocity": [1e300, 1e300, -1e300, -1e300]})
         until(lambda: bus.count("commands") >= heard + 2, 5.0, "so was this")
@@ -242,7 +243,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
             driving = states.find(
                 lambda state: state["linear"] == pytest.approx(0.2, abs=0.01), 3.0, "0.2 m/s"
             )
-            # Most of the flood first, then the stop in the middle of it.
+            # Send most of the flood first, then the stop in the middle of it.
             states.find(lambda _: True, 3.0, "1.5 s of flood", after=begun + 1.5)
             sent = time.monotonic()
             bus.session.put("acsard/acsar/stop", b"")
@@ -271,7 +272,7 @@ def test_a_flood_costs_no_periods_and_no_memory_and_a_stop_still_latches_at_once
     assert "Traceback" not in daemon.stderr
 
 
-# the same by ROS
+# the same commands over ROS
 
 
 SESSION = """\
@@ -298,7 +299,8 @@ print("flooded", count, flush=True)
 session.close()
 """
 )
-"""One payload on a key as fast as one process can for `seconds`, as a node or a bridge sends it."""
+"""Sends one payload on a key as fast as one process can for `seconds`, as a node or a bridge does.
+"""
 
 SLOW_WORK = (
     SESSION
@@ -317,19 +319,19 @@ print("flooded", count, called, flush=True)
 session.close()
 """
 )
-"""The same, and 1000 calls of a service in the first half of the time."""
+"""The same flood, with 1000 calls of a service in the first half of the time."""
 
 HALF = b"\0\1\0\0"
 
 EMPTY_JOINTS = HALF + struct.pack("<iIIB3xI", 0, 0, 1, 0, 1017)
 EMPTY_JOINTS += bytes(4096 - len(EMPTY_JOINTS))
 EMPTY_NAMES = HALF + struct.pack("<I", 1022) + bytes(4088)
-"""4096 bytes that are as many names without a letter as there is room for."""
+"""4096 bytes with as many names without a letter as fit."""
 
 
 @pytest.fixture(scope="module")
 def flooded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A daemon of its own for those who flood by ROS."""
+    """A separate daemon for the ROS floods."""
     with Daemon(tmp_path_factory.mktemp("flooded")) as daemon:
         yield daemon
 
@@ -350,7 +352,7 @@ def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
             count = int(flood.says("flooded").split()[1])
             assert flood.ended(5.0) == 0
             lasted = time.monotonic() - begun
-        # A tenth of a second of silence: what was under way is through.
+        # Wait for a tenth of a second of silence. All messages under way have then arrived.
         lines = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") >= lines + 10, 3.0, "ten more lines")
         after = bus.state()
@@ -362,7 +364,7 @@ def test_a_flood_by_ros_is_held_to_a_thousand_commands_a_second_as_any_other(
     print(f"flood of {count} puts in {lasted:.2f} s by {way}: {taken} taken, overrun {overrun}")
     assert count > 5000
     assert taken > 100
-    # Without the limit what is too much is overrun, or comes in all the same.
+    # Without the limit, the excess would be overrun, or would still be accepted.
     assert taken + overrun + counted("command_stale") <= 1100 * lasted
 
 

@@ -1,4 +1,4 @@
-"""`acsard bench` on the simulator, and on a port that is not ours."""
+"""`acsard bench` on the simulator, and on the port of an independent peer."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ auto_activate = false
 def test_it_measures_the_simulator_and_moves_nothing_on_a_real_port(
     tmp_path: Path, peer: Peer
 ) -> None:
-    """Both at once: they share nothing. What the simulator does not need, it leaves out."""
+    """Run both at once, since they share nothing."""
     (tmp_path / "acsard.toml").write_text(CHECKED)
     (tmp_path / "real").mkdir()
     words = acsard("bench", "--seconds", "3", "--json")
@@ -64,7 +64,7 @@ def is_sane(result: dict[str, Any]) -> None:
     for name in ("command_to_wire", "feedback_to_odometry", "read_to_odometry"):
         figure = result["outside"][name]
         assert 0 < figure["p50"] <= figure["p99"] <= figure["max"]
-    # Nothing arrives before it was sent, and no median takes longer than a period.
+    # No line arrives before it was sent, and no median takes longer than a period.
     assert result["outside"]["command_to_wire"]["p50"] < 10_000
     assert result["lines_sent"] > 200
     assert result["missed_periods"] < result["lines_sent"]

@@ -64,14 +64,14 @@ FIELDS = {
 
 
 class Late(Following):
-    """Somebody who subscribed to `tf_static` late and plainly, and since when."""
+    """A plain client that subscribed to `tf_static` late, and when it did."""
 
     since = 0.0
 
 
 @pytest.fixture(scope="module", autouse=True)
 def late(shared: Daemon) -> Iterator[Late]:
-    """Subscribed while all the other tests run: what it waits for is sent every 5 s only."""
+    """Subscribe while all the other tests run, because its message is sent only every 5 s."""
     with Bus(shared.endpoint) as bus:
         bus.linked()  # the first tf_static, sent at the start, is gone by then
         late = Late()
@@ -83,7 +83,7 @@ def late(shared: Daemon) -> Iterator[Late]:
 
 @contextmanager
 def restored(bus: Bus) -> Iterator[None]:
-    """Leaves the shared robot at rest, ready and at the origin."""
+    """Leave the shared robot at rest, ready and at the origin."""
     try:
         yield
     finally:
@@ -135,7 +135,7 @@ def test_a_last_value_is_the_present_one(bus: Bus) -> None:
     )
 
 
-# what it says of itself
+# the daemon's information about itself
 
 
 def test_info_says_who_the_daemon_is(bus: Bus, shared: Daemon) -> None:
@@ -223,7 +223,7 @@ def test_a_get_by_wildcard_never_runs_a_service(bus: Bus, pattern: str, latched:
     else:
         assert answered == set()
     assert not {key for key in answered if key.startswith("srv/")}
-    # An answer that never ends would cost the client its whole timeout of 5 s.
+    # If the answers never ended, the client would lose its whole timeout of 5 s.
     assert took < 2.0
 
 
@@ -249,7 +249,7 @@ def test_deactivate_and_activate_by_their_exact_keys(bus: Bus) -> None:
         assert bus.state()["mode"] == "inactive"
         assert "srv/activate" in bus.state()["reason"]
         assert bus.get("srv/activate")["success"]
-        # Never "waiting", which says that there is no link, while it is up.
+        # While the link is up the state is never "waiting", which means that there is no link.
         bus.comes_to("ready")
 
 
@@ -338,7 +338,7 @@ def test_a_put_of_anything_on_stop_latches(bus: Bus, payload: bytes) -> None:
 def test_a_delete_on_stop_is_counted_as_not_a_put_and_latches_nothing(bus: Bus) -> None:
     refused, before = bus.count("command_not_a_put"), bus.count("commands")
     bus.session.delete("acsard/acsar/stop")
-    # A command that follows on the same link has been taken when it is counted.
+    # A command that follows on the same link has been accepted when it is counted.
     bus.put("cmd/app", twist(0.0))
     until(lambda: bus.count("commands") > before, 5.0, "the command behind it")
     state = bus.state()
@@ -359,7 +359,7 @@ def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
             flood.says("deleting")
             took = []
             for _ in range(10):
-                # More come than are held, before the stop and behind it.
+                # More messages come than the inbox holds, before the stop and after it.
                 pushed = overrun()
                 until(lambda: overrun() > pushed, 5.0, "DELETEs are pushed out before")  # noqa: B023
                 assert bus.state()["mode"] != "stopped"
@@ -381,13 +381,13 @@ def test_a_flood_of_deletes_on_stop_around_a_put_pushes_no_stop_out(
     assert max(took) < 0.2
 
 
-# what is published
+# the publications
 
 
 def test_every_published_key_names_its_encoding(bus: Bus) -> None:
     for key, type_name in PUBLISHED.items():
         if key == "tf_static":
-            continue  # sent every 5 s: below, when it comes
+            continue  # sent every 5 s: checked below, when it arrives
         with bus.follow(key) as messages:
             if key == "events":
                 bus.get("srv/reset_odometry")
@@ -411,7 +411,7 @@ def test_events_tell_what_happened_when_and_by_whom_and_how_many_there_were(bus:
     before = bus.get("events")
     with bus.follow("events") as messages:
         bus.get("srv/reset_odometry")
-        # What other tests here sent may be told at any moment.
+        # Messages of other tests here may be reported at any moment.
         seen = messages.find(
             lambda one: (
                 one["total"] > before["total"] and one["events"][-1]["name"] == "reset_odometry"
@@ -421,7 +421,7 @@ def test_events_tell_what_happened_when_and_by_whom_and_how_many_there_were(bus:
         )
     last = seen.value["events"][-1]
     assert last["level"] == "info"
-    assert last["count"] >= 1  # what others here did in the same second counts with it
+    assert last["count"] >= 1  # actions of other tests in the same second are counted with it
     assert "x 0, y 0" in last["text"]
     assert last["by"]
     assert seconds(last["stamp"]) == seconds(seen.value["stamp"]) >= seconds(before["stamp"])
@@ -463,14 +463,16 @@ def test_odometry_comes_a_hundred_times_a_second_and_state_ten_times(bus: Bus) -
         f"{counts[1] / spans[1]:.2f} Hz; the machine took {machine_s:.3f} s"
     )
     assert stamps == sorted(set(stamps))
-    # A state goes out at once when it has changed, as a link may on a machine that stands still.
+    # The daemon publishes a state at once when it has changed. On a machine that stands still the
+    # link may change.
     if any(state["link"] != "up" for state in told):
         return  # the kernel's thread that carries bytes through the simulator's pty had no core
     for heard, more, span, rate, near in zip(
         counts, (0, changes), spans, (100.0, 10.0), (0.03, 0.1), strict=True
     ):
         least = (1 - near) * span - machine_s
-        # What the machine held back at the beginning has a late stamp, and the span is short.
+        # Messages that the machine delayed at the beginning have a late stamp, so the span is
+        # short.
         assert least * rate <= heard <= (1 + near) * (span + machine_s) * rate + more
 
 
@@ -487,7 +489,7 @@ def test_odom_tf_and_wheel_states_of_one_sample_carry_one_stamp(bus: Bus) -> Non
             stamps(tf, lambda value: value["transforms"][0]["header"]),
             stamps(wheels, lambda value: value["header"]),
         ]
-    # They began and ended to be heard one after the other; in between they are the same.
+    # The subscriptions began and ended one after the other. In between the streams are the same.
     first, last = max(map(min, found)), min(map(max, found))
     between = [{stamp for stamp in one if first <= stamp <= last} for one in found]
     assert len(between[0]) > 20
@@ -512,7 +514,7 @@ def test_a_late_advanced_subscriber_gets_tf_static_at_once(bus: Bus) -> None:
     seen = following.find(lambda _: True, 3.0, "the latched transform")
     subscriber.undeclare()
     print(f"tf_static by history: {seen.at - asked:.3f} s")
-    # Well under the 5 s after which it would be sent again anyway.
+    # This is well under the 5 s after which it would be sent again anyway.
     assert seen.at - asked < 1.0 + lost(asked, seen.at)
     assert seen.value["transforms"][0]["child_frame_id"] == "lidar_link"
 
@@ -575,7 +577,8 @@ def test_more_queries_than_are_held_are_answered_or_told_to_ask_again(bus: Bus) 
 
 @pytest.mark.slow
 def test_a_stop_query_behind_more_queries_than_are_held_stops(bus: Bus, shared: Daemon) -> None:
-    # A get on every key is dozens of queries. What is let go unanswered: `test_inbox.py`.
+    # A get on every key is dozens of queries. `test_inbox.py` covers queries that are dropped
+    # unanswered.
     unanswered = 0
     with restored(bus), Bus(shared.endpoint) as crowd, bus.follow("state") as states:
         for _ in range(3):
@@ -584,7 +587,7 @@ def test_a_stop_query_behind_more_queries_than_are_held_stops(bus: Bus, shared: 
             unanswered += not list(crowd.session.get("acsard/acsar/srv/stop", timeout=5.0))
             states.find(lambda state: state["mode"] == "stopped", 2.0, "stopped", after=asked)
             for one in open_ones:
-                list(one)  # to the end, so that the next round begins anew
+                list(one)  # read to the end, so that the next round starts afresh
             assert bus.get("srv/clear")["success"]
     print(f"{unanswered} of 3 stops came with 512 queries open; all of them stopped")
 
@@ -599,7 +602,7 @@ def test_two_clients_hear_the_same_odometry(bus: Bus, shared: Daemon) -> None:
         subscriber.undeclare()
 
 
-# at the end: what was waited for all along
+# at the end: the message for which `late` has waited all along
 
 
 def test_a_late_plain_subscriber_gets_tf_static_within_6_s(late: Late) -> None:

@@ -60,7 +60,7 @@ def free() -> str:
 
 @contextmanager
 def router(endpoint: str) -> Iterator[zenoh.Session]:
-    """Somebody else's router, who has positions."""
+    """Run a separate router on the bus, which has positions."""
     config = zenoh.Config()
     config.insert_json5("mode", '"router"')
     config.insert_json5("listen/endpoints", json.dumps([endpoint]))
@@ -75,7 +75,7 @@ RIDES_S = 120.0
 
 @contextmanager
 def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """`acsard calibrate` at a terminal of its own; what it finds goes into a pipe."""
+    """Run `acsard calibrate` at a terminal of its own, with its results in a pipe."""
     given = ["calibrate", "--config", str(daemon.config), *words]
     with (
         Terminal() as terminal,
@@ -92,7 +92,7 @@ def calibrating(daemon: Daemon, *words: str) -> Iterator[tuple[Terminal, Program
 
 
 def asks(terminal: Terminal, program: Program, words: str, times: int, within: float) -> None:
-    """The screen has those words so often; a program that has ended has not."""
+    """Wait until the screen shows those words this often; fails if the program has ended."""
 
     def look() -> bool:
         assert program.process.poll() is None, terminal.screen
@@ -102,7 +102,7 @@ def asks(terminal: Terminal, program: Program, words: str, times: int, within: f
 
 
 def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
-    """The first leg moves."""
+    """Wait until the first leg moves."""
     asks(terminal, program, STARTS, 1, 10.0)
     terminal.press("\n")
 
@@ -115,13 +115,13 @@ def begun(terminal: Terminal, program: Program, bus: Bus) -> None:
 
 
 TRIES = 3
-"""Of a drive of a minute, which ends where the machine stands still for a moment."""
+"""Attempts at a drive of a minute. A drive ends if the machine stands still for a moment."""
 
 T = TypeVar("T")
 
 
 def tried(bus: Bus, drive: Callable[[], T]) -> T:
-    """What the drive finds; begun anew where the machine did not run in it."""
+    """Return the result of the drive. Repeats it if the machine did not run during it."""
     for left in reversed(range(TRIES)):
         try:
             return drive()
@@ -136,7 +136,7 @@ def tried(bus: Bus, drive: Callable[[], T]) -> T:
 
 
 def found_with_a_gyro(daemon: Daemon, bus: Bus) -> dict[str, Any]:
-    """From the first question to what is written."""
+    """Return the results of a whole calibration, from the first question to the written file."""
     begins = bus.get("sim/pose")["pose"]["position"]
     with calibrating(daemon, "--write", "--json") as (terminal, program):
         asks(terminal, program, STARTS, 1, 10.0)
@@ -170,12 +170,12 @@ def test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file(tmp_p
 
 
 LINE_M, LENGTH_M, WIDTH_M = 0.45, 0.25, 0.30
-"""m from where the robot's middle begins to the line on its left, between its wheels, and its
-width."""
+"""m from the robot's middle at the start to the line on its left, its wheelbase, its width.
+"""
 
 
 def measured(bus: Bus, words: str) -> str:
-    """What a person reads off who sees where the robot truly is; mm, and m for the long one."""
+    """Return a person's reading of the robot's true position, mm, or m for the long distance."""
     pose = bus.get("sim/pose")["pose"]
     where, turn = pose["position"], pose["orientation"]
     yaw = 2 * math.atan2(turn["z"], turn["w"])
@@ -192,12 +192,12 @@ ENDED = "ended"
 
 
 def shown(terminal: Terminal) -> str:
-    """All of the screen, whatever its lines."""
+    """Return the whole screen as one line."""
     return " ".join(terminal.screen.split())
 
 
 def question(terminal: Terminal, program: Program, seen: int) -> str | None:
-    """What is asked behind what has been seen; `ENDED` when nothing will be any more."""
+    """Return the question after the text seen so far. `ENDED` means that no more will come."""
     words = shown(terminal)[seen:]
     if words.endswith((" mm:", " m:", " deg:", "q leaves.")):
         return words
@@ -205,7 +205,7 @@ def question(terminal: Terminal, program: Program, seen: int) -> str | None:
 
 
 def once_round(bus: Bus) -> None:
-    """It has turned to the left until it looks as before."""
+    """Wait until the robot has turned to the left and looks as before."""
 
     def yaw() -> float:
         turn = bus.get("sim/pose")["pose"]["orientation"]
@@ -216,11 +216,11 @@ def once_round(bus: Bus) -> None:
 
 
 Reads = Callable[[str], str]
-"""What a person types who is asked this."""
+"""The reply that a person types to this question."""
 
 
 def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
-    """Every leg and question of a way to the written file; what was printed then."""
+    """Go through every leg and question of a way to the written file; return the output."""
     with calibrating(daemon, "--way", way, "--write") as (terminal, program):
         seen = 0
         while program.process.poll() is None:
@@ -254,8 +254,10 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
 
 
 class Beside:
-    """A person who sets the robot where a leg asks for it, and reads off how it stands from there:
-    nothing moves the simulated robot, so there is where it is."""
+    """A person who sets the robot where a leg asks for it, and reads off how it stands from there.
+
+    Nothing moves the simulated robot, so that place is its current position.
+    """
 
     def __init__(self, bus: Bus) -> None:
         self._bus, self._player = bus, Player(Robot(rng=np.random.default_rng(1)))
@@ -279,7 +281,7 @@ class Beside:
 
 
 SETS = ("Push", "Set", "Mark")
-"""Words of legs before which the robot is set by hand."""
+"""Words of legs before which a person sets the robot by hand."""
 
 
 @pytest.mark.soak
@@ -288,7 +290,7 @@ SETS = ("Push", "Set", "Mark")
 def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
     tmp_path: Path, way: str
 ) -> None:
-    config = SKIDDING | {"control": {"rate": 10.0}}  # a link that a busy machine keeps up
+    config = SKIDDING | {"control": {"rate": 10.0}}  # the link, which a busy machine may interrupt
     with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         said = tried(bus, lambda: goes_through(daemon, bus, way, Beside(bus).reads))
@@ -313,7 +315,7 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
             bus.at_rest()
             took = time.monotonic() - pressed
             print(f"space -> at rest: {took:.2f} s")
-            # 0.3 m/s at 1 m/s2, and some of the way.
+            # 0.3 m/s at 1 m/s2, and a part of the way.
             assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
             assert program.ended(5.0) == 1
             assert "a key was pressed" in terminal.screen

@@ -1,4 +1,4 @@
-"""The tools at the shell: what they print, where, and the code they end with."""
+"""The tools at the shell: their output, its stream, and their exit code."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.system.harness import (
 from tests.system.typed import typed
 
 WAITS = "waiting for a command"
-"""What a robot says that nobody drives."""
+"""The reason in `state` while no client drives the robot."""
 
 VERBS = (
     "run",
@@ -63,7 +63,7 @@ VERBS = (
 
 
 def tool(shared: Daemon, *words: str) -> Finished:
-    """A tool that knows where the shared daemon is, run to its end."""
+    """Run a tool, with the address of the shared daemon, to its end."""
     return typed(*words, "--config", str(shared.config))
 
 
@@ -304,7 +304,8 @@ def test_hz_measures_a_hundred_per_second(shared: Daemon, bus: Bus) -> None:
     print(f"hz odom: {lines[-1]}")
     assert len(lines) == 2
     assert lines[1]["count"] > lines[0]["count"]
-    # Measured over a second; what comes late at one end may have come at the other.
+    # Measured over a second. A message that comes late at one end may also have come late at the
+    # other.
     assert lines[1]["hz"] == pytest.approx(100.0, abs=3.0 + 100.0 * late)
 
 
@@ -349,7 +350,7 @@ def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str,
     assert "acsard fleet" in ended.err
 
 
-# words that nothing is called
+# names that do not exist
 
 
 @pytest.mark.variations(3)
@@ -497,7 +498,7 @@ def test_a_simulator_of_its_own_is_driven_through_the_printed_port(tmp_path: Pat
                 begun = time.monotonic()
                 robot.drive(0.5, seconds=0.6)
                 until(lambda: robot.get("state").linear == 0.0, 3.0, "at rest")
-                # What comes late is driven on for: 0.5 m/s.
+                # If a message comes late, the robot drives on meanwhile: 0.5 m/s.
                 assert robot.pose().x == pytest.approx(0.3, abs=0.05 + 0.5 * lost(begun))
         sim.signal(signal.SIGTERM)
         assert sim.ended(2.0) == 0
@@ -567,7 +568,7 @@ fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 words = ["bash", "--norc", "-ic", '"$@"; true', "bash", sys.executable, "-m", "acsard"]
 os.execvp("bash", [*words, *sys.argv[1:]])
 """
-"""The same, as a job of a shell."""
+"""The same program, as a job of a shell."""
 
 
 WITHOUT_RICH = """\
@@ -577,11 +578,11 @@ sys.modules["rich"] = None
 sys.argv[0] = "acsard"
 runpy.run_module("acsard", run_name="__main__")
 """
-"""The same, where the library of the screens is not installed."""
+"""The same program, without the library of the screens."""
 
 
 class Terminal:
-    """A person at a terminal: presses keys, reads the screen."""
+    """A person at a terminal: presses keys and reads the screen."""
 
     def __init__(self) -> None:
         self.screen = ""
@@ -599,7 +600,7 @@ class Terminal:
             self.close()
 
     def close(self) -> None:
-        """The window is closed."""
+        """Close the window."""
         self._open = False
         self._leave.set()
         self._reader.join()
@@ -621,7 +622,7 @@ class Terminal:
 
 @contextmanager
 def held(terminal: Terminal, key: str) -> Iterator[None]:
-    """A key held down: its repeats come 20 times a second until it is let go."""
+    """Hold a key down: it repeats 20 times a second until it is released."""
     released = threading.Event()
 
     def repeat() -> None:
@@ -639,7 +640,7 @@ def held(terminal: Terminal, key: str) -> Iterator[None]:
 
 @contextmanager
 def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """`acsard drive` at a terminal of its own, showing the robot."""
+    """Run `acsard drive` at a terminal of its own until it shows the robot."""
     with Terminal() as terminal:
         drive = ["drive", "--config", str(shared.config), *words]
         command = [sys.executable, "-c", ON_TERMINAL, *drive]
@@ -663,7 +664,7 @@ def teleop(shared: Daemon, *words: str) -> Iterator[tuple[Terminal, Program]]:
 def at_terminal(
     daemon: Daemon, verb: str, term: str, columns: int = 80, how: str = ON_TERMINAL
 ) -> Iterator[tuple[Terminal, Program]]:
-    """A verb at a terminal of its own, of that kind and width and 24 lines."""
+    """Run a verb at a terminal of its own, of that kind and width, with 24 lines."""
     with Terminal() as terminal:
         size = struct.pack("HHHH", 24, columns, 0, 0)
         fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, size)
@@ -686,14 +687,14 @@ def at_terminal(
 def without_a_screen(
     shared: Daemon, how: str = ON_TERMINAL, columns: int = 80
 ) -> Iterator[tuple[Terminal, Program]]:
-    """`acsard drive` at a terminal that can have no screen."""
+    """Run `acsard drive` at a terminal that cannot show a screen."""
     with at_terminal(shared, "drive", "dumb", columns, how) as (terminal, program):
         until(lambda: WAITS in terminal.screen, 10.0, "the robot's state")
         yield terminal, program
 
 
 def screens(terminal: Terminal) -> list[str]:
-    """All whole screens so far, without their colours."""
+    """Return all whole screens so far, without their colours."""
     frames = terminal.screen.split("\x1b[H")[1:-1]
     return [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", frame) for frame in frames]
 
@@ -702,7 +703,7 @@ def screens(terminal: Terminal) -> list[str]:
 def screened(
     shared: Daemon, columns: int, how: str = ON_TERMINAL
 ) -> Iterator[tuple[Terminal, Program]]:
-    """`acsard drive` at a terminal of that width that can have a screen."""
+    """Run `acsard drive` at a terminal of that width that can show a screen."""
     with at_terminal(shared, "drive", "xterm-256color", columns, how) as (terminal, program):
         until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
         yield terminal, program
@@ -727,7 +728,7 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
     for text in ("READY", "no source has sent one within its timeout", "yaw", "rad/s", "u i o"):
         assert text in told
     assert all(len(line.rstrip()) <= columns for line in shown.split("\r\n"))
-    # Each screen is written over the one before: nothing scrolls.
+    # Each screen overwrites the one before: nothing scrolls.
     assert "\x1b[?1049h" in terminal.screen
     assert all(frame.count("\n") < 24 for frame in frames)
 
@@ -787,7 +788,8 @@ def test_the_last_word_without_a_screen_is_of_a_robot_that_stands(shared: Daemon
 def test_a_terminal_closed_under_a_shell_stops_its_drive_by_a_zero_not_by_silence(
     shared: Daemon, bus: Bus
 ) -> None:
-    # It hears that twice: by its keys, or by its shell, and once more while it says its zeros.
+    # The program gets the signal twice: from its keys or its shell, and once more while it sends
+    # its zeros.
     with (
         bus.follow("cmd/teleop") as commands,
         without_a_screen(shared, UNDER_A_SHELL) as (terminal, _),
@@ -809,7 +811,7 @@ def test_a_held_key_drives_and_letting_go_stops_by_itself(shared: Daemon, bus: B
         bus.at_rest()
         took = time.monotonic() - released
         print(f"key let go -> at rest: {took:.2f} s")
-        # 0.6 s of hold, 0.5 s of ramp, and some of the way.
+        # 0.6 s of hold, 0.5 s of ramp, and a part of the way.
         assert 0.6 < took < 1.5 + 0.3 + lost(released, released + took)
         assert program.process.poll() is None
 

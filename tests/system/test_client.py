@@ -51,7 +51,7 @@ DEFAULT = "tcp/127.0.0.1:7448"
 
 
 class Outcome(NamedTuple):
-    """How an example ended, the robot's state at rest afterwards, and what the machine took, s."""
+    """An example's exit, the robot's state at rest after it, and the time the machine took, s."""
 
     ended: Finished
     state: Any
@@ -59,19 +59,19 @@ class Outcome(NamedTuple):
 
 
 def code_blocks() -> list[str]:
-    """The README's Python, as printed."""
+    """Return the README's Python, as printed."""
     return re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.S | re.M)
 
 
 def kind(code: str) -> str:
-    """Which of the three examples this is."""
+    """Return the name of this one of the three examples."""
     if "connect_async" in code:
         return "async"
     return "five lines" if "acsard.client" in code else "plain zenoh"
 
 
 def default_is_free() -> bool:
-    """Nobody listens where an unconfigured daemon would."""
+    """Return whether the default endpoint of a daemon is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -82,7 +82,7 @@ def default_is_free() -> bool:
 
 
 def at_endpoint(code: str, endpoint: str) -> str:
-    """The example, where the daemon is not at the default endpoint."""
+    """Return the example with this daemon's endpoint instead of the default one."""
     if endpoint == DEFAULT:
         return code
     changed = re.sub(r"(connect|connect_async)\(\)", rf'\1("{endpoint}")', code)
@@ -91,7 +91,7 @@ def at_endpoint(code: str, endpoint: str) -> str:
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """All examples at the same time, each with a robot of its own: each takes two seconds."""
+    """Run all examples at the same time, each with a robot of its own: each takes two seconds."""
     where = tmp_path_factory.mktemp("examples")
     codes = {kind(code): code for code in code_blocks()}
     endpoints = {name: free_endpoint() for name in codes}
@@ -138,9 +138,9 @@ def test_the_five_lines_of_the_readme_drive_one_metre_and_print_the_pose(
     ended, state, late = examples["five lines"]
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith("Pose(x=")
-    # What comes late is driven on for: 0.5 m/s.
+    # If a message comes late, the robot drives on meanwhile: 0.5 m/s.
     assert state["x"] == pytest.approx(1.0, abs=0.03 + 0.5 * late)
-    # It prints where the robot came to a stand, not where it still rolled.
+    # The example prints where the robot came to a stand, not where it still rolled.
     printed = re.match(r"Pose\(x=([\d.]+),", ended.out)
     assert printed
     assert float(printed[1]) == pytest.approx(state["x"], abs=0.01)
@@ -169,7 +169,7 @@ def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_
     assert {odom["child_frame_id"] for odom in seen} == {"base_link"}
     first, last = (one["pose"]["pose"]["position"]["x"] for one in (seen[0], seen[-1]))
     assert first < 0.5 * state["x"] < last
-    # Its own sleeps add up to some more than 2 s.
+    # The example's own sleeps add up to a little more than 2 s.
     assert state["x"] == pytest.approx(1.03, abs=0.05 + 0.5 * late), state["counters"]
 
 
@@ -178,7 +178,7 @@ def test_the_plain_zenoh_example_of_the_readme_drives_one_metre_and_follows_the_
 
 @pytest.fixture
 def fresh(shared: Daemon, bus: Bus) -> Iterator[Bus]:
-    """The shared robot, at the origin and at rest, and left so."""
+    """Provide the shared robot at the origin and at rest, and leave it so."""
     bus.at_rest()
     bus.get("srv/reset_odometry")
     yield bus
@@ -223,7 +223,7 @@ def test_messages_of_tf_static_yields_the_latched_one_and_ends_after_silence(
         message = next(messages)
         assert message.transforms[0].child_frame_id == "lidar_link"
         assert time.monotonic() - start < 0.5 + lost(start)
-        # At most one more, if the one of every 5 s falls into that time.
+        # There is at most one more, if the message of every 5 s falls into that time.
         assert len(list(messages)) <= 1
         assert time.monotonic() - start < 2.0 + lost(start)
 
@@ -465,7 +465,7 @@ def test_a_reader_sleeps_between_messages(shared: Daemon, fresh: Bus) -> None:
             states = robot.messages("state", timeout=5.0)
             for _ in range(5):
                 next(states)
-    # Polled once a millisecond it would be hundreds for half a second of them.
+    # Polling once a millisecond would take hundreds of calls per half second.
     assert looks <= 20
 
 
@@ -502,7 +502,7 @@ def test_a_drive_that_is_interrupted_stops_at_once(shared: Daemon, fresh: Bus) -
 
     with pytest.raises(InterruptionError), connect(shared.endpoint) as robot:
         drive_and_fail(robot)
-    # Nothing but silence tells it: the source is gone after 0.25 s.
+    # Only silence shows it: the source is gone after 0.25 s.
     until(lambda: fresh.state()["mode"] == "ready", 1.0, "the source is gone")
 
 
@@ -520,7 +520,7 @@ def test_not_a_number_is_refused_before_it_is_sent(shared: Daemon, fresh: Bus) -
 
 
 def run_async(shared: Daemon, work: Any, **how: Any) -> Any:
-    """`work(robot)` with an async client."""
+    """Run `work(robot)` with an async client."""
 
     async def main() -> Any:
         async with asyncio.timeout(20.0), connect_async(shared.endpoint, **how) as robot:
@@ -580,11 +580,11 @@ def test_cancelling_an_async_drive_sends_the_zero_at_once(shared: Daemon, fresh:
 
 
 def test_a_zero_right_behind_a_command_is_heard(shared: Daemon, fresh: Bus) -> None:
-    # As a drive that is cancelled just after it sent: commands of one key that come faster than
-    # 1000 Hz are thinned out on the way in, and then the robot drives on for its timeout.
+    # A drive may be cancelled just after it sent a command. The bus drops commands of one key that
+    # come faster than 1000 Hz, and then the robot drives on for its timeout.
     async def work(robot: AsyncClient) -> None:
         driving = asyncio.create_task(robot.drive(0.2, seconds=60.0))
-        # The zero that opens it, the pause, and the first command, in one step of the loop.
+        # Send the opening zero, the pause, and the first command, in one step of the loop.
         await asyncio.sleep(0)
         while "0.2" not in sent:
             await asyncio.sleep(0)
@@ -604,7 +604,7 @@ def test_a_zero_right_behind_a_command_is_heard(shared: Daemon, fresh: Bus) -> N
     with pytest.MonkeyPatch.context() as patch, fresh.follow("cmd/app") as commands:
         patch.setattr(Client, "_put", put)
         run_async(shared, work)
-        fresh.get("info")  # behind all that was sent: the command itself may be thinned out
+        fresh.get("info")  # after everything that was sent: the command itself may be dropped
         until(lambda: commands.seen[-1].value["twist"]["linear"]["x"] == 0.0, 1.0, "a last zero")
 
 
@@ -614,7 +614,7 @@ def test_an_async_call_and_pose_leave_the_loop_running(shared: Daemon, fresh: Bu
         pose = await robot.pose()
         return reply.success, pose.x
 
-    # To a tenth of a millimetre: wheels that come to rest creep.
+    # Compare to a tenth of a millimetre, because wheels that come to rest creep.
     assert run_async(shared, work) == (True, pytest.approx(4.0, abs=1e-4))
 
 
@@ -639,7 +639,7 @@ def test_a_daemon_that_is_asked_too_much_is_asked_again_but_no_verb_is_called_ag
             assert robot.reply("config")[1] == b"{}"
             assert asked == ["acsard/acsar/config"] * 4
             asked.clear()
-            # Somebody may have pressed stop since.
+            # Another client may have pressed stop since.
             with pytest.raises(ReplyError, match="busy"):
                 robot.call("deactivate")
             assert asked == ["acsard/acsar/srv/deactivate"]

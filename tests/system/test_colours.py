@@ -1,4 +1,4 @@
-"""NO_COLOR at a terminal, and whatever is no terminal, has no colours anywhere."""
+"""With NO_COLOR, or without a terminal, no output has colours."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SGR = re.compile(r"\x1b\[([\d;:]*)m")
 
 
 def colours(text: str) -> list[str]:
-    """The sequences that ask for a colour; bold, faint and reversed are none."""
+    """Return the sequences that set a colour. Bold, faint and reversed are not colours."""
     found = (match[1] for match in SGR.finditer(text))
     return [one for one in found if any(map(_is_colour, re.split("[;:]", one)))]
 
@@ -70,11 +70,11 @@ for one in words(parser()):
             pass
 print("that was", "all")
 """
-"""Also of the verbs' own verbs, and what is said to an option that there is not."""
+"""Includes the subcommands of the verbs, and the error for an unknown option."""
 
 
 def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
-    """All that a program writes at a terminal that knows colours, until that text is there."""
+    """Return a program's output at a terminal that knows colours, up to that text."""
     with Terminal() as terminal:
         fcntl.ioctl(terminal.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
         env = environment(TERM="xterm-256color", COLORTERM="truecolor")
@@ -94,7 +94,7 @@ def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
 
 
 def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
-    """These words of the command line at a terminal, with that daemon's file."""
+    """Run this command line at a terminal, with that daemon's file."""
     file = [] if words[0] in ("run", "log") else ["--config", str(daemon.config)]
     return [sys.executable, "-c", ON_TERMINAL, *words, *file]
 

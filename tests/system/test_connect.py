@@ -1,4 +1,4 @@
-"""A router that is missing, goes or comes back is told: by the log, `diagnostics` and `doctor`."""
+"""The log, `diagnostics` and `doctor` report a router that is missing, goes or comes back."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def router(where: Path, endpoint: str) -> Program:
 
 
 def row(bus: Bus) -> Any:
-    """What `diagnostics` says of the router."""
+    """Return the router's row in `diagnostics`."""
     rows = [one for one in bus.get("diagnostics")["status"] if one["name"] == "acsard: router"]
     return rows[0] if rows else None
 
 
 def told(daemon: Daemon, name: str, times: int) -> str:
-    """The words of the log at so many lines of that event."""
+    """Return the text of that event's log line, once there are this many."""
     until(lambda: len(daemon.events(name)) >= times, 5.0, f"{name}, {times} times")
     return str(daemon.events(name)[times - 1]["text"])
 
@@ -66,7 +66,7 @@ def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_pa
             there.signal(signal.SIGKILL)
             told(daemon, "router_missing", 2)
         assert bus.count("router_missing") == 2
-        assert bus.state()["link"] == "up"  # local driving does not care
+        assert bus.state()["link"] == "up"  # local driving does not depend on the router
 
 
 def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> None:
@@ -91,7 +91,10 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
 def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_saw(
     tmp_path: Path,
 ) -> None:
-    """Neither hands on what the other says: who stops all at one of them has to know."""
+    """Neither daemon forwards the other's messages.
+
+    An operator who stops all robots at one of them must know that.
+    """
     one = Daemon(tmp_path, config={"robot": {"id": "one"}}, name="one")
     config: Tables = {
         "robot": {"id": "two"},
@@ -109,7 +112,7 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
         stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
         assert stopped.out.startswith("one: stopped")
         assert f"all seen at {one.endpoint}: 1 robot" in stopped.err
-        assert one.events("no_router") == []  # it named nobody
+        assert one.events("no_router") == []  # `one` has no router to connect to
         with Bus(two.endpoint, robot_id="two") as bus:
             assert bus.state()["mode"] != "stopped"
 
@@ -121,7 +124,7 @@ def test_a_daemon_that_connects_to_nobody_says_nothing_of_routers(tmp_path: Path
 
 
 def test_what_a_router_stamps_is_nobody_s_name(tmp_path: Path) -> None:
-    """All programs that say nothing of themselves look like one, behind it too."""
+    """All programs without a sender identity look like one, also behind the router."""
     meeting = free_endpoint()
     with (
         router(tmp_path, meeting),
@@ -134,7 +137,7 @@ def test_what_a_router_stamps_is_nobody_s_name(tmp_path: Path) -> None:
         begun = time.monotonic()
 
         def driven() -> Any:
-            """Zeros first, until their delays are known and they count."""
+            """Send zeros first, until the delays are known and the zeros count."""
             wish = twist(0.1 if time.monotonic() > begun + 2.0 else 0.0)
             plain.put("acsard/acsar/cmd/app", json.dumps(wish))
             return bus.state()["sender"]

@@ -1,4 +1,4 @@
-"""When a failure is no judgement yet."""
+"""A failure is not yet a verdict if no core was free."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`acsard doctor` and `acsard ports`: each thing that is wrong is found, with its mend."""
+"""`acsard doctor` and `acsard ports` find each fault and name its remedy."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.network
 def examined(
     where: Path, text: str, *options: str, **variables: str
 ) -> tuple[int, dict[str, list[dict[str, str]]]]:
-    """Exit code and findings by subject for a configuration."""
+    """Return the exit code and the findings by subject for a configuration."""
     file = where / "doctor.toml"
     file.write_text(text)
     words = [*acsard("doctor", "--json", "--config", str(file)), *options]
@@ -128,7 +128,7 @@ def test_what_a_daemon_runs_with_counts_and_where_the_file_differs_is_told(tmp_p
         file = f'[bus]\nlisten = ["{daemon.endpoint}"]\n[control]\nstate_directory = "{kept}"\n'
         _, found = examined(tmp_path, file)
         (other,) = [one for one in found["configuration"] if "other values" in one["text"]]
-        assert other["level"] == "ok"  # it was meant: the README says so
+        assert other["level"] == "ok"  # it is intentional: the README says so
         assert f'[mcu] port = "{peer.path}"' in other["mend"]
         assert f'mcu.port = "{peer.path}", not "sim"' in other["text"]
         assert f"pid {daemon.pid}" in other["text"]

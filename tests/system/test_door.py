@@ -1,4 +1,4 @@
-"""The door's process: opened anew whenever it ends, gone when the daemon is."""
+"""The TLS gateway's process restarts whenever it ends, and ends with the daemon."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.network
 
 
 class Open:
-    """A daemon with a door, and who comes through it."""
+    """A daemon with a TLS gateway, and clients that come through it."""
 
     def __init__(self, where: Path, certificates: Certificates) -> None:
         self._certificates = certificates
@@ -38,7 +38,7 @@ class Open:
         self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
 
     def door(self) -> int:
-        """Its process."""
+        """The gateway's process."""
         (pid,) = until(lambda: children(self.daemon.pid, "acsard door"), 5.0, "a door")
         return pid
 
@@ -64,7 +64,7 @@ def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
 
 
 def gone(pid: int) -> bool:
-    """It has ended, whoever it was left to."""
+    """Return whether the process has ended, even if nobody has reaped it."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
     except FileNotFoundError:
@@ -154,7 +154,7 @@ def listening(endpoint: str) -> zenoh.Config:
 def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
     tmp_path: Path, certificates: Certificates, answers: bool
 ) -> None:
-    """Zenoh has been seen to read no more from a door on a machine with much other work."""
+    """Zenoh has been seen to stop reading from a gateway on a machine with much other work."""
     plain, tls = free_endpoint(), free_tls_endpoint()
     bus = {"listen": [plain, tls], "tls": str(certificates.robot)}
     config = write_config(tmp_path / "a.toml", {"bus": bus})

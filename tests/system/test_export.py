@@ -1,4 +1,4 @@
-"""What is exported of a recording is what strangers got over the bus while it was made."""
+"""The export of a recording has the messages that strangers received while it was made."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.system.harness import ROOT, Bus, Daemon, acsard, finish, until
 
 OFTEN = {"rates": {"state": 100.0, "diagnostics": 100.0}}
-"""What has a rate is said when the mode changes, and from then on at that rate: whoever listens by
-then gets the same ones, whenever he began."""
+"""Messages with a rate go out when the mode changes, and from then on at that rate.
+
+All clients that listen by then get the same ones, whenever they began.
+"""
 
 ROS = ("odom", "tf", "joint_states", "cmd_vel_out", "diagnostics")
 
 MEASURED = {"acsard: control loop", "acsard: recording"}
-"""Rows of what the daemon measures of itself, which is in no recording."""
+"""Diagnostic rows of the daemon's measurements of itself, which are in no recording."""
 
 RECORDED = ROOT / "tests" / "recordings" / "quiet.mcap"
 
 MISSED = 0.2
-"""The share of messages that a listener on a busy machine may not have got: the bus drops them."""
+"""The share of messages that a subscriber on a busy machine may miss: the bus drops them."""
 
 
 class Told(NamedTuple):
-    """A bag in memory: the bytes of each topic, and what makes messages of them."""
+    """A bag in memory: the bytes of each topic, and the function that decodes them."""
 
     data: dict[str, list[bytes]]
     times: dict[str, list[int]]
@@ -58,19 +60,19 @@ def _take(got: list[bytes], sample: Any) -> None:
 
 @contextmanager
 def heard(bus: Bus) -> Iterator[dict[str, list[bytes]]]:
-    """All that comes on the keys of the ROS tree, and `state` and `events` of our own."""
+    """Collect all messages on the keys of the ROS tree, and our own `state` and `events`."""
     seen: dict[str, list[bytes]] = {}
     with ExitStack() as stack:
         for key in (*ROS, f"{bus.root}/state", f"{bus.root}/events"):
             got = seen.setdefault(key.rpartition("/")[2], [])
             subscriber = bus.session.declare_subscriber(key, partial(_take, got))
             stack.callback(subscriber.undeclare)
-        bus.ask("info")  # behind the subscriptions
+        bus.ask("info")  # after the subscriptions
         yield seen
 
 
 def assert_among(live: Sequence[Any], told: Sequence[Any], topic: str) -> None:
-    """Each of the live ones is in the file, in order; few of the file's are missing live."""
+    """Check that each live message is in the file, in order, and few others are."""
     at = iter(enumerate(told))
     found = [next((n for n, other in at if other == one), None) for one in live]
     assert None not in found, f"{topic}: live message {found.index(None)} of {len(found)}"
@@ -81,18 +83,18 @@ def assert_among(live: Sequence[Any], told: Sequence[Any], topic: str) -> None:
 
 
 def since_driving(live: Sequence[Any], reason: Callable[[Any], str]) -> Sequence[Any]:
-    """From the first change of mode on."""
+    """Return the messages from the first change of mode on."""
     first = next(n for n, one in enumerate(live) if reason(one).startswith("driving"))
     assert len(live) - first > 50
     return live[first:]
 
 
-pytestmark = pytest.mark.slow  # in virtual time it is in tests/scenarios/test_export.py
+pytestmark = pytest.mark.slow  # tests/scenarios/test_export.py has it in virtual time
 
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """What was heard live, the static transforms as they were asked for, and the bag."""
+    """The live messages, the static transforms as a query returned them, and the bag."""
     where = tmp_path_factory.mktemp("export")
     words = ["--record", str(where / "record")]
     with (
@@ -214,7 +216,7 @@ def test_times_in_the_file_are_when_it_was_published(both: Any) -> None:
 
 def test_a_full_disk_is_a_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
     words = acsard("log", "export", str(RECORDED), "new.mcap")
-    full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes a file
+    full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes per file
     ended = finish(full, tmp_path)
     assert (ended.code, ended.err) == (1, "acsard: cannot write new.mcap: File too large")
     assert not [*tmp_path.iterdir()]

@@ -51,19 +51,22 @@ WIRE_S = 33 * 10 / 115200
 """A line's time on the wire at the default baud rate, 2.86 ms."""
 
 SLACK_S = 0.1
-"""What a noisy two-core machine may add to a bound before a test calls it broken."""
+"""The time that a noisy two-core machine may add to a bound before a test calls it broken."""
 
 ZERO_TEXT = ZERO_LINE.strip()
 
 
 def commander(daemon: Daemon, speed: float, source: str = "app", zeros: int = 1) -> Program:
-    """A process that sends stamped commands at 20 Hz until it is ended."""
+    """Run a process that sends stamped commands at 20 Hz until it is ended."""
     return Program(words(COMMANDER, daemon.endpoint, source, speed, zeros), daemon.config.parent)
 
 
 def drives(peer: FarPeer, driver: Program, speed: float = 0.3) -> Heard:
-    """The first line at this speed; a commander that the machine held up in the beginning, so that
-    its zero was not heard as one, lets go once more."""
+    """Return the first line at this speed.
+
+    The machine may have delayed a commander at the beginning so that its zero did not count; the
+    commander then returns to neutral once more.
+    """
     begun = said = time.monotonic()
 
     def look() -> Heard | None:
@@ -85,33 +88,33 @@ def robot(where: Path) -> Iterator[tuple[FarPeer, Daemon]]:
 
 @pytest.fixture(scope="module")
 def one_robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FarPeer, Daemon]]:
-    """A daemon and its MCU for short faults, after which the robot can always be driven again."""
+    """A daemon and its MCU for short faults, after which the robot can always drive again."""
     with robot(tmp_path_factory.mktemp("far")) as both:
         yield both
 
 
 @pytest.fixture
 def far(one_robot: tuple[FarPeer, Daemon]) -> tuple[FarPeer, Daemon]:
-    """`one_robot` at rest: a line of the commander before must not be taken for one of the next."""
+    """Provide `one_robot` at rest, so that lines of two commanders are not confused."""
     peer = one_robot[0]
     until(lambda: [h.line for h in peer.lines[-1:]] == [ZERO_TEXT], 5.0, "at rest")
     return one_robot
 
 
 def last_put(program: Program) -> float:
-    """When a commander that has ended sent its last command."""
-    # Killed in the middle of a line, it has said "put" and not yet when.
+    """Return when a commander that has ended sent its last command."""
+    # A commander killed in the middle of a line has printed "put" and not yet the time.
     said = [line.split() for line in program.out[-2:]]
     return max(float(words[1]) for words in said if len(words) == 2)
 
 
 def puts_of(program: Program) -> list[float]:
-    """When a commander sent, but for the last time, which it may not have said whole."""
+    """Return when a commander sent, without the last time, which it may not have printed whole."""
     return [float(line.split()[1]) for line in program.out[:-1]]
 
 
 def text(speed: float) -> bytes:
-    """How a line begins that drives straight at so many m/s."""
+    """Return the beginning of a line that drives straight at this speed, m/s."""
     return f"ap{speed / 0.05:05.2f},".encode()
 
 
@@ -123,23 +126,24 @@ def gaps(lines: list[Heard]) -> list[float]:
 
 
 class Ramp(NamedTuple):
-    """How long after the last accepted command a ramp began, s, less what the machine took."""
+    """The time from the last accepted command to a ramp, s, less the time that the machine took."""
 
     step: float
-    """The first slower step, by the daemon's own stamps."""
+    """Until the first slower step, by the daemon's own stamps."""
     line: float
-    """Its line at the far end of the pty, by the clock of this machine."""
+    """Until its line at the far end of the pty, by the clock of this machine."""
 
 
 LATE_S = 0.005
-"""What a late timer tick may add on a busy machine; how many needed it is printed."""
+"""The delay that a late timer tick may add on a busy machine. The test prints how many needed it.
+"""
 
 
 def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
-    """From the last command the daemon accepted of a commander that is killed to the ramp.
+    """Return the times from the last accepted command of a commander that is killed to the ramp.
 
-    When it was accepted is what `state` says: its stamp less the source's age. A put that died
-    on its way with its commander does not count, nor does the way of one that arrived.
+    `state` says when a command was accepted: its stamp less the source's age. A put that died on
+    its way with its commander does not count, and neither does the travel time of one that arrived.
     """
     rng, found = random.Random(1), []
     with (
@@ -162,7 +166,8 @@ def killed_commanders(peer: FarPeer, daemon: Daemon, count: int) -> list[Ramp]:
             ).value  # fmt: skip
             age = next(source["age"] for source in state["sources"] if source["name"] == "app")
             accepted = seconds(state["stamp"]) - age
-            # Killed early, its last command may still find the robot on its way up.
+            # If the commander is killed early, its last command may still find the robot on its way
+            # up.
             rest_of_it = [seen.value for seen in steps.seen if stamp(seen.value) > accepted]
             full = itertools.dropwhile(lambda step: speed(step) < 0.0999, rest_of_it)
             slower = next(step for step in full if speed(step) < 0.0999)
@@ -238,8 +243,10 @@ def three_sources(where: Path, peer: FarPeer) -> Iterator[Daemon]:
 def taken_over(
     peer: FarPeer, daemon: Daemon, bus: Bus, successor: str
 ) -> tuple[float, list[Heard]] | None:
-    """When a commander that was killed sent its last, and the lines up to the speed of the next;
-    nothing when the machine broke the link meanwhile."""
+    """Return a killed commander's last send time, and the lines up to the next one's speed.
+
+    Returns nothing if the machine broke the link meanwhile.
+    """
     with bus.follow("state") as states, commander(daemon, 0.3, "first") as first:
         steady = drives(peer, first).at
         with commander(daemon, 0.1, successor) as other:
@@ -291,17 +298,17 @@ def test_when_a_commander_is_killed_the_next_one_takes_over_from_its_own_command
 
 
 def kinds_of(pid: int) -> tuple[int, int]:
-    """File descriptors and threads of a process."""
+    """Return the file descriptors and threads of a process."""
     return len(os.listdir(f"/proc/{pid}/fd")), len(os.listdir(f"/proc/{pid}/task"))
 
 
 @contextmanager
 def taken(name: str) -> Iterator[None]:
-    """Hold the pty of this name, so that whoever asks for one now gets another."""
+    """Hold the pty of this name, so that the next program that opens a pty gets another."""
     kept: list[tuple[int, int]] = []
 
     def hold() -> bool:
-        # Free once the daemon has closed its end, too; others may be free before it.
+        # The name is free once the daemon has closed its end, too. Others may be free before it.
         some = [pty.openpty() for _ in range(8)]
         for ends in some:
             if os.ttyname(ends[1]) == name:
@@ -320,8 +327,10 @@ def taken(name: str) -> Iterator[None]:
 
 
 def replugged(tmp_path: Path, peer: Peer, cycles: int) -> tuple[list[float], list[float]]:
-    """Seconds until an unplug is seen in state, and from replug to the first zero line, each less
-    what the machine took."""
+    """Return the seconds until `state` shows an unplug, and from a replug to the first zero line.
+
+    The time that the machine took is subtracted from each.
+    """
     noticed, zeros = [], []
     with (
         Daemon(tmp_path, peer.path) as daemon,
@@ -382,7 +391,7 @@ def test_200_replugs_are_found_in_time_and_leak_nothing(tmp_path: Path, peer: Pe
     assert max(zeros) <= 0.5 + SLACK_S
 
 
-# nobody reads
+# the far end does not read
 
 
 def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_lines(
@@ -408,12 +417,12 @@ def test_a_peer_that_stops_reading_and_answering_finds_at_most_quiet_of_drive_li
         )
         assert set(found[first_zero:]) == {ZERO_LINE}
         assert len(drive) <= 10 + 2
-        # 10 Hz of zeros.
+        # Zeros at 10 Hz.
         assert len(found) - first_zero <= 10 * (heard - begun) + 2
 
 
 def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> None:
-    # Feedback goes on, so only the kernel's refusal says that nothing goes out.
+    # Feedback goes on, so only the kernel's refusal shows that nothing goes out.
     with (
         Daemon(tmp_path, peer.path) as daemon,
         Bus(daemon.endpoint) as bus,
@@ -424,7 +433,7 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             noise, known = [peer.stuff()], len(peer.lines)
 
             def full() -> bool:
-                # The kernel moves what it took on to where it is read: that makes room again.
+                # The kernel moves accepted bytes on to the reader's buffer, which makes room again.
                 noise.append(peer.stuff())
                 return noise[-3:] == [0, 0, 0]
 
@@ -450,26 +459,26 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
             f"{len(waited)} lines of ours in the first 5 ms, {periods.superseded} superseded, "
             f"link {after['link']}"
         )
-        # Unless it, or who speaks to it, had no core for as long as a link may be silent.
+        # The exception is a daemon or a peer that had no core for as long as a link may be silent.
         starved = silent > 0.05 or periods.latest > 5.0 or lost(begun, heard) > 0.02
         assert after["link"] == "up" or starved
-        # To a link that was lost, even for a moment, there is no line to be made.
+        # While the link is lost, even for a moment, the daemon makes no lines for it.
         kept = len(daemon.events("link_stale")) == lost_links
         assert kept or starved or lost(begun) > 0.01
         assert not kept or periods.superseded + periods.missed >= 15
         assert not kept or periods.are_all_accounted_for()
-        # Those sent between the last read and the stuffing, a torn one and the newest.
+        # These are the lines between the last read and the stuffing, a torn one and the newest.
         assert len(waited) <= 6
 
         def obeyed() -> bool:
-            # A busy machine may hand over what we said in one burst, which no wheel can do.
+            # A busy machine may deliver our replies in one burst, which no wheel could produce.
             state = bus.state()
             if state["mode"] == "fault":
                 bus.get("srv/clear")
             driver.wish = ZERO if "send a zero first" in state["reason"] else twist(0.2)
             return peer.lines[-1].line.startswith(text(0.2))
 
-        # Long unheard, the MCU has stopped: we start over from zero.
+        # After a long silence the MCU has stopped, so the daemon starts over from zero.
         until(obeyed, 5.0, "the newest command")
 
 
@@ -477,7 +486,7 @@ def test_a_full_line_holds_no_line_of_ours_back(tmp_path: Path, peer: Peer) -> N
 
 
 def busy(where: Path) -> ExitStack:
-    """Two processes per core that use all they get."""
+    """Run two processes per core that use all the time they get."""
     stack = ExitStack()
     for _ in range(2 * (os.cpu_count() or 1)):
         stack.enter_context(Program(words(BUSY), where))
@@ -493,11 +502,11 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
     ):
         drives(peer, driver)
         with busy(daemon.config.parent):
-            # Published after a step, so that stamp and counters belong together.
+            # The message is published after a step, so that stamp and counters belong together.
             begun, ended = time.monotonic(), time.monotonic() + length
             before = states.find(lambda _: True, 5.0, "a state", after=begun).value
             after = states.find(lambda _: True, length + 5, "a later one", after=ended).value
-            # The peer's times are its own: it has no core either.
+            # The peer's own times are in doubt too, because it has no core either.
             ended, waited = time.monotonic(), kept_waiting(daemon.pid) + kept_waiting(peer.pid)
             driver.signal(signal.SIGKILL)
             driver.ended(5.0)
@@ -521,13 +530,13 @@ def starved(peer: FarPeer, daemon: Daemon, length: float) -> None:
         f"{max(between) * 1e3:.1f} ms apart, {close} closer than a line's time; ramp "
         f"{slower.at - sent:.3f} s after the last command"
     )
-    # A link that was lost may have periods in which nothing is said.
+    # A link that was lost may have periods without a line.
     assert periods.are_all_accounted_for() or broken(states, begun, ended)
-    # Counted, not timed: the kernel's thread that carries bytes through a pty starves as well,
-    # and then hands over several lines at once.
+    # The lines are counted, not timed: the kernel's thread that carries bytes through a pty starves
+    # as well, and then delivers several lines at once.
     assert len(lines) <= 100 * (ended - begun) + 5
-    # The commander starves, too, and so does the link; and a loop that had no core for as long as a
-    # command counts begins anew, from zero.
+    # The commander starves, too, and so does the link. A loop that had no core for as long as a
+    # command counts starts again from zero.
     stood = max(silent, *steps_apart)
     if stood < TIMEOUT_S - TICK_S and not broken(states, begun, ended):
         assert {h.line for h in lines} <= {text(0.3) + b"bp06.00,cp06.00,dp06.00"}
@@ -548,7 +557,7 @@ def test_starved_of_both_cores_for_60_s(tmp_path: Path) -> None:
 
 @contextmanager
 def stalled(daemon: Daemon) -> Iterator[None]:
-    """The whole daemon stands still while entered."""
+    """Stop the whole daemon while entered."""
     daemon.signal(signal.SIGSTOP)
     try:
         yield
@@ -557,16 +566,17 @@ def stalled(daemon: Daemon) -> Iterator[None]:
 
 
 def no_burst(lines: list[Heard]) -> float:
-    """The smallest gap; fails when lines came faster than their periods.
+    """Return the smallest gap.
 
-    Counted over a tenth of a second: the kernel's thread that carries bytes through a pty may be
-    late itself and hand over two or three lines at once, or as many as the machine made it wait.
+    Fails if lines came faster than their periods. Lines are counted over a tenth of a second: the
+    kernel's thread that carries bytes through a pty may be late itself and deliver two or three
+    lines at once, or as many as the machine made it wait.
     """
     for first in lines:
         most = 10 + 4
         if (count := sum(first.at <= heard.at < first.at + 0.1 for heard in lines)) > most:
-            # What waited for longest in there was written as long before.
-            # Who reads all the time waits longer than who only looks at the clock.
+            # The line that waited longest was written that much earlier. A process that reads all
+            # the time waits longer than one that only checks the clock.
             most += 2 + round(3 * lost(first.at - 0.5, first.at + 0.1) / TICK_S)
         assert count <= most
     return min(gaps(lines), default=0.0)
@@ -611,7 +621,7 @@ def test_after_half_a_second_s_stall_a_commander_that_goes_on_drives_from_zero_b
         assert after[0].line == ZERO_TEXT
         ramp = [wheels(heard.line)[0] for heard in after]
         assert max(b - a for a, b in itertools.pairwise(ramp)) <= 20 * 0.05 + 0.01
-        # The machine may keep the commander or the link waiting as well: that is another ramp.
+        # The machine may keep the commander or the link waiting as well, which causes another ramp.
         puts = [woken, *(at for at in puts_of(driver) if at > woken), steady.at]
         silent = max(b - a for a, b in itertools.pairwise(puts))
         if silent < TIMEOUT_S - TICK_S and not broken(states, woken, steady.at):
@@ -623,7 +633,7 @@ def test_after_a_stall_of_seconds_a_commander_that_goes_on_must_be_neutral_first
     far: tuple[FarPeer, Daemon],
 ) -> None:
     peer, daemon = far
-    # Shorter than the 2 s after which clients give the daemon up and connect anew.
+    # The stall is shorter than the 2 s after which clients give the daemon up and reconnect.
     with commander(daemon, 0.3) as driver:
         drives(peer, driver)
         with stalled(daemon):
@@ -667,7 +677,7 @@ def test_after_50_stalls_of_any_length_the_first_line_is_zero_and_none_comes_in_
 
 @contextmanager
 def full_pipe() -> Iterator[int]:
-    """A pipe that is full and that nobody reads: every write to it waits for ever."""
+    """A full pipe that no process reads: every write to it waits for ever."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     os.set_blocking(writer, False)
@@ -690,7 +700,7 @@ def test_control_goes_on_and_ends_well_when_output_is_blocked_for_the_whole_run(
 ) -> None:
     with ExitStack() as stack:
         how: dict[str, Any] = {which: stack.enter_context(full_pipe())}
-        # As a user starts it, with buffered streams.
+        # Run it as a user starts it, with buffered streams.
         how["env"] = {k: v for k, v in environment().items() if k != "PYTHONUNBUFFERED"}
         daemon = stack.enter_context(Daemon(tmp_path, peer.path, ready=False, **how))
         with alive_at(daemon.endpoint, daemon) as alive:

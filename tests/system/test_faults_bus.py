@@ -48,25 +48,31 @@ from tests.system.strangers import CODED_FLOOD, COMMANDER, HOARDER, ROUTER, word
 TIMEOUT_S = 0.25
 TICK_S = 0.01
 SLACK_S = 0.1
-"""What a noisy two-core machine may add to a bound before a test calls it broken. A backlog's ages
-run through all values from seconds down to zero: one that is obeyed too early cannot hide in it."""
+"""The time that a noisy two-core machine may add to a bound before a test calls it broken.
+
+The ages of a backlog run through all values from seconds down to zero, so a command that is obeyed
+too early cannot hide in it.
+"""
 
 HANDS = 3
-"""Sender, way and daemon, through which a command goes: a busy machine keeps each waiting."""
+"""The sender, the relay and the daemon through which a command goes. A busy machine delays each."""
 
 PROMPT: dict[str, object] = {
     "linear_acceleration": 100.0,
     "linear_deceleration": 100.0,
     "linear_stop_deceleration": 100.0,
 }
-"""Limits so wide that a command's speed is on the wire in one step: lines say whose they are."""
+"""Limits so wide that a command's speed is on the wire in one step.
+
+Each line then shows its command.
+"""
 
 PROMPT_FEEDBACK: dict[str, object] = {"wheel_acceleration": 1e6}
-"""And what wheels that obey so promptly report is possible."""
+"""A feedback limit that accepts the reports of wheels that obey at once."""
 
 
 def gaps(lines: list[Heard]) -> list[float]:
-    """How far the lines are apart, less what the machine took where that is much."""
+    """Return the gaps between the lines, less the time that the machine took if that is much."""
     return [
         b.at - a.at - (lost(a.at, b.at) if b.at - a.at > 2 * TICK_S else 0.0)
         for a, b in itertools.pairwise(lines)
@@ -83,7 +89,10 @@ Way = Literal["hole", "fast", "slow"]
 
 
 class Proxy:
-    """Between a client and the daemon: a hole swallows what both say, and gives it back later."""
+    """A relay between a client and the daemon.
+
+    A hole holds back both sides' bytes and delivers them later.
+    """
 
     def __init__(self, endpoint: str) -> None:
         self._target = port_of(endpoint)
@@ -113,7 +122,7 @@ class Proxy:
             one.close()
 
     def turn(self, way: Way) -> None:
-        """From now on let nothing through, or all at once, or all at `pace`."""
+        """From now on let nothing through, or everything at once, or everything at `pace`."""
         with self._changed:
             self._way = way
             self._changed.notify_all()
@@ -193,7 +202,7 @@ class Numbered:
     """A stamped commander at 50 Hz whose every command has a speed of its own."""
 
     COUNT = 400
-    """Speeds before they repeat: 8 s, longer than any hole and its drain."""
+    """Number of speeds before they repeat: 8 s, longer than any hole and its drain."""
 
     def __init__(self, client: Client) -> None:
         self.sent: list[list[float]] = [[] for _ in range(self.COUNT)]
@@ -218,7 +227,7 @@ class Numbered:
                 return
 
     def age(self, heard: Heard) -> float | None:
-        """How old the command of this line was when it appeared; None for one of no command."""
+        """Return the age of this line's command when the line appeared, or None without one."""
         number = round(wheels(heard.line)[0] * 100) - 200
         if not 0 <= number < self.COUNT:
             return None
@@ -227,7 +236,7 @@ class Numbered:
 
 
 class Hole(NamedTuple):
-    """What came of one partition."""
+    """The result of one partition."""
 
     way: Way
     length: float
@@ -240,12 +249,12 @@ class Hole(NamedTuple):
 
 
 def appeared(lines: list[Heard]) -> list[Heard]:
-    """The first line of each new command."""
+    """Return the first line of each new command."""
     return [b for a, b in itertools.pairwise(lines) if b.line != a.line]
 
 
 def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
-    """Partitions of so many seconds one after the other, each drained one way."""
+    """Run partitions of these lengths (s) one after the other, each drained in one way."""
     where.mkdir(exist_ok=True)
     found: list[Hole] = []
     with (
@@ -269,7 +278,7 @@ def holes(where: Path, ways: list[tuple[Way, float]]) -> list[Hole]:
             begun = time.monotonic()
             until(lambda: time.monotonic() > begun + length, length + 5, "a hole")  # noqa: B023
             held = proxy.held
-            # Twice as fast as it came: the drain takes as long as the hole did.
+            # The drain is twice as fast as the sender, so it takes as long as the hole did.
             proxy.pace = max(1, round(2 * held / length * 0.01))
             healed = time.monotonic()
             proxy.turn("slow" if way == "slow" else "fast")
@@ -349,19 +358,25 @@ BASE = 0.25
 
 
 class Flooded(NamedTuple):
-    """How old what a flood's steps obeyed was, s, less what the machine took where that is over
-    20 ms. The first two hold also the way to the daemon, on which a flooder's own threads and
-    Zenoh's wait for a core."""
+    """The ages of the commands that the steps obeyed in a flood, s.
+
+    The time that the machine took is subtracted if it is over 20 ms. The first two also contain the
+    way to the daemon, on which the flooder's own threads and Zenoh's wait for a core.
+    """
 
     age: list[float]
-    """Since the command was written, be there a newer one or not."""
+    """Since the command was written, whether there is a newer one or not."""
     overtaken: list[float]
-    """Since the next one had been put: how long one went on to count that was out of date."""
+    """Since the next command had been put: the time for which an outdated one continued to count.
+    """
     arrived: list[float]
-    """Since it arrived in the daemon, by its own account in `state`, asked again and again."""
+    """Since the command arrived in the daemon, by the daemon's `state`, which is polled often.
+    """
     held_up: list[float]
-    """How long the flooder itself stood between two clock readings, where that was over 5 ms: it
-    never waits for anything but a core, so this tells that there was none to be had."""
+    """How long the flooder itself stood between two clock readings, if that was over 5 ms.
+
+    It never waits for anything but a core, so this shows that no core was free.
+    """
 
     def __str__(self) -> str:
         return "; ".join(
@@ -373,11 +388,11 @@ class Flooded(NamedTuple):
 
 
 def flooded(where: Path, length: float) -> Flooded:
-    """How fresh the commands obeyed in a flood were, by the speeds applied and the steps' stamps.
+    """Return the ages of the obeyed commands in a flood, by applied speeds and step stamps.
 
-    Not by the lines at the other end of the pty: the kernel's thread that carries them starves on
-    a machine that a flood keeps busy, up to making the link stale; the robot then stands, and
-    steps that stand or rise from there obey no command's speed yet.
+    The lines at the other end of the pty would not show it: the kernel's thread that carries them
+    starves on a machine that a flood keeps busy, until the link becomes stale. The robot then
+    stands, and steps that stand or rise from there obey no command's speed yet.
     """
     limits = PROMPT | {"linear_speed": 10.0, "wheel_speed": 99.0}
     feedback = PROMPT_FEEDBACK | {"wheel_speed": 99.99}
@@ -419,12 +434,12 @@ def flooded(where: Path, length: float) -> Flooded:
             stood = at
         elif at < length and at > stood + 0.1:
             code = (speed - BASE) / SLOPE
-            # By 0.1 ms: a code holds 0.02 ms, commands are 0.5 ms apart.
+            # The margin is 0.1 ms: a code holds 0.02 ms, and commands are 0.5 ms apart.
             newer = bisect.bisect(written, code + 0.0001)
             found.age.append(by_itself(at - code, at))
             late = at - put[newer] if newer < len(put) else 0.0
             found.overtaken.append(by_itself(late, at))
-    # Before its first one counts, the last command is the zero it opened with.
+    # Until its first command counts, the last command is the zero with which it opened.
     flooding = [state for state in asked if seconds(state["stamp"]) > start + 0.1]
     found.arrived.extend(
         by_itself(source["age"], seconds(state["stamp"]) - start)
@@ -446,7 +461,7 @@ def flooded(where: Path, length: float) -> Flooded:
     assert periods.missed <= 0.03 * periods.elapsed + 1 + waited / TICK_S
     during = sum(0.0 <= at < length for at, _ in steps)
     assert during > 90 * length - waited / TICK_S
-    # While the machine keeps the link from being up the robot stands.
+    # While the machine keeps the link down, the robot stands.
     assert len(found.age) > (10 if stale else 50)
     assert grown < 10_000
     assert after["mode"] != "fault", after["reason"]
@@ -457,7 +472,7 @@ def test_in_a_flood_the_command_obeyed_is_a_fresh_one(tmp_path: Path) -> None:
     found = flooded(tmp_path, 1.0)
     assert len(found.arrived) > 20
     assert statistics.median(found.age) <= 0.02
-    # A loop that the machine kept for a while obeys one that is older, once, when it goes on.
+    # A loop that the machine delayed for a while obeys one older command, once, when it goes on.
     for late in (found.overtaken, found.arrived):
         assert sum(one > 0.02 + SLACK_S for one in late) <= 0.05 * len(late)
 
@@ -477,7 +492,7 @@ def test_in_a_minute_of_floods_the_command_obeyed_is_a_fresh_one(tmp_path: Path)
             assert max(these.overtaken) <= 0.02
             assert max(these.arrived) <= 0.02
     print(f"all, {quiet} of 7 floods with cores to be had throughout: {found}")
-    # The others tell of the machine: of its 2 cores the flood takes all that it can get.
+    # The other floods measure the machine: the flood takes all it can get of its 2 cores.
     for ages in found[:3]:
         assert sum(age > 0.02 for age in ages) <= 0.01 * len(ages)
         assert max(ages) <= 0.02 + SLACK_S
@@ -487,16 +502,16 @@ def test_in_a_minute_of_floods_the_command_obeyed_is_a_fresh_one(tmp_path: Path)
 
 
 def unsent(port: int) -> list[int]:
-    """Bytes the kernel holds for each client of a local port."""
+    """Return the bytes that the kernel holds for each client of a local port."""
     rows = [row.split() for row in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     mine = [row for row in rows if int(row[1].partition(":")[2], 16) == port and row[3] == "01"]
     return [int(row[4].partition(":")[0], 16) for row in mine]
 
 
 def filled(daemon: Daemon, filler: Bus) -> int:
-    """The bytes held for stopped clients when there is no room for more, else 0.
+    """Return the bytes held for stopped clients once there is no more room, else 0.
 
-    What the daemon says by itself would take a minute to fill it, so another client helps.
+    The daemon's own messages would take a minute to fill it, so another client helps.
     """
     before = sorted(unsent(port_of(daemon.endpoint)))[-4:]
     for _ in range(40):
@@ -507,7 +522,7 @@ def filled(daemon: Daemon, filler: Bus) -> int:
 
 
 def hoarded(where: Path, rounds: int, length: float) -> tuple[list[float], list[float]]:
-    """Longest gaps between lines, a round each: without, and with, four stopped subscribers."""
+    """Return the longest gaps between lines: without and with four stopped subscribers."""
     without, stopped = [], []
     with FarPeer(where) as peer, Daemon(where, peer.path) as daemon, ExitStack() as stack:
         peer.awaits(b"ap00.00")
@@ -561,7 +576,7 @@ def test_four_stopped_subscribers_hold_up_no_line_in_20_rounds(tmp_path: Path) -
 
 
 def rerouted(where: Path, cycles: int) -> list[float]:
-    """Seconds from a router's return to odometry at a client behind it."""
+    """Return the seconds from a router's return to odometry at a client behind it."""
     routed, found, worst = free_endpoint(), [], 0.0
     with ExitStack() as stack:
         peer = stack.enter_context(FarPeer(where))
@@ -594,7 +609,7 @@ def rerouted(where: Path, cycles: int) -> list[float]:
         f"{statistics.median(found):.2f} max {max(found):.2f} s; longest gap between lines of the "
         f"local drive {worst * 1e3:.1f} ms"
     )
-    assert worst <= 0.06  # less what the machine took
+    assert worst <= 0.06  # without the time that the machine took
     return found
 
 

@@ -1,8 +1,8 @@
-"""deploy/zenoh is true: its router between two robots and each who may come, by certificates.
+"""deploy/zenoh is true: its router holds two robots and each client to their certificates.
 
-The router is Zenoh itself in router mode with router.json5; only addresses and files differ, and
-what the storage plugin does is done by a few lines in the router's process. What counts is the
-effect; what must not happen is never waited for: behind each attempt goes something answered.
+The router is Zenoh itself in router mode with router.json5. Only addresses and files differ, and a
+few lines in the router's process replace the storage plugin. The tests judge effects. No test waits
+to see a forbidden effect stay away: a request that is answered follows each attempt.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from tests.system.identities import free_tls_endpoint
 
 pytestmark = pytest.mark.network
 
-# who may, as SAFETY section 3 has it; robot2 is whoever has the certificate of that robot
+# permissions as in SAFETY section 3; robot2 is any client with the certificate of that robot
 
 Who = frozenset[str]
 Verb = Literal["put", "delete", "query", "subscribe"]
@@ -79,17 +79,17 @@ EVERY_REPLY = zenoh.ConsolidationMode.NONE
 
 
 class Try(NamedTuple):
-    """A key (expression), and who may."""
+    """A key (expression), and the identities that may use it."""
 
     key: str
     who: Who
     payload: bytes = b""
     how: Literal["plain", "late", "token"] = "plain"
-    """How to subscribe: as anybody, as one who wants what was before, or to liveliness tokens."""
+    """How to subscribe: plainly, with history for late joiners, or to liveliness tokens."""
 
     @property
     def label(self) -> str:
-        """What tells it from the other rows of its verb."""
+        """A name that is unique among the rows of its verb."""
         return self.key + ("" if self.how == "plain" else f" ({self.how})")
 
 
@@ -99,7 +99,7 @@ def _puts() -> Iterator[Try]:
         for source in SOURCES:
             yield Try(f"{ONE}/cmd/{source}/{name}", own, TWIST)
         yield Try(f"{ONE}/wheel_cmd/ros2_control/{name}", own, WHEELS)
-        # A robot may do all in its own tree.
+        # A robot may do everything in its own tree.
         yield Try(f"{TWO}/cmd/app/{name}", own | ITSELF, TWIST)
     yield Try(f"{TWO}/cmd/app/robot2", ITSELF, TWIST)
     for key in ("cmd/app", "cmd/app/viewer", "cmd/app/robot2", "wheel_cmd/nav", "cmd/app/*"):
@@ -174,14 +174,14 @@ ROWS: dict[Verb, tuple[Try, ...]] = {
 
 
 class Member(Bus):
-    """A plain Zenoh client of the router that shows a certificate."""
+    """A plain Zenoh client that shows the router a certificate."""
 
     def __init__(self, config: zenoh.Config, robot_id: str) -> None:
         self.session = zenoh.open(config)
         self.root = f"acsard/{robot_id}"
 
     def ask(self, key: str, payload: object = None) -> list[Answered]:
-        """What the robot itself answers, in JSON; a storage has what it published."""
+        """Return the robot's own answers, which are in JSON. A storage holds the published form."""
         data = self.payload(key, payload)
         found = []
         for reply in self.session.get(
@@ -194,7 +194,7 @@ class Member(Bus):
 
 
 class Fleet:
-    """The router, two robots, and somebody who may look at everything."""
+    """The router, two robots, and a client that may read everything."""
 
     def __init__(self, where: Path) -> None:
         self.where, self.endpoint = where, free_tls_endpoint()
@@ -202,7 +202,8 @@ class Fleet:
         self._stack = ExitStack()
         self._fooled = threading.Event()
         self.sensed = threading.Event()
-        """Something came on a robot's `imu`, as a gyro's driver beside it would hear it."""
+        """Set when a message came on a robot's `imu`, as a gyro's driver there would receive it.
+        """
 
     def __enter__(self) -> Fleet:
         enter = self._stack.enter_context
@@ -234,9 +235,9 @@ class Fleet:
         self._stack.close()
 
     def robot(self, robot_id: str, name: str = "", *, ready: bool = True) -> Daemon:
-        """A daemon with robot.toml and the certificate of its id, quick to drive and to tell.
+        """Return a daemon with robot.toml and the certificate of its id, quick to drive and report.
 
-        robot2 is a peer instead, as README.md has it for one with programs of its own.
+        robot2 is a peer instead, as README.md has it for a robot with programs of its own.
         """
         tables = tomllib.loads(ROBOT_FILE.read_text())
         if robot_id == "robot2":
@@ -248,7 +249,7 @@ class Fleet:
         return Daemon(self.where, config=tables, name=name or robot_id, ready=ready)
 
     def member(self, name: str, robot_id: str = "robot1") -> Member:
-        """A client with this certificate, set up as README.md has it for any language."""
+        """Run a client with this certificate, set up as README.md has it for any language."""
         config = client_config(self.endpoint)
         tls = tls_settings(self.where / name)
         config.insert_json5("transport/link/tls", json.dumps(tls))
@@ -260,14 +261,17 @@ class Fleet:
             self._fooled.set()
 
     def fooled(self) -> bool:
-        """Whether the witness has since heard what no robot said, or somebody's command."""
+        """Return whether the witness has since received a command or a forged message."""
         self.robots[0].ask("info")
         was = self._fooled.is_set()
         self._fooled.clear()
         return was
 
     def comes(self, look: Callable[[], bool], steps: int = 5) -> bool:
-        """Whether it becomes true within so many control periods, which is long on one machine."""
+        """Return whether `look` becomes true within this number of control periods.
+
+        Periods are long compared with a delivery on one machine.
+        """
         here = self.robots[0]
         begun = here.count("lines_sent")
         while not (found := look()):
@@ -276,12 +280,12 @@ class Fleet:
         return found
 
     def restored(self) -> None:
-        """Both released and switched on."""
+        """Release both robots and switch them on."""
         for robot in self.robots:
             until(partial(_restored, robot), 5.0, "cleared and active")
 
     def tried(self, name: str, verb: Verb) -> dict[str, bool]:
-        """What became of every attempt of one with this certificate."""
+        """Return the result of every attempt by a client with this certificate."""
         with self.member(name) as member:
             visitor = Visitor(self, member.session, name)
             rows = ROWS[verb]
@@ -293,32 +297,34 @@ class Fleet:
                 self.restored()
                 return {row.label: found[row.label] for row in rows}
             attempt = visitor.followed if verb == "subscribe" else partial(visitor.sent, verb)
-            # All that should do nothing at once, and one by one only when something happened.
+            # Try all rows that should have no effect at once, and one by one only if something
+            # happened.
             idle = [row for row in rows if name not in row.who]
             quiet = idle if idle and not attempt(idle) else []
             return {row.label: row not in quiet and attempt([row]) for row in rows}
 
 
 class Visitor:
-    """One session at the router that tries."""
+    """One session at the router that makes the attempts."""
 
     def __init__(self, fleet: Fleet, session: zenoh.Session, name: str) -> None:
         self._fleet, self._session, self._name = fleet, session, name
         self._answering = [ONE, TWO] if name in ANYBODY else [TWO] if name in ITSELF else []
 
     def _behind(self) -> None:
-        """All that this session has sent is there. On one way all is in order."""
+        """Wait until all messages of this session have arrived: one route keeps them in order."""
         for root in self._answering:
             assert list(self._session.get(f"{root}/info", timeout=5.0))
         if len(self._answering) < 2:
             self._fleet.comes(lambda: False)
 
     def sent(self, verb: Verb, rows: Sequence[Try]) -> bool:
-        """Whether a robot obeyed any of these puts or deletes, or others took it for a robot's."""
+        """Return whether a robot obeyed any of these, or the witness took one for a robot's."""
         fleet = self._fleet
 
         def commands() -> list[int]:
-            # A first command of a new clock is let through, and not believed yet.
+            # A first command of a new clock passes the router, and the daemon does not believe it
+            # yet.
             heard = ("commands", "commands_first_contact")
             return [sum(map(robot.count, heard)) for robot in fleet.robots]
 
@@ -342,7 +348,7 @@ class Visitor:
         return done or fooled
 
     def asked(self, rows: Sequence[Try]) -> dict[str, bool]:
-        """Which questions got an answer."""
+        """Return the queries that got an answer."""
         waiting = {}
         for row in rows:
             replies: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(64)
@@ -362,7 +368,7 @@ class Visitor:
         return {label: found.get(label) or _answered(waiting[label]) for label in waiting}
 
     def followed(self, rows: Sequence[Try]) -> bool:
-        """Whether any of these subscriptions brought anything."""
+        """Return whether any of these subscriptions received a sample."""
         came = threading.Event()
 
         def on_sample(sample: zenoh.Sample) -> None:
@@ -371,9 +377,9 @@ class Visitor:
         subscribers = [self._subscribed(row, on_sample) for row in rows]
         self._behind()
         if any(row.key.endswith("events") for row in rows):
-            for verb in ("deactivate", "activate"):  # which are events
+            for verb in ("deactivate", "activate"):  # these calls are events
                 assert self._fleet.robots[0].get(f"srv/{verb}")["success"]
-        # What was before is said again every 5 s, for those who cannot ask for it.
+        # Last values are sent again every 5 s, for clients that cannot ask for them.
         mine = [row for row in rows if self._name in row.who]
         late = any(row.how == "late" for row in mine)
         done = self._fleet.comes(came.is_set, 700 if late else 50 if mine else 5)
@@ -392,7 +398,10 @@ class Visitor:
 
 
 def _restored(robot: Bus) -> bool:
-    """Clear and activate; False if another stop came meanwhile, which the clear did not know."""
+    """Clear and activate.
+
+    Returns False if another stop came meanwhile, which the clear did not name.
+    """
     if robot.state()["mode"] == "stopped" and not robot.get("srv/clear")["success"]:
         return False
     return bool(robot.get("srv/activate")["success"])

@@ -1,4 +1,4 @@
-"""`acsard foxglove` as a viewer has it: a client of its protocol that knows nothing of acsard."""
+"""`acsard foxglove` serves a viewer: a client of its protocol that knows nothing of acsard."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ TOPICS = {
     f"/cmd_vel_in/{source}": ("geometry_msgs/msg/TwistStamped", f"cmd/{source}")
     for source in ("teleop", "app", "ros2_control", "nav")
 }
-"""ROS type, and the key on the bus that says the same."""
+"""The ROS type, and the bus key with the same contents."""
 
 OURS = {"header": "stamp", "sources": "sources", "counters": "counters"}
-"""The fields of `state` that are shaped otherwise on the bus."""
+"""The fields of `state` that have another shape on the bus."""
 
 
 def free_port() -> int:
-    """A port of this machine nobody listens on."""
+    """Return a port of this machine on which no program listens."""
     return int(free_endpoint().rpartition(":")[2])
 
 
@@ -98,13 +98,13 @@ def viewer(shows: Shows, bus: Bus) -> Iterator[Viewer]:
 
 
 def speed(linear: float, angular: float = 0.0) -> bytes:
-    """What the Teleop panels of Foxglove and Lichtblick publish in JSON."""
+    """Return a speed in JSON, as the Teleop panels of Foxglove and Lichtblick publish it."""
     axes = {"x": 0, "y": 0, "z": 0}
     return json.dumps({"linear": axes | {"x": linear}, "angular": axes | {"z": angular}}).encode()
 
 
 class Panel:
-    """A button that is held: 20 messages a second."""
+    """Hold a button down: 20 messages a second."""
 
     def __init__(self, viewer: Viewer, data: bytes, encoding: str = "json") -> None:
         self._send, self.channel = viewer.publish_on("/cmd_vel", encoding, "geometry_msgs/Twist")
@@ -132,7 +132,7 @@ class Panel:
 
 
 def driving(bus: Bus, faster_than: float = 0.2) -> Any:
-    """The state once the robot drives so fast."""
+    """Return the state once the robot drives at this speed."""
 
     def look() -> Any:
         state = bus.state()
@@ -144,7 +144,7 @@ def driving(bus: Bus, faster_than: float = 0.2) -> Any:
 
 
 def same(told: Any, value: Any) -> bool:
-    """A message of ROS as rosbags decodes it holds the same as one of the bus."""
+    """Check that a ROS message, as rosbags decodes it, holds the same as one of the bus."""
     if isinstance(value, Mapping):
         return all(same(getattr(told, key), inner) for key, inner in value.items())
     if isinstance(value, list):
@@ -152,7 +152,7 @@ def same(told: Any, value: Any) -> bool:
     return bool(told == value)
 
 
-# what is shown
+# the displayed data
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_a_topic_shows_what_was_on_the_bus_at_the_time(
             seen = [one.value for one in list(on_bus.seen)]
             return sum(any(same(message, value) for value in seen) for message in messages)
 
-        # One was asked for, so that who looks need not wait: that is in no publication.
+        # The bridge queried one, so that the viewer need not wait; that one is in no publication.
         until(lambda: found() >= count - 1, 5.0, f"{messages} on {key}")
 
 
@@ -210,14 +210,14 @@ def test_who_comes_late_gets_tf_static_and_the_last_state(
             with Viewer(shows.port) as late:
                 assert late.show("/tf_static").first()[0].payload == first.payload
         late_ones = len(published.seen)
-    # It is published once in 5 s: none of them has waited for that.
+    # It is published once in 5 s. No viewer has waited for that.
     assert late_ones < 4
     viewer.show("/diagnostics").first()
 
 
 def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
     looked = viewer.show("/cmd_vel_in/nav")
-    # Nothing tells when a subscription has reached the daemon: a zero moves nobody.
+    # No event shows when a subscription has reached the daemon. A zero moves no robot.
 
     def put() -> bool:
         bus.put("cmd/nav", ZERO)
@@ -230,11 +230,11 @@ def test_what_a_source_commands_is_shown(viewer: Viewer, bus: Bus) -> None:
 
 
 Sent = tuple[str, float, Callable[[], None]]
-"""Of which source, at what m/s, and what sends it."""
+"""The source, the speed in m/s, and the function that sends it."""
 
 
 def moving(name: str, speed: float) -> Any:
-    """A message of this ROS type."""
+    """Return a message of this ROS type."""
     if name == JOINTS:
         wheels = [speed / 0.05] * 4
         return JointState(name=list(JointsConfig().as_tuple()), velocity=wheels)
@@ -243,7 +243,7 @@ def moving(name: str, speed: float) -> Any:
 
 
 def every_way(session: zenoh.Session) -> Iterator[Sent]:
-    """To command, each with a speed of its own."""
+    """The ways to command, each with a speed of its own."""
     speeds = (number / 100 for number in itertools.count(1))
 
     def put(key: str, payload: bytes, **named: str) -> Callable[[], None]:
@@ -268,7 +268,7 @@ def every_way(session: zenoh.Session) -> Iterator[Sent]:
 
 
 def asked(messages: list[Any]) -> list[tuple[str, float, float]]:
-    """Frame and speeds of each."""
+    """Return frame and speeds of each."""
     return [(m.header.frame_id, m.twist.linear.x, m.twist.angular.z) for m in messages]
 
 
@@ -303,12 +303,12 @@ def test_whatever_a_source_commands_by_is_shown_as_an_export_has_it(tmp_path: Pa
     told = exported(tmp_path / "new.mcap")
     for source in sources:
         live, written = shown(source), asked(told[f"/cmd_vel_in/{source}"])
-        # The first may have come before the subscription.
+        # The first message may have come before the subscription.
         assert live == written[-len(live) :]
 
 
 def exported(path: Path) -> dict[str, list[Any]]:
-    """The messages of each topic."""
+    """Return the messages of each topic."""
     found: dict[str, list[Any]] = {}
     store: Any = get_typestore(Stores.EMPTY)
     with path.open("rb") as stream:
@@ -334,7 +334,7 @@ def test_the_log_tells_the_daemon_s_events_each_once(viewer: Viewer, bus: Bus) -
     def all_of_them() -> bool:
         messages = [looked.read(one.payload) for one in list(looked.came)]
         found = [(m.name, m.msg.partition(" (")[0]) for m in messages]
-        # More may have happened since: a busy machine keeps a link waiting.
+        # More events may have happened since, because a busy machine keeps a link waiting.
         return any(found[at : at + len(told)] == told for at in range(len(found)))
 
     until(all_of_them, 5.0, f"{told} in {lines(looked)}")
@@ -347,7 +347,7 @@ def lines(log: Looked) -> list[str]:
 
 
 def test_the_bus_is_followed_for_what_is_shown_only(viewer: Viewer, bus: Bus) -> None:
-    # A publisher of a name is told whether anybody listens.
+    # Zenoh tells a publisher of a key whether any subscriber listens.
     publisher: Any = bus.session.declare_publisher(f"{bus.root}/tf")
 
     def listened() -> bool:
@@ -410,7 +410,7 @@ def test_parameters_are_the_live_settings_and_errors_are_told(viewer: Viewer, bu
     assert viewer.get()["limits.linear_speed"] == 1.0
     assert viewer.set({"limits.linear_speed": 2}) == {"limits.linear_speed": 2.0}
     assert bus.get("config")["limits"]["linear_speed"] == 2.0
-    # As it is, so that the panel shows it again.
+    # It sends the current value, so that the panel shows that again.
     assert viewer.set({"limits.linear_speed": 99}) == {"limits.linear_speed": 2.0}
     assert "a number from 0 to 10 m/s" in viewer.status("not set: limits.linear_speed")["message"]
     viewer.set({"drive.wheel_radius": 1.0})
@@ -491,13 +491,13 @@ def test_a_viewer_that_reads_nothing_or_floods_holds_up_nobody(
         for _ in range(flood):
             send(speed(0.0))
         looked.first(len(looked.came) + 50)
-        # The newest goes, no faster than the bus takes them; what was in between does not.
+        # The newest command is sent, no faster than the bus accepts; those in between are dropped.
         assert 0 < len(commands.seen) < flood / 5
 
 
 @contextmanager
 def followed(bus: Bus) -> Iterator[tuple[list[Any], list[Any]]]:
-    """What is commanded and what is applied, each with its time by our clock."""
+    """Collect the commanded and the applied speeds, each with its time by our clock."""
     asked: list[Any] = []
     applied: list[Any] = []
 
@@ -543,7 +543,7 @@ def test_whoever_is_gone_while_driving_leaves_a_robot_that_ramps_down(
         slower = next(at for at, linear in applied if at > last and linear < 0.39)
         assert slower - last < TIMEOUT_S + TICKS_S + lost(begun)
         zeros = [at for at, linear in asked if at > last and linear == 0]
-        # Killed, it can send none: the source's timeout does it.
+        # A killed program cannot send a zero; the source's timeout stops the robot.
         assert len(zeros) == (0 if how == "killed" else 1)
 
 
@@ -602,7 +602,7 @@ def test_a_port_that_is_taken_is_a_sentence(shared: Daemon, tmp_path: Path) -> N
 @SLOW
 def test_nobody_who_looks_costs_nothing(shows: Shows, viewer: Viewer, bus: Bus) -> None:
     def cost() -> float:
-        """Processor time while the daemon publishes so much, s."""
+        """Return the processor time while the daemon publishes 300 odometry messages, s."""
         with bus.follow("odom") as odom:
             before = cpu_seconds(shows.pid)
             until(lambda: len(odom.seen) >= 300, 20.0, "three seconds of odometry")
@@ -634,7 +634,8 @@ def test_what_a_stamp_says_is_old_moves_nobody_however_it_trickles_in(
         assert time.monotonic() < until_driven, bus.state()["reason"]
         stamped(time.time_ns())
     with followed(bus) as (asked, applied):
-        # A tunnel that was held up passes on, one by one, what went into it more than 1 s ago.
+        # A tunnel that was interrupted delivers, one by one, messages that entered it more than 1 s
+        # ago.
         bus.at_rest()
         stood = len(applied)
         for number in range(40):

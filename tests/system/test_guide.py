@@ -1,4 +1,4 @@
-"""Checks and calibrations gone through over the page's WebSocket: begun, answered, let go of."""
+"""Checks and calibrations over the page's WebSocket are started, answered and abandoned."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
 
 
 async def beside(call: Callable[[], Any]) -> Any:
-    """What waits, while the pings go on."""
+    """Run the call in a thread, while the pings go on."""
     return await asyncio.to_thread(call)
 
 
 async def drives(guided: Guided, standing: Bus) -> None:
-    """The first leg moves; it is begun again where a busy machine has ended it."""
+    """Wait until the first leg moves. Starts it again if a busy machine has ended it."""
     for _ in range(4):
         await guided.begin("calibrate", way="umbmark")
         await guided.answer(await guided.asks("How wide"), 300)
@@ -60,7 +60,8 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
             assert subject["simulated"] is True
             question = await guided.asks("lifted")
             assert question["answers"] == ["lifted"]
-            # What is not allowed is told, and asked again; nothing has turned.
+            # An answer that is not allowed is reported, and the question is asked again. Nothing
+            # has turned.
             await guided.answer(question, "yes")
             question = await guided.asks("lifted")
             assert question["wrong"] == "one of: lifted"
@@ -70,7 +71,7 @@ def test_a_board_is_checked_without_a_daemon_from_the_first_question_to_the_writ
             assert 'front_left = "+a"' in result["result"]
             await guided.answer(await guided.asks(str(alone.config)), "write")
             end = await guided.ended()
-            assert (end["ended"], end["meaning"]) == (1, "failure")  # the map was another
+            assert (end["ended"], end["meaning"]) == (1, "failure")  # it was another map
             heard = guided.ours.heard
             found.extend(s["guide"]["finding"] for s in heard if "finding" in str(s))
             told = {"Subject", "Doing", "Progress", "Question", "Found", "Result"}
@@ -94,7 +95,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
             await drives(guided, standing)
             about = await other.says(lambda said: said.get("running"))
             assert (about["running"], about["by"], about["yours"]) == ("calibrate", "here", False)
-            # One at a time; and nobody else answers, presses or ends.
+            # Only one runs at a time, and no other client answers, presses or ends it.
             await other.begin("check", port="sim")
             refused = await other.ours.find(lambda said: said.get("refused") == "begin")
             assert "here goes through a calibrate already" in refused["reason"]
@@ -102,7 +103,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
             await other.ours.say(press="leave")
             for number in range(100):
                 await other.ours.say(reply=number, value=1)
-            # Answers that nobody has asked for do nothing, however many come.
+            # Answers without a question do nothing, however many come.
             for number in range(150):
                 await guided.ours.say(reply=number, value="start")
             refused = await guided.ours.find(lambda said: said.get("refused") == "reply")
@@ -112,7 +113,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
             await guided.ours.say(press="key")
             await beside(standing.at_rest)
             took = time.monotonic() - pressed
-            # 0.3 m/s at 1 m/s2, and some of the way.
+            # 0.3 m/s at 1 m/s2, and a part of the way.
             assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
             end = await guided.ended()
             assert (end["ended"], end["meaning"]) == (1, "failure")
@@ -126,7 +127,7 @@ def test_a_key_stops_the_leg_and_all_others_see_that_it_goes_on(page: Page, stan
 
 
 def gone(guided: Guided, page: Page) -> None:
-    """As a browser that is killed."""
+    """Cut the connection like a browser that is killed."""
     cast(Any, guided.ours.socket)._response.connection.transport.abort()
 
 
@@ -184,7 +185,7 @@ def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
             guided.falls_silent()
             await beside(standing.at_rest)
             took = time.monotonic() - silent
-            # And the ramp: 0.3 m/s at 1 m/s2, and some of the way.
+            # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
             assert took < 1.0 + 0.3 + 0.4 + lost(silent, silent + took)
 
     run(story)
@@ -192,25 +193,25 @@ def test_who_falls_silent_in_the_middle_of_a_drive_stops_it_within_a_second(
 
 
 LINES = 10
-"""That have had one speed: it is steady."""
+"""Number of consecutive lines with one speed that count as steady."""
 
 
 @pytest.mark.network
 def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_second(
     hosts: Hosts, tmp_path: Path
 ) -> None:
-    """Nothing closes, and nobody is told."""
+    """No connection closes, and no program gets an error."""
     Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", [hosts.address], 1)
 
     def fast(since: float) -> float:
-        """The speed of a wheel in the last lines, which all have it; 0 when they have not."""
+        """Return the speed of a wheel if all of the last lines have it, else 0."""
         said = [one.line for one in peer.since(since) if one.line != b"-"][-LINES:]
         speeds = [abs(wheels(line)[0]) for line in said]
         steady = len(speeds) == LINES and len(set(speeds)) == 1
         return speeds[0] if steady else 0.0
 
     def slower(gone: float, than: float) -> float | None:
-        """When the first slower line came."""
+        """Return when the first slower line came."""
         for one in peer.since(gone):
             if one.line != b"-" and abs(wheels(one.line)[0]) < than:
                 return one.at
@@ -230,7 +231,7 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
             finally:
                 hosts.heal()
             print(f"slower after {at - gone:.2f} s")
-            # Its server, the command and the daemon, which a busy machine keeps waiting.
+            # The page's server, the command and the daemon. A busy machine delays each.
             assert at - gone < 1.0 + 3 * lost(gone, at)
 
     with (
@@ -290,7 +291,7 @@ async def _then_fail(story: Callable[[], Any]) -> None:
 
 
 def ended(pid: int) -> bool:
-    """Gone, or waiting for a parent that hangs."""
+    """Return whether the process has ended, or is a zombie of a parent that hangs."""
     try:
         return " Z " in Path(f"/proc/{pid}/stat").read_text()
     except FileNotFoundError:
@@ -350,7 +351,7 @@ def test_nothing_but_what_is_offered_can_be_begun(page: Page) -> None:
                     assert said["guide"]["ended"] == 2, said
                     assert said["guide"]["text"], said
                 else:
-                    await asyncio.sleep(1.0)  # a refusal is told once a second
+                    await asyncio.sleep(1.0)  # a refusal is logged once a second
             assert not any("question" in str(said) for said in guided.ours.heard)
 
     run(story, 120.0)
@@ -370,7 +371,7 @@ def test_a_port_that_the_daemon_has_is_told_with_how_to_end_it(tmp_path: Path) -
                 assert f"process {holder.pid}" in end["text"]
                 assert "systemctl stop acsard" in end["text"]
             told = json.loads(await text(f"{served.here}/api/guide"))
-            # A pty is a port like any other: what is said of the simulator is not said of it.
+            # A pty counts as an ordinary port: the advice for the simulator does not apply to it.
             assert (told["way"], told["advice"]) == ("", "")
 
         with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
@@ -393,7 +394,7 @@ def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(tmp_p
 
         with Page(NoDaemon(tmp_path, port), tmp_path) as served:
             run(story)
-        # The next one finds the wheels standing, and the port free.
+        # The next check finds the wheels at rest, and the port free.
         with Program(acsard("mcu", "check", "--port", port, "--yes"), tmp_path) as again:
             again.says("PASS    motor a", 30.0)
 
@@ -404,7 +405,7 @@ def test_what_may_be_begun_is_listed(page: Page) -> None:
         assert sorted(told["ways"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
         assert told["way"] == "positions"
         assert "no floor to lay a tape on" in told["advice"]
-        assert told["ports"][0]["port"] == "sim"  # the configured one
+        assert told["ports"][0]["port"] == "sim"  # the configured port
         if len(told["ports"]) == 1:
             assert "systemctl stop acsard" in told["note"]
 

@@ -60,7 +60,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
 
 @contextmanager
 def driving(client: Client, seconds: float) -> Iterator[None]:
-    """The client drives straight on at 0.2 m/s in a thread of its own."""
+    """Drive straight on at 0.2 m/s by the client, in a thread of its own."""
     failed: list[BaseException] = []
 
     def drive() -> None:
@@ -92,7 +92,10 @@ def attack(session: zenoh.Session, keys: tuple[str, ...], sender: str) -> None:
 
 
 def attacked(robot: Robot, victim: Client, sender: str = "") -> list[Any]:
-    """The states while an operator attacks the victim with this sender, else the published one."""
+    """Return the states while an operator attacks the victim.
+
+    The attack uses this sender, or else the published one.
+    """
     keys = tuple(f"acsard/acsar/cmd/teleop{end}" for end in ("", "/operator", "/maintainer"))
     with (
         Bus(robot.plain) as bus,

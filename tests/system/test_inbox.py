@@ -1,4 +1,4 @@
-"""What the bus takes in, with real Zenoh sessions and without a daemon."""
+"""The bus input accepts and drops messages of real Zenoh sessions, without a daemon."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from tests.system.harness import Bus, client_config, free_endpoint, until
 
 
 class Deaf:
-    """Told that something came in; here nobody is waiting."""
+    """A stand-in for the loop that is woken when something came in. Here no loop waits."""
 
     def command(self) -> None:
-        """What may be a command."""
+        """Called for a message that may be a command."""
 
     def stop(self) -> None:
-        """A stop."""
+        """Called for a stop."""
 
 
 def test_a_stop_query_counts_although_too_many_others_are_open_for_it_to_be_answered() -> None:
     prefix, endpoint = "acsard/acsar/", free_endpoint()
-    # Never started, so no query is ever answered, as behind clients that read no reply.
+    # The input is never started, so no query is answered, as with clients that read no reply.
     inbox = Inbox(prefix, Replies(prefix), (), Deaf())
     with zenoh.open(client_config(endpoint, "router")) as robot, Bus(endpoint) as bus:
         topics = ("info", "srv/stop")
         held = [robot.declare_queryable(prefix + t, partial(inbox.on_query, t)) for t in topics]
         asked = [bus.session.get(f"{prefix}info", timeout=60.0) for _ in range(TICKETS + 1)]
-        # One more is let go, at once, and so is the stop itself; but it counts.
+        # One more query is dropped at once, and so is the stop itself; but the stop counts.
         assert list(bus.session.get(f"{prefix}info", timeout=60.0)) == []
         assert inbox.take(0).arrivals == ()
         assert list(bus.session.get(f"{prefix}srv/stop", timeout=60.0)) == []

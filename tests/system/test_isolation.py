@@ -1,7 +1,8 @@
-"""Whoever is let in over TLS: the loop, the stop and the other users are not disturbed.
+"""A client that is admitted over TLS cannot disturb the loop, the stop or the other users.
 
-Each attack comes with a viewer's certificate and with one that nobody listed, while somebody at the
-machine drives: at the robot's own door, and at the router of a fleet that the robot is behind.
+Each attack comes with a viewer's certificate and with an unlisted certificate, while a local
+client drives. The attack goes to the robot's own TLS gateway, and to the router of a fleet to which
+the robot belongs.
 """
 
 from __future__ import annotations
@@ -73,55 +74,58 @@ FORMS = [
 ]
 
 HALT = ("may_stop", "may_call")
-"""Whoever sees the robot may stop it: it stands then, and nobody drives on."""
+"""Attacks that stop the robot.
+
+Any client that sees the robot may stop it; it then stands and no client drives on.
+"""
 
 LARGE = ("many@1500", "many@3000", "many_chunks@3000", *HALT)
-"""In the long runs only."""
+"""Attacks of the long runs only."""
 
 LONG_S = 10.0
-"""From here on a run is a long one."""
+"""A run of at least this length is a long one."""
 
 AGAIN_S = 5.0
-"""How often it is cleared, driven and stopped again in a long one."""
+"""In a long run, the robot is cleared, driven and stopped again once per this time."""
 
 
 class Stop(NamedTuple):
-    """A local `stop`."""
+    """The reaction to a local `stop`."""
 
     took: float
-    """To the first slower line, s."""
+    """Time to the first slower line, s."""
     lost: float
-    """What the machine took meanwhile of a bare process, s."""
+    """The time that the machine took meanwhile from a bare process, s."""
 
 
 class Figures(NamedTuple):
-    """What an attack did."""
+    """The effects of an attack."""
 
     periods: Periods
     calm: Periods
-    """Of the same robot, driven for a while before it."""
+    """The same robot's periods, driven for a while before the attack."""
     stops: tuple[Stop, ...]
     grown_kb: int
     back: float
-    """How long an operator takes to be answered when the attacker has gone, s."""
+    """Time until an operator gets an answer after the attacker has gone, s."""
     taken: float
-    """What the machine took meanwhile of a bare process, s."""
+    """The time that the machine took meanwhile from a bare process, s."""
 
 
 class Network(NamedTuple):
-    """How others reach a robot."""
+    """The way by which other hosts reach a robot."""
 
     tls: str
-    """Where."""
+    """The endpoint."""
     shown: Callable[[Identity], dict[str, object]]
-    """Zenoh's `transport/link/tls` of one who comes there."""
+    """Zenoh's `transport/link/tls` of a client that comes there."""
     tables: Tables
-    """What it takes in the robot's configuration."""
+    """The settings that it needs in the robot's configuration."""
     robot: str = "acsar"
 
 
 class Robot:
-    """A robot that somebody at the machine drives."""
+    """A robot that a local client drives."""
 
     def __init__(self, where: Path, network: Network) -> None:
         self._where, self._network, self._plain = where, network, free_endpoint()
@@ -134,11 +138,11 @@ class Robot:
         self.daemon = Daemon(where, self._peer.path, tables, endpoint=self._plain)
 
     def _joined(self) -> Bus:
-        """One at the machine."""
+        """Run a client on the robot's machine."""
         return Bus(self._plain, self._network.robot)
 
     def attacked(self, form: str, who: Identity, seconds: float) -> Figures:
-        """What becomes of it."""
+        """Run the attack and return its effects."""
         with self._peer, self.daemon, self._joined() as bus:
             bus.linked()
             with ExitStack() as driven:
@@ -164,13 +168,13 @@ class Robot:
     @staticmethod
     @contextmanager
     def _driven(bus: Bus) -> Iterator[None]:
-        """Somebody at the machine drives it, while entered."""
+        """Drive by a local client while entered."""
         with bus.commanding(0.3):
             until(lambda: (bus.state()["linear"] or 0.0) > 0.25, 5.0, "it drives")
             yield
 
     def locked(self, seconds: float) -> tuple[Periods, Mapping[str, int]]:
-        """What becomes of the periods and the counters while Zenoh cleans up behind a local one."""
+        """Return the periods and the counters while Zenoh cleans up after a local attacker."""
         with self._peer, self.daemon, self._joined() as bus, bus.follow("odom"):
             bus.linked()
             begun = bus.state()
@@ -180,7 +184,7 @@ class Robot:
                 assert attacker.ended(10.0) == 0
             until(lambda: self.daemon.events("bus_stuck"), 10.0, "the log says it")
             time.sleep(seconds)
-            # A question waits as long as the lock is held.
+            # A query waits as long as the lock is held.
             until(lambda: bus.ask("info"), 30.0, "the bus is free again")
             ended = bus.state()
         return Periods.between(begun, ended), ended["counters"]
@@ -188,7 +192,10 @@ class Robot:
     def _under(
         self, form: str, who: Identity, seconds: float, bus: Bus, driven: ExitStack
     ) -> tuple[int, tuple[Stop, ...]]:
-        """What the daemon grew by, and the stops; in a long run it is driven again behind each."""
+        """Return the daemon's growth and the stops.
+
+        In a long run the robot is driven again after each.
+        """
         memory_kb, most_kb = resident_kb(self.daemon.pid), 0
         network, text = self._network, HOSTILE.replace("acsard/acsar", self._root)
         attack = words(text, form, network.tls, json.dumps(network.shown(who)), seconds)
@@ -209,13 +216,13 @@ class Robot:
         return most_kb, tuple(stops)
 
     def _again(self, bus: Bus, driven: ExitStack) -> None:
-        """Clear, zeros, drive."""
+        """Clear the robot, send zeros, and drive."""
         driven.close()
         assert bus.get("srv/clear")["success"]
         driven.enter_context(self._driven(bus))
 
     def _stopped(self) -> Stop:
-        """From a stop by one who has just come to this machine to the wire."""
+        """Return the time from a stop, by a client that has just connected here, to the wire."""
         with self._joined() as other:
             said = time.monotonic()
             before = wheels(self._peer.lines[-1].line)[0]
@@ -230,7 +237,7 @@ class Robot:
         return Stop(slower.at - said, lost(said, slower.at))
 
     def _back(self) -> float:
-        """How long an operator over TLS takes to be answered."""
+        """Return the time until an operator over TLS gets an answer."""
         begun = time.monotonic()
 
         def answered() -> bool:
@@ -239,7 +246,7 @@ class Robot:
                 shown = json.dumps(self._network.shown("operator"))
                 config.insert_json5("transport/link/tls", shown)
                 with zenoh.open(config) as session:
-                    # Long: an answer that is late is to be timed, not asked for again.
+                    # The timeout is long, so that a late answer is timed and not requested again.
                     return any(r.ok for r in session.get(f"{self._root}/state", timeout=5.0))
             except zenoh.ZError:
                 return False
@@ -249,7 +256,7 @@ class Robot:
 
 
 class Door(NamedTuple):
-    """A robot with a door of its own, and the certificates for it."""
+    """A robot with its own TLS gateway, and the certificates for it."""
 
     certificates: Certificates
 
@@ -270,7 +277,7 @@ Router = Callable[[Path, str], Program]
 
 @contextmanager
 def fleet(where: Path, router: Router) -> Iterator[Network]:
-    """A router with the rules of deploy/zenoh, and how a robot behind it is reached."""
+    """A router with the rules of deploy/zenoh, and the way to a robot behind it."""
     tls = free_tls_endpoint()
     certified(where, "robot1", ITS_NAME, "viewer", "operator", "unlisted")
     bus: dict[str, object] = {"listen": [], "connect": [tls], "tls": str(where / "robot1")}
@@ -290,11 +297,11 @@ def _answers(endpoint: str) -> bool:
 
 
 def undisturbed(figures: Figures, *, long: bool = False, back_s: float = BACK_S) -> None:
-    """The loop, the stop, the daemon's memory and the other users."""
+    """Check the loop, the stop, the daemon's memory and the other users."""
     elapsed = figures.periods.elapsed
     calm = figures.calm.missed * elapsed / figures.calm.elapsed
     allowed = calm + 100.0 * figures.taken
-    if not long:  # too short to know either well
+    if not long:  # too short to measure either well
         allowed += calm + 0.01 * elapsed + 4
     assert figures.periods.missed <= allowed
     assert all(0.0 < stop.took <= STOP_S + stop.lost for stop in figures.stops)
@@ -306,7 +313,10 @@ Forms = Mapping[Identity, Sequence[str]]
 
 
 def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
-    """Each for half a minute in the long runs; for a moment, every time, those that differ most."""
+    """Each attack takes half a minute in the long runs.
+
+    The most different ones run briefly every time.
+    """
     return [
         pytest.param(form, who, seconds, marks=marks)
         for forms, seconds, marks in ((a_moment, 1.5, ()), (half_a_minute, 30.0, pytest.mark.soak))
@@ -357,7 +367,7 @@ def test_who_attacks_the_fleets_router_does_not_disturb_the_robot_behind_it(
 
 
 HOLD_UP = ("publish", "querier", "as_peer")
-"""What zenohd's rules do not ask about: it is held up, and must be started again by hand."""
+"""Attacks that zenohd's rules do not cover: they block the router, and a person must restart it."""
 
 
 @pytest.mark.parametrize("form", [form for form in FORMS if form not in HOLD_UP])
@@ -369,7 +379,10 @@ def test_who_attacks_zenohd_does_not_disturb_the_robot_behind_it(tmp_path: Path,
 
 
 def test_a_bus_that_is_locked_costs_messages_and_no_period(tmp_path: Path, door: Door) -> None:
-    """On the machine anybody may use wildcards: what holds Zenoh's tables holds who puts."""
+    """On the robot's machine any client may use wildcards.
+
+    A client that holds the lock on Zenoh's tables blocks every program that puts.
+    """
     periods, counters = Robot(tmp_path, door.network()).locked(0.5)
     print(f"\n{periods}, {counters}")
     assert periods.missed <= 0.01 * periods.elapsed + 4
@@ -381,7 +394,7 @@ def test_a_bus_that_is_locked_costs_messages_and_no_period(tmp_path: Path, door:
 def test_behind_the_door_not_even_wildcards_disturb(tmp_path: Path, door: Door, form: str) -> None:
     figures = Robot(tmp_path, door.network(wildcards=True)).attacked(form, "viewer", 1.5)
     print(f"\n{form} with wildcards: {figures}")
-    # The door's tables are tidied at the machine's pace, 1.7 s on a quick one; newcomers wait.
+    # The gateway's tables are cleaned at the machine's speed, 1.7 s on a fast one; newcomers wait.
     undisturbed(figures, back_s=3 * BACK_S)
 
 

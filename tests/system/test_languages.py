@@ -1,9 +1,8 @@
-"""deploy/clients as its page says: the examples follow a robot, types made of the schemas read it.
+"""The examples in deploy/clients follow a robot, and types generated from the schemas read it.
 
-    pytest -m 'languages and not soak'   Rust, types in TypeScript and Python: two minutes
-    pytest -m languages                  TypeScript too, whose bridge is built for ten minutes
-
-What is built is kept in pytest's cache.
+`pytest -m 'languages and not soak'` runs Rust and the types in TypeScript and Python: two minutes.
+`pytest -m languages` also runs TypeScript, whose bridge takes ten minutes to build. The builds are
+kept in pytest's cache.
 """
 
 from __future__ import annotations
@@ -37,14 +36,14 @@ BRIDGE = "zenoh-bridge-remote-api"
 
 @pytest.fixture(scope="module")
 def kept(request: pytest.FixtureRequest) -> Path:
-    """A place for what takes long to build."""
+    """Return a directory for builds that take long."""
     cache = request.config.cache
     assert cache is not None
     return Path(cache.mkdir("languages"))
 
 
 def program(name: str, needed: str) -> str:
-    """Where it is; the test is skipped without it."""
+    """Return the path of a tool; skips the test if it is not installed."""
     found = shutil.which(name)
     if found is None:
         pytest.skip(f"no {name} on the PATH: {needed}")
@@ -52,7 +51,7 @@ def program(name: str, needed: str) -> str:
 
 
 def run(words: Sequence[str], where: Path, **more: str) -> str:
-    """Run to the end, which is a good one."""
+    """Run it to the end, which must be successful."""
     done = subprocess.run(
         words, cwd=where, env=environment(**more), capture_output=True, text=True, check=False
     )
@@ -66,7 +65,7 @@ LINE = re.compile(r"x (-?\d+\.\d{3}) m, y (-?\d+\.\d{3}) m, (-?\d+\.\d{3}) m/s")
 
 
 def followed(words: Sequence[str], where: Path, bus: Bus) -> None:
-    """It prints where the robot is, and that while it drives."""
+    """Check that the example prints the robot's position, and does so while it drives."""
     with Program(words, where) as follower:
         follower.says(" m/s", 30.0)
         begun = bus.state()["x"]
@@ -100,7 +99,7 @@ def npm() -> str:
 
 @pytest.fixture(scope="module")
 def bridge(kept: Path) -> str:
-    """The one that is installed, or else the one of the page's first line, built here."""
+    """Return the installed bridge, or build the one of the page's first line."""
     words = next(line for line in commands() if line.startswith(f"cargo install {BRIDGE}"))
     if (found := shutil.which(BRIDGE)) is None:
         program("cargo", "it builds the bridge")
@@ -114,13 +113,13 @@ def bridge(kept: Path) -> str:
 
 
 def commands() -> list[str]:
-    """What the page says to type."""
+    """Return the commands that the page asks the reader to type."""
     page = "deploy/clients/README.md"
     return [line for block in blocks("sh") if block.page == page for line in block.commands()]
 
 
 def copied(language: str, kept: Path) -> Path:
-    """The example where it may be built, on top of what was built there before."""
+    """Copy the example to a directory for building, on top of an earlier build."""
     built = shutil.ignore_patterns("target", "node_modules", "dist", "*lock*")
     return shutil.copytree(CLIENTS / language, kept / language, ignore=built, dirs_exist_ok=True)
 
@@ -165,7 +164,7 @@ Said = tuple[str, Any]
 
 @pytest.fixture(scope="module")
 def schemas(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Written as the page says."""
+    """Generate the types as the page says."""
     where = tmp_path_factory.mktemp("types")
     run([sys.executable, str(CLIENTS / "python/schemas.py"), "schemas", shared.endpoint], where)
     return where / "schemas"
@@ -173,7 +172,7 @@ def schemas(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def heard(shared: Daemon) -> list[Said]:
-    """What the daemon says, of every key and in JSON."""
+    """Return a JSON message of every key that the daemon publishes or answers."""
     found: list[Said] = []
     with Bus(shared.endpoint) as bus:
         bus.linked()
@@ -192,14 +191,14 @@ def heard(shared: Daemon) -> list[Said]:
 
 
 def wrong(heard: list[Said]) -> list[Said]:
-    """What no daemon says."""
+    """Return messages that no daemon sends."""
     of = dict(heard)
     lacking = {name: value for name, value in of["Odometry"].items() if name != "twist"}
     return [("RobotState", of["RobotState"] | {"mode": "idle"}), ("Odometry", lacking)]
 
 
 def judged(words: Sequence[str], where: Path, said: list[Said]) -> list[str]:
-    """What the reader prints of each: its type, and `read` or `refused`."""
+    """Return the reader's output for each message: its type, and `read` or `refused`."""
     text = "".join(json.dumps(one) + "\n" for one in said)
     done = subprocess.run(
         words, cwd=where, env=environment(), input=text, capture_output=True, text=True, check=False

@@ -14,7 +14,7 @@ from tests.system.harness import Bus, Daemon, Program, acsard, until
 
 
 def drives(robot: Client) -> float:
-    """0.5 m/s for 0.5 s, from this x; again where a busy machine broke the link."""
+    """Drive at 0.5 m/s for 0.5 s from this x. Repeats it if a busy machine broke the link."""
     while True:
         begun, x = time.monotonic(), robot.pose().x
         try:
@@ -29,7 +29,7 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
     started = time.monotonic()
     with Daemon(tmp_path, config=config) as daemon, Bus(daemon.endpoint) as bus:
         until(lambda: bus.state()["link"] == "up", 5.0, "link up")
-        outcome = daemon.events("link_check")[-1]  # a link that a busy machine lost has two
+        outcome = daemon.events("link_check")[-1]  # if a busy machine lost the link, there are two
         assert outcome["text"] == "the serial lines are checked with samples"
         with connect(daemon.endpoint) as robot:
             began = time.monotonic()
@@ -46,7 +46,7 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
         # A line that waited for a core for longer than the next two took answers an old one.
         late = {"line_stale_sequence"} if lost(started) > 0.02 else set()
         if late and daemon.events("link_stale"):
-            late.add("line_unchecked")  # it was asked for the check anew
+            late.add("line_unchecked")  # the check was requested again
         assert {name for name in bus.state()["counters"] if name.startswith("line_")} <= late
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(2.0) == 0

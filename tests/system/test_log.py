@@ -1,4 +1,7 @@
-"""The log of the real process: who asked, what changed, how it began and ended."""
+"""The log of the real process names each caller and each change with its reason.
+
+It also says how the process began and ended.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A report in a browser: it draws under its page's own policy; a stranger's words stay words."""
+"""A report in a browser draws under its page's own policy, and a stranger's text stays text."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_it_is_drawn_and_no_strangers_program_runs(tmp_path: Path) -> None:
     path = tmp_path / "evil.html"
     evil = "<script>document.title = 'taken'</script>"
     text = page(followed(evil_steps()), origin(robot=evil + EVIL), get_plotlyjs(), clock)
-    # Were the escaping forgotten somewhere, the policy would still stop it.
+    # If the escaping were missing somewhere, the policy would still block the script.
     path.write_text(text.replace("<h1>", f"<h1>{evil}"), encoding="utf-8")
     done = subprocess.run(
         [

@@ -1,4 +1,4 @@
-"""Many robots behind one router: who is there, what they say, and all of them stopped at once."""
+"""Many robots behind one router are listed, followed, and all stopped at once."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from tests.system.identities import free_tls_endpoint
 from tests.system.test_cli import ON_TERMINAL, Terminal, screens
 from tests.system.typed import typed
 
-pytestmark = pytest.mark.slow  # two robots and a router, each time
+pytestmark = pytest.mark.slow  # each starts two robots and a router
 
 ONE, TWO = "robot1", "robot2"
 
 
 class Robots:
-    """Two of them, and where their router is."""
+    """Two robots, and the address of their router."""
 
     def __init__(self, where: Path, endpoint: str, daemons: dict[str, Daemon]) -> None:
         self.where, self.endpoint, self.daemons = where, endpoint, daemons
@@ -76,7 +76,7 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robots]:
 
 
 def messages(program: Program) -> list[Any]:
-    """What it has printed so far."""
+    """Return the messages printed so far."""
     return [json.loads(line) for line in program.out]
 
 
@@ -96,12 +96,12 @@ def test_get_of_named_robots_says_whose_each_answer_is(robots: Robots) -> None:
 
 
 HOSTILE = "[2J\x1b]0;x\x07"
-"""What a terminal would obey."""
+"""Characters that a terminal would obey."""
 
 
 @contextmanager
 def fake(robots: Robots, answer: bytes | None) -> Iterator[None]:
-    """Somebody behind the same router who says he is a robot, and gives that answer or none."""
+    """Run a client of the same router that claims to be a robot and gives that answer or none."""
     who = "acsard/fake"
 
     def reply(query: zenoh.Query) -> None:

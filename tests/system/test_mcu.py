@@ -1,4 +1,4 @@
-"""`acsard mcu check` as a person uses it: at a terminal, and on ptys with faults planted."""
+"""`acsard mcu check` works at a terminal, and finds the planted faults of boards on ptys."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ from tests.system.harness import ROOT, Bus, Daemon, Program, acsard, finish, unt
 from tests.system.test_cli import ON_TERMINAL, Terminal
 
 CHECK_S = 200.0
-"""A check takes 13 to 25 s; this is for a machine that is busy with other things, on which it looks
-again at what that spoilt."""
+"""A check takes 13 to 25 s.
+
+The limit is for a machine that is busy with other work, on which the check repeats the measurements
+that this spoilt.
+"""
 
 BESIDE = 6
-"""So many checks leave the cores of a small machine time for each other."""
+"""Number of parallel checks that leave the cores of a small machine enough time for each."""
 
 WHEELS = ("fr", "fl", "rl", "rr")
 
@@ -69,7 +72,7 @@ def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s(tmp_path: Pat
 
 @contextmanager
 def at_terminal(where: Path, *words: str) -> Iterator[tuple[Terminal, Program]]:
-    """A check at a terminal of its own."""
+    """Run a check at a terminal of its own."""
     with Terminal() as terminal:
         command = [sys.executable, "-c", ON_TERMINAL, "mcu", "check", *words]
         with Program(
@@ -84,7 +87,7 @@ def at_terminal(where: Path, *words: str) -> Iterator[tuple[Terminal, Program]]:
 
 
 def answer(terminal: Terminal, question: str, word: str, times: int, within: float) -> None:
-    """Wait until the question has been asked so many times, then type."""
+    """Wait until the question has been asked this number of times, then type."""
     until(lambda: terminal.screen.count(question) >= times, within, f"{question}, {times} times")
     terminal.press(f"{word}\n")
 
@@ -142,7 +145,7 @@ FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
 
 
 def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
-    """Exit code, answer and what the simulator heard last, of a check of one faulty robot."""
+    """Check one faulty robot; return exit code, answer and the written configuration."""
     fault = FAULTS[name][0]
     place = where / name
     place.mkdir()
@@ -161,7 +164,10 @@ def checked(where: Path, name: str) -> tuple[int, dict[str, Any], str]:
 @pytest.mark.network
 @pytest.mark.timeout(3 * CHECK_S)
 def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: Path) -> None:
-    """Or was not judged, where this machine was late; that only then is one in virtual time."""
+    """The check finds the fault, or does not judge it because this machine was late.
+
+    A test in virtual time shows that this is the only reason for not judging it.
+    """
     with ThreadPoolExecutor(BESIDE) as pool:
         results = dict(zip(FAULTS, pool.map(lambda n: checked(tmp_path, n), FAULTS), strict=True))
     for name, (_, failed, changes) in FAULTS.items():
@@ -174,7 +180,8 @@ def test_each_planted_fault_is_found_on_a_pty_and_the_good_one_passes(tmp_path: 
         if name in ("spaces", "unpadded"):
             form = next(one for one in found["findings"] if one["name"] == "reply form")
             assert (form["verdict"], form["figure"]) == ("WARN", name)
-        # Every line of the reference is there still, but for the values of the keys that changed.
+        # Every line of the reference is still there, apart from the values of the keys that
+        # changed.
         reference = (ROOT / "acsard.toml").read_text().splitlines()
         pairs = zip(reference, text.splitlines(), strict=True)
         differing = [after for before, after in pairs if before != after]
@@ -190,7 +197,7 @@ BUSY = "while True: pass"
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("loops", [0, 4])
 def test_a_busy_computer_finds_no_fault_of_a_good_board(tmp_path: Path, loops: int) -> None:
-    """Five checks beside each other, or one beside loops of the same priority."""
+    """Run five checks in parallel, or one together with loops of the same priority."""
     spinning = [subprocess.Popen([sys.executable, "-c", BUSY]) for _ in range(loops)]
     places = [tmp_path / str(n) for n in range(1 if loops else 5)]
     for place in places:
@@ -221,14 +228,14 @@ def test_a_signal_while_a_wheel_turns_ends_in_zeros(tmp_path: Path, number: sign
         words = acsard("mcu", "check", "--port", port, "--yes")
         with Program(words, tmp_path) as check:
             check.says("checked link")
-            # It is silent now for as long as motor a turns.
+            # The check prints nothing from now on while motor a turns.
             with pytest.raises(subprocess.TimeoutExpired):
                 check.process.wait(0.5)
             check.signal(number)
             assert check.ended(5.0) == (130 if number == signal.SIGINT else 128 + number)
             assert "zeros go out" in check.stderr
             assert "Traceback" not in check.stderr
-        # The next one finds the wheels standing, and the port free.
+        # The next check finds the wheels at rest, and the port free.
         words = acsard("mcu", "check", "--port", port, "--yes")
         with Program(words, tmp_path) as again:
             again.says("PASS    motor a", 30.0)

@@ -36,13 +36,13 @@ pytestmark = [
 
 
 class Phone:
-    """A daemon, its page in a phone's browser, and somebody on the bus beside them."""
+    """A daemon, its page in a phone's browser, and another client on the bus."""
 
     def __init__(self, daemon: Daemon, bus: Bus, server: Page, browser: Browser) -> None:
         self.daemon, self.bus, self.server, self.browser = daemon, bus, server, browser
 
     def shows(self, name: str, words: str) -> None:
-        """The element with this id says so."""
+        """Wait until the element with this id contains the words."""
         said = ""
 
         def look() -> bool:
@@ -56,7 +56,7 @@ class Phone:
             raise AssertionError(f"{error}; it says {said!r}") from None
 
     def hold(self) -> None:
-        """A finger drives forwards."""
+        """Drive forwards with a finger on the stick."""
         self.browser.hold(lambda: (self.bus.state()["linear"] or 0.0) > 0.15)
 
 
@@ -89,7 +89,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     until(lambda: bus.state()["x"] > 1.0, 20.0, "a metre")
     assert bus.state()["source"] == "teleop"
     page.shows("who", "you")
-    assert (bus.state()["linear"] or 0.0) <= 0.2 + 0.03  # slow to begin with
+    assert (bus.state()["linear"] or 0.0) <= 0.2 + 0.03  # slow at the beginning
     page.browser.push(-80, 0)
     until(lambda: bus.state()["yaw"] > 0.3, 10.0, "it turns left")
     browser.touch("End")
@@ -99,7 +99,7 @@ def test_a_finger_drives_a_metre_turns_stops_and_clears(page: Phone) -> None:
     until(lambda: bus.state()["mode"] == "stopped", 5.0, "it stops")
     page.shows("mode", "STOPPED")
     page.shows("reason", "press Clear")
-    # Who still holds the stick does not drive when somebody clears.
+    # A person who still holds the stick does not drive when another person clears.
     browser.touch("End")
     browser.tap("clear")
     page.shows("mode", "READY")
@@ -123,7 +123,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
         page.shows("mode", "READY")
     browser.tap("tab-drive")
     page.hold()
-    bus.get("srv/stop")  # by somebody else
+    bus.get("srv/stop")  # by another client
     page.shows("told", "why stands above")
     assert browser.js("document.body.innerText").count("press Clear") == 1
     bus.get("srv/clear")
@@ -161,7 +161,7 @@ def test_keys_drive_while_they_are_held(page: Phone) -> None:
 
 
 def pressed(browser: Browser, code: str, number: int) -> None:
-    """A key with what it does to what has the focus."""
+    """Press a key, with its effect on the focused element."""
     for kind in ("rawKeyDown", "keyUp"):
         browser.ask(
             "Input.dispatchKeyEvent", type=kind, code=code, key=code, windowsVirtualKeyCode=number
@@ -219,7 +219,7 @@ def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
 
 
 def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Phone) -> None:
-    """The browser tells no pointerup until the last of them is up."""
+    """The browser sends no pointerup until the last finger is lifted."""
     browser, bus = page.browser, page.bus
     browser.size(*DESKTOP, touch=False)
     x, y = browser.middle("stick")
@@ -229,7 +229,7 @@ def test_a_mouse_that_lets_go_of_its_button_beside_another_one_lets_go(page: Pho
         browser.ask("Input.dispatchMouseEvent", x=x, y=y - dy, **told)
 
     def drives() -> bool:
-        """A page that let go, because the machine was busy, has to be pressed anew."""
+        """If the page released the stick on a busy machine, the mouse presses it again."""
         if not browser.js("document.getElementById('stick').matches('.held')"):
             mouse("Released", button="left", buttons=0)
             mouse("Pressed", button="left")
@@ -250,7 +250,7 @@ COARSE = """(() => {
     const now = performance.now.bind(performance);
     performance.now = () => Math.floor(now() / 100) * 100;
 })();1"""
-"""The clock of a browser that tells nobody the time exactly."""
+"""The clock of a browser that tells no page the exact time."""
 
 
 def test_a_browser_whose_clock_stands_for_a_tenth_of_a_second_drives_and_lets_go(
@@ -269,11 +269,11 @@ JAM = """(() => {
     WebSocket.prototype.send = function (text) { window.sent.push(text); send.call(this, text); };
     Object.defineProperty(WebSocket.prototype, 'bufferedAmount', {get: () => 1e6});
 })();1"""
-"""A network that takes nothing for now; what the page hands to it is written down."""
+"""A network that accepts nothing for now. The page's writes to it are logged."""
 
 
 def test_the_zero_of_a_finger_that_leaves_goes_twice_also_where_much_waits(page: Phone) -> None:
-    """A daemon that reads late may drop one that comes on the heels of another command."""
+    """A daemon that reads late may drop a zero that closely follows another command."""
     page.hold()
     page.browser.js(JAM)
     page.browser.touch("End")
@@ -285,7 +285,10 @@ def test_the_zero_of_a_finger_that_leaves_goes_twice_also_where_much_waits(page:
 
 
 def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
-    """A phone freezes what it has put away; it hides it before, so here is the event alone."""
+    """A phone freezes a page that was put away.
+
+    It hides the page before, so this test sends the event alone.
+    """
     page.hold()
     page.browser.js("document.dispatchEvent(new Event('freeze'))")
     page.bus.at_rest()
@@ -293,7 +296,10 @@ def test_a_page_that_is_frozen_lets_go(page: Phone) -> None:
 
 
 def test_a_page_lets_go_when_the_browser_is_about_to_go_elsewhere(page: Phone) -> None:
-    """It waits for this event alone; what it tells afterwards is late on a busy machine."""
+    """The test waits for this event alone.
+
+    The browser reports the later ones late on a busy machine.
+    """
     page.hold()
     page.browser.js("window.dispatchEvent(new Event('beforeunload'))")
     page.bus.at_rest()
@@ -301,7 +307,7 @@ def test_a_page_lets_go_when_the_browser_is_about_to_go_elsewhere(page: Phone) -
 
 
 def viewers(page: Phone) -> int:
-    """Who looks, as the page's server knows it."""
+    """Return the number of viewers that the page's server knows."""
     _, told = asyncio.run(answer(f"{page.server.here}/metrics"))
     return int(re.findall(r"^acsard_page_viewers\{.*\} (\d+)$", told, re.MULTILINE)[0])
 
@@ -309,7 +315,7 @@ def viewers(page: Phone) -> int:
 def test_a_page_that_is_left_is_gone_at_once_and_there_again_when_somebody_goes_back(
     page: Phone,
 ) -> None:
-    """The browser keeps it, asleep, with all that it has open."""
+    """The browser keeps the page, asleep, with everything that it has open."""
     browser = page.browser
     assert viewers(page) == 1
     left = time.monotonic()
@@ -395,7 +401,7 @@ def test_a_gamepad_that_is_gone_lets_go(page: Phone) -> None:
     browser, bus = page.browser, page.bus
     browser.js(PAD.replace("AXES", "[0, -1, 0, 0]").replace("HELD", "true") + ";1")
     until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "it drives")
-    # What it said last stays held, as with a battery that is empty.
+    # The gamepad's last values stay pressed, as when its battery is empty.
     browser.js("dispatchEvent(new Event('gamepaddisconnected'))")
     page.shows("told", "the gamepad is gone")
     bus.at_rest()
@@ -439,7 +445,7 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     page.daemon.signal(signal.SIGSTOP)
     try:
         page.shows("age", "STALE")
-        page.shows("mode", "NOT HEARD")  # nobody knows whether it still drives
+        page.shows("mode", "NOT HEARD")  # the page cannot know whether it still drives
         page.shows("reason", "nothing is heard of the daemon")
         assert page.browser.js("document.body.classList.contains('stale')")
     finally:
@@ -457,14 +463,14 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
 def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_measured(
     page: Phone,
 ) -> None:
-    """Its server has a state of before still."""
+    """The page's server still has a state from before."""
     browser = page.browser
     page.daemon.signal(signal.SIGSTOP)
     try:
         page.shows("reason", "nothing is heard of the daemon")
         browser.open(page.server.here)
         page.shows("reason", "nothing is heard of the daemon")
-        browser.js("new Promise(done => setTimeout(done, 500))")  # more than one look
+        browser.js("new Promise(done => setTimeout(done, 500))")  # more than one poll
         said = [browser.text(one) for one in ("mode", "age", "speed", "turn", "who")]
         assert said == ["WAITING", "waiting", "–", "–", "–"]
         assert not browser.js("document.body.classList.contains('stale')")
@@ -490,7 +496,7 @@ def test_a_robot_without_its_board_has_no_speed(tmp_path: Path, browser: Browser
 
 
 def row(page: Phone, source: str) -> str:
-    """What the table says of a source."""
+    """Return the row of a source in the table."""
     rows = "[...document.querySelectorAll('#sources tr')].map(row => row.textContent)"
     return next((str(one) for one in page.browser.js(rows) if one.startswith(source)), "")
 
@@ -502,7 +508,7 @@ SET = """(() => {
     button.click();
     return true;
 })()"""
-"""As a person in many a country types it."""
+"""Decimal comma, as people in many countries type it."""
 
 
 def test_what_is_set_and_switched_on_the_page_is_so(page: Phone) -> None:
@@ -521,13 +527,13 @@ DRAWN = (
     "new Promise(done => setTimeout(() => done(document.getElementById('map').toDataURL()), 100))"
 )
 STEADY = 5
-"""Looks, one every 100 ms, at which nothing has changed any more."""
+"""Number of looks, one every 100 ms, at which nothing has changed any more."""
 
 
 def test_the_map_is_nearer_and_farther_and_follows_the_robot_again(page: Phone) -> None:
-    """Each button changes what is drawn, and the way back is the way there."""
+    """Each button changes the drawing, and the reverse button restores it."""
     browser = page.browser
-    # What comes in the beginning (the robot's place, a banner that goes) changes it too.
+    # Messages at the beginning (the robot's place, a banner that goes) change the drawing, too.
     looks = [str(n) for n in range(STEADY)]
 
     def stands() -> bool:
@@ -557,7 +563,7 @@ def test_somebody_else_who_drives_is_named(page: Phone) -> None:
     with page.bus.commanding(0.1, source="teleop"):
         page.browser.tap("tab-status")
         until(lambda: "drives" in row(page, "teleop"), 5.0, "who drives is in the table")
-        assert row(page, "app").endswith("a command")  # what it waits for
+        assert row(page, "app").endswith("a command")  # the command for which it waits
         page.browser.tap("tab-drive")
         page.shows("who", "teleop")
         assert page.browser.text("who") != "you"
@@ -576,7 +582,7 @@ BOXES = """['stick', 'stop', 'limit', 'hint', 'speed', 'mode', 'map'].map(name =
 })"""
 
 PIECE_PX = 90
-"""Of the path, and of the stick."""
+"""The least width and height of the path and of the stick, px."""
 
 
 @pytest.mark.parametrize("size", SCREENS)
@@ -597,7 +603,7 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
     for name in ("map", "stick"):
         left, top, right, bottom = boxes[name]
         assert min(right - left, bottom - top) >= PIECE_PX, name
-    # Nothing is hidden behind an edge that would have to be scrolled.
+    # Nothing is hidden behind an edge that would need scrolling.
     more = "(one => one.scrollHeight - one.clientHeight)(document.querySelector('main'))"
     assert page.browser.js(more) <= 0
     for view in VIEWS:
@@ -607,7 +613,7 @@ def test_stick_stop_speed_mode_and_path_fit_on_the_screen_beside_each_other(
 
 def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
     page.bus.get("srv/stop")
-    page.shows("mode", "STOPPED")  # with Clear
+    page.shows("mode", "STOPPED")  # together with Clear
     for size, view in itertools.product((PHONE, SIDEWAYS, SMALL_SIDEWAYS), VIEWS):
         page.browser.size(*size)
         pictures.show(page.browser, view)
@@ -628,7 +634,7 @@ def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
     async def story() -> None:
         async with AsyncExitStack() as stack:
             left = CONNECTIONS_HERE
-            while left:  # the page that was open here goes when it is noticed
+            while left:  # the page that was open here disappears once the server notices
                 with suppress(aiohttp.WSServerHandshakeError):
                     other = await stack.enter_async_context(hands(page.server))
                     reading.append(asyncio.create_task(read(other)))
@@ -638,7 +644,7 @@ def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
     reading: list[asyncio.Task[None]] = []
 
     async def read(other: Hands) -> None:
-        """As one who is there, however long it takes."""
+        """Stay connected as a viewer, however long it takes."""
         async for _ in other.socket:
             pass
 
@@ -680,7 +686,7 @@ SHOWN = """new MutationObserver(() => {
     if (says("mode") === "READY" && says("where"))
         requestAnimationFrame(() => setTimeout(() => window.shown ??= performance.now()));
 }).observe(document, {subtree: true, childList: true, characterData: true})"""
-"""Notes when mode and place of the robot can be read, ms after the address was called."""
+"""Notes when mode and place of the robot are readable, ms after the address was opened."""
 
 BARE = """\
 from aiohttp import web
@@ -708,11 +714,11 @@ app = web.Application()
 app.add_routes([web.get("/", index), web.get("/ws", socket)])
 web.run_app(app, host="127.0.0.1", port=0, print=lambda text: print(text, flush=True))
 """
-"""The least that shows what comes over a WebSocket."""
+"""The smallest page that shows messages from a WebSocket."""
 
 
 class Look(NamedTuple):
-    """What one costs."""
+    """The cost of opening a page once."""
 
     ms: float
     received: int
@@ -743,7 +749,7 @@ def test_a_first_look_is_small_and_the_second_one_smaller(page: Phone, tmp_path:
             )
     first, second = looks["the page"]
     assert second.received < first.received <= 1_500_000
-    # 2 s and 0.7 s where a bare page takes 0.1 s and less.
+    # 2 s and 0.7 s, while a bare page takes 0.1 s and less.
     bare_ms = min(look.ms for look in looks["a bare one"])
     assert first.ms < 20 * bare_ms + 1000.0
     assert second.ms < 15 * bare_ms + 500.0
@@ -766,7 +772,7 @@ HAND = """import('/page/hand.js').then(({Hand, ZERO, twist, objection}) => {
 
 
 def by_hand(page: Phone, script: str) -> list[Any]:
-    """What the pure part says, run where it runs."""
+    """Run the page's pure part in the browser and return its results."""
     return list(page.browser.js(HAND.replace("SCRIPT", script)))
 
 
@@ -785,7 +791,7 @@ STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
 })"""
 
 FAILS = ["sent", "STOP: no answer; it is sent again"]
-"""What a first one without an answer does."""
+"""The expected trace of a first attempt that gets no answer."""
 
 
 @pytest.mark.parametrize(
@@ -829,7 +835,7 @@ def test_a_stop_is_sent_until_it_arrived_and_never_much_later_than_it_was_presse
 
 
 def test_a_page_that_is_hidden_says_its_zero_once(page: Phone) -> None:
-    """Its timers run late, when somebody else may drive."""
+    """The page's timers run late while another client may drive."""
     page.hold()
     page.browser.js(JAM)
     page.browser.js(
@@ -898,7 +904,7 @@ def test_what_is_typed_is_a_number_with_a_comma_too_but_between_several(page: Ph
 
 
 def test_a_list_of_settings_has_no_space_and_says_why(page: Phone) -> None:
-    """Space is STOP, in a field too."""
+    """Space is STOP, in a text field too."""
     browser = page.browser
     browser.tap("tab-set")
     fields = "[...document.querySelectorAll('#settings input')]"
@@ -924,7 +930,7 @@ def test_what_strangers_write_is_text(page: Phone) -> None:
 
 WORDS = """one => one.getAttribute('aria-describedby')?.split(' ')
     .map(name => document.getElementById(name).textContent).join(' ') ?? ''"""
-"""What describes an element to who does not see it."""
+"""The description of an element for a screen reader."""
 
 
 def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> None:
@@ -987,7 +993,7 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
             opened = "document.querySelector('#recordings a[target=_blank]')"
             until(lambda: browser.js(f"Boolean({opened})"), 60.0, "a report")
             assert browser.too_small() == []
-            # In the place of our page, since one page is what the test looks at.
+            # Open the report in place of our page, because the test looks at one page.
             browser.open(browser.js(f"{opened}.href"))
             drawn = "document.querySelectorAll('.js-plotly-plot').length"
             until(lambda: browser.js(drawn) == 7, 30.0, "pictures")
@@ -1006,7 +1012,7 @@ def test_curves_that_lie_on_each_other_are_told_apart_and_say_their_values(page:
     values = r"^(front right|front left|rear left|rear right) .?\d+\.\d\d$"
     until(lambda: all(re.match(values, one) for one in browser.js(legend)), 10.0, "values")
     assert len(browser.js(legend)) == 4
-    # Standing still all four are zero: each has its colour somewhere on the line.
+    # At rest all four are zero: each has its colour somewhere on the line.
     until(lambda: browser.js(SEEN) == 4, 20.0, "four colours")
 
 
@@ -1025,13 +1031,13 @@ ABOVE = """(() => {
         return count;
     });
 })()"""
-"""Points of the measured and of the wished speed in the upper half of their plot."""
+"""Number of points of the measured and of the commanded speed in the upper half of their plot."""
 
 
 def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
     page: Phone,
 ) -> None:
-    """It was driven before anybody looked, then while a page was open, and stands now."""
+    """A client drove the robot before any page was open, then while one was. It stands now."""
     browser, bus = page.browser, page.bus
     browser.open("about:blank")
     until(lambda: viewers(page) == 0, 5.0, "nobody looks")
@@ -1040,7 +1046,7 @@ def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
     bus.at_rest()
 
     def looked() -> tuple[int, int]:
-        """Comes anew."""
+        """Open the page again, and count the points."""
         browser.open(page.server.here)
         page.shows("mode", "READY")
         browser.tap("tab-status")

@@ -1,4 +1,4 @@
-"""Checks and calibrations in a real browser: asked, answered, stopped, looked at."""
+"""Checks and calibrations work in a real browser: questions, answers, stops and layout."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = [
 
 
 class Person:
-    """Somebody with a phone, at the view Set."""
+    """A person with a phone, at the view Set."""
 
     def __init__(self, browser: Browser, server: Page) -> None:
         self.browser, self.server = browser, server
@@ -56,7 +56,7 @@ class Person:
         self.click(what)
 
     def asked(self, words: str, within: float = 10.0) -> None:
-        """This is the question now, and the eye is led there."""
+        """Check that this is the current question, and that it has the focus."""
         self.shows("guide-words", words, within)
         until(lambda: not self.hidden("guide-question"), 5.0, "a question")
         focus = self.browser.js("document.activeElement.id")
@@ -66,11 +66,11 @@ class Person:
         return bool(self.browser.js(f"document.getElementById({name!r}).hidden"))
 
     def press(self, answer: str) -> None:
-        """The button of this answer."""
+        """Press the button of this answer."""
         self.browser.js(f"document.querySelector('[data-answer={answer}]').click()")
 
     def types(self, value: str) -> None:
-        """A number."""
+        """Type a number."""
         self.browser.js(f"document.getElementById('guide-number').value = {value!r}")
         self.browser.js("document.querySelector('#guide-answers .go').click()")
 
@@ -85,8 +85,10 @@ def browser() -> Iterator[Browser]:
 
 
 def sound(browser: Browser) -> None:
-    """Nothing is wider than the screen, too small for a finger or in the way of a screen reader, in
-    any light."""
+    """Check the layout in light and dark colours.
+
+    Nothing is wider than the screen, too small for a finger or an obstacle for a screen reader.
+    """
     browser.js(files("axe_core_python").joinpath("axe.min.js").read_text() + ";1")
     for size in (PHONE, DESKTOP):
         for dark in (False, True):
@@ -113,7 +115,7 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
         person.begin("check", **{"check-port": "sim"})
         person.asked("tick this")
         person.shows("guide-where", "SIMULATED")
-        # Not ticked: it does not go on.
+        # The box is not ticked, so the check does not go on.
         person.press("lifted")
         assert "tick this" in browser.text("guide-words")
         assert browser.js("document.activeElement.id") == "guide-words"
@@ -151,7 +153,7 @@ def skidding(tmp_path: Path) -> Iterator[tuple[Daemon, Bus, Page]]:
 
 
 def drives(person: Person, bus: Bus) -> None:
-    """The first leg moves; it is begun again where a busy machine has ended it."""
+    """Wait until the first leg moves. Starts it again if a busy machine has ended it."""
     told: list[str] = []
 
     def moves() -> bool:
@@ -200,7 +202,7 @@ def test_whatever_a_person_does_while_it_drives_stops_it(
     until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
     took = time.monotonic() - begun
     print(f"{way}: at rest after {took:.2f} s")
-    # 0.3 m/s at 1 m/s2, and some of the way.
+    # 0.3 m/s at 1 m/s2, and a part of the way.
     assert took < 0.3 + 0.5 + lost(begun, begun + took)
     browser.lift()
     person.ended("failure" if way in ("a key", "the button", "a long press") else "stopped")
@@ -211,7 +213,7 @@ def test_whatever_a_person_does_while_it_drives_stops_it(
 def test_a_browser_that_stands_still_while_it_drives_stops_it_within_a_second(
     browser: Browser, skidding: tuple[Daemon, Bus, Page]
 ) -> None:
-    """Its connection stays open: that it says nothing is all there is to hear."""
+    """Its connection stays open: the server can notice only the silence."""
     _, bus, server = skidding
     person = Person(browser, server)
     drives(person, bus)
@@ -225,7 +227,7 @@ def test_a_browser_that_stands_still_while_it_drives_stops_it_within_a_second(
     finally:
         os.killpg(browser.process.pid, signal.SIGCONT)
     print(f"at rest after {took:.2f} s")
-    # And the ramp: 0.3 m/s at 1 m/s2, and some of the way.
+    # Add the ramp: 0.3 m/s at 1 m/s2, and a part of the way.
     assert took < 1.0 + 0.3 + 0.5 + lost(begun, begun + took)
     browser.open("about:blank")
 
@@ -238,7 +240,7 @@ def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
     assert browser.js("document.getElementById('way').value") == "positions"
     assert not person.hidden("positions-row")
     person.shows("advice", "no floor to lay a tape on")
-    # As it stands it works; and another one that is chosen stays so.
+    # The default works, and a different choice is kept.
     person.click("calibrate")
     person.asked("1. Set the robot", 30.0)
     person.click("guide-leave")

@@ -1,4 +1,4 @@
-"""Who opens an invitation in a real browser: let in, whatever the network does, or told why not."""
+"""An invitation in a real browser admits the client, whatever the network does, or says why not."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = [
 ]
 
 NEXT_MS = 1200
-"""After which the page would have knocked again, twice."""
+"""Time after which the page would have tried again, twice."""
 
 
 class Stranger:
@@ -30,7 +30,7 @@ class Stranger:
         self.server, self.browser = server, browser
 
     def opens(self, token: str) -> None:
-        """The link of an invitation."""
+        """Return the link of an invitation."""
         self.browser.open(f"{self.server.away}/#token={token}")
 
     def shows(self, name: str, words: str) -> None:
@@ -38,12 +38,12 @@ class Stranger:
 
     @property
     def tries(self) -> float:
-        """What was refused for want of a token that counts."""
+        """Return the number of requests that were refused for lack of a valid token."""
         counted = self.server.refused()
         return sum(counted.get(one, 0) for one in ("no_token", "bad_token", "too_fast"))
 
     def knocks_no_more(self, since: float, times: int) -> None:
-        """Once it was refused so often."""
+        """Check that the page stops trying after this number of refusals."""
         until(lambda: self.tries >= since + times, 15.0, "it is refused")
         before = self.tries
         self.browser.js(f"new Promise(done => setTimeout(done, {NEXT_MS}))")
@@ -78,7 +78,7 @@ def stranger(server: Page, browser: Browser) -> Stranger:
 
 @contextmanager
 def silent(browser: Browser, path: str) -> Iterator[None]:
-    """What the page asks there gets no answer."""
+    """Give no answer to the page's requests for that path."""
     browser.ask("Network.setBlockedURLs", urls=[f"*/{path}"])
     yield
     browser.ask("Network.setBlockedURLs", urls=[])
@@ -99,7 +99,7 @@ def test_an_invitation_outlives_a_network_that_fails(stranger: Stranger) -> None
 def test_an_invitation_that_is_not_valid_is_told_and_nobody_knocks_on(stranger: Stranger) -> None:
     before = stranger.tries
     stranger.opens("x" * 43)
-    stranger.knocks_no_more(before, 3)  # the invitation, the socket, and why
+    stranger.knocks_no_more(before, 3)  # the invitation, the socket, and the reason
     assert "this invitation is not valid" in stranger.browser.text("reason")
     assert stranger.browser.js("location.hash") == ""
 
@@ -111,7 +111,7 @@ def test_a_token_that_has_ended_is_told_as_that_and_a_new_link_in_its_tab_lets_i
     stranger.shows("role", "viewer")
     Vault(stranger.server.state / "acsard-web").revoke("lent")
     before = stranger.tries
-    stranger.knocks_no_more(before, 2)  # the socket, and why
+    stranger.knocks_no_more(before, 2)  # the socket, and the reason
     assert "this token has ended" in stranger.browser.text("reason")
     token = stranger.server.invite("operator", "anew")
     stranger.browser.js(f"location.hash = 'token={token}'")
@@ -124,7 +124,7 @@ def test_who_comes_without_a_token_is_told_once_and_a_press_asks_again(stranger:
     browser.open(stranger.server.away)
     stranger.knocks_no_more(before, 2)
     assert "who are you?" in browser.text("reason")
-    # Invited in another tab meanwhile.
+    # The phone was meanwhile invited in another tab.
     token = stranger.server.invite("viewer", "tab")
     posted = "fetch('token', {method: 'POST', body: new URLSearchParams({token: 'TOKEN'})})"
     browser.js(posted.replace("TOKEN", token) + ".then(told => told.ok)")

@@ -1,6 +1,6 @@
-"""Each way to let go of the stick in a real browser, which is on another host than the robot.
+"""Each way to release the stick stops the robot, with a real browser on another host.
 
-What counts is what the far end of the port sees: when its lines begin to slow down, and whether any
+The tests judge the lines at the far end of the port: when they begin to slow down, and whether any
 of them ever grows again. The browser comes by HTTPS, with an invitation.
 """
 
@@ -34,36 +34,37 @@ from tests.system.hosts import Hosts, inside, on
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
 
 TIMEOUT_S, TICK_S = 0.25, 0.01
-"""Of source teleop; of the control loop."""
+"""The timeout of source teleop, and the period of the control loop."""
 
 SPEED = 0.2
 """m/s."""
 
 STEADY, LINES = b"ap04.00", 10
-"""0.2 m/s, with which the page begins, for so long."""
+"""The line of 0.2 m/s, the page's first speed, and the number of them that count as steady.
+"""
 
 EMPTY = b"-"
-"""With which the daemon begins anew when a busy machine kept the answers from it."""
+"""The line with which the daemon starts again after a busy machine kept the answers from it."""
 
 QUIET = 30
-"""Lines that are looked at when all that was on the way has arrived."""
+"""Lines that are examined after everything on the way has arrived."""
 
 HANDS = 4
-"""Browser, page, server and daemon, through which it goes: a busy machine keeps each waiting."""
+"""The browser, page, server and daemon on the way of a command. A busy machine delays each."""
 
 GOLDEN = 0.618
-"""Spreads what is tried evenly, however often."""
+"""Spreads the tried values evenly, for any number of rounds."""
 
 
 class Round(NamedTuple):
-    """What letting go once came to."""
+    """The result of one release of the stick."""
 
     took_s: float
-    """To the first slower line."""
+    """Time to the first slower line."""
     allowed_s: float
-    """With what the machine itself lost meanwhile."""
+    """The allowed time, including the time that the machine itself lost meanwhile."""
     obeyed: int
-    """Lines that grew when that was over."""
+    """Lines that grew after that time was over."""
 
 
 class Field:
@@ -72,7 +73,7 @@ class Field:
     def __init__(self, hosts: Hosts, where: Path, peer: FarPeer, daemon: Daemon) -> None:
         self.hosts, self.peer, self._where, self._daemon = hosts, peer, where, daemon
         self.longest_s = 3.0
-        """That a network is away."""
+        """The longest time for which the network is cut, s."""
         Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [hosts.address], 1)
         self._servers, self._browsers = ExitStack(), ExitStack()
         self.serve()
@@ -84,13 +85,13 @@ class Field:
         self._servers.close()
 
     def serve(self) -> None:
-        """A page's server."""
+        """Start the page's server."""
         self._servers.close()
         page = Page(self._daemon, self._where, at=self.hosts.address)
         self.server = self._servers.enter_context(on(self.hosts.robot, page))
 
     def browse(self) -> None:
-        """A browser that trusts the robot's certificate."""
+        """Start a browser that trusts the robot's certificate."""
         self._browsers.close()
         held = x509.load_pem_x509_certificate((self._where / "tls/certificate.pem").read_bytes())
         key = held.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
@@ -105,7 +106,7 @@ class Field:
         return self.browser.process.pid
 
     def ready(self) -> None:
-        """The page is open and live, and nobody touches it."""
+        """Open the page and wait until it is live; no finger touches it."""
         if self.server.process.poll() is not None:
             self.serve()
         assert self.browser.process is not None
@@ -125,23 +126,23 @@ class Field:
                 raise AssertionError(f"{error}; the page says {says}") from None
 
     def hold(self) -> None:
-        """A finger drives until the speed is steady."""
+        """Drive with a finger until the speed is steady."""
         begun = time.monotonic()
         self.browser.hold(lambda: self.steady_since(begun))
 
     def steady_since(self, at: float) -> bool:
-        """Have the last lines all had the speed?"""
+        """Return whether all of the last lines had the speed."""
         last = self.peer.since(at)[-LINES:]
         return len(last) == LINES and all(one.line.startswith(STEADY) for one in last)
 
     def settle(self) -> None:
-        """All that was on the way has arrived, or whoever had it is gone."""
+        """Wait until everything on the way has arrived, or the process that held it has gone."""
         until(lambda: not self._on_the_way(), 90.0, "nothing is on the way any more")
         now = time.monotonic()
         until(lambda: len(self.peer.since(now)) >= QUIET, 5.0, "some lines more")
 
     def _on_the_way(self) -> bool:
-        """Does a kernel hold anything that was sent and has not arrived, or was not read?"""
+        """Return whether a kernel holds bytes that were sent and not delivered, or not read."""
         for host in (self.hosts.robot, self.hosts.stranger):
             with inside(host):
                 rows = Path("/proc/thread-self/net/tcp").read_text().splitlines()[1:]
@@ -150,7 +151,10 @@ class Field:
         return False
 
     def braking(self, gone: float) -> tuple[float, float]:
-        """Seconds from then to the first slower line, and what it may take; the robot stands."""
+        """Return the seconds from then to the first slower line, and the allowed time.
+
+        The robot stands.
+        """
 
         def slower() -> Heard | None:
             since = self.peer.since(gone)
@@ -162,8 +166,11 @@ class Field:
         return at - gone, allowed
 
     def obeyed(self, gone: float) -> int:
-        """The lines that grew when the timeout of the last command was over. Before that it counts,
-        also after a moment in which a busy machine kept the answers from the daemon."""
+        """Return the lines that grew after the timeout of the last command.
+
+        Before that the command still counts, also after a moment in which a busy machine kept the
+        answers from the daemon.
+        """
         lines = [one for one in self.peer.since(gone) if one.line != EMPTY]
         grown = [
             after.at
@@ -173,11 +180,11 @@ class Field:
         return sum(at - gone > self.allowed(gone, at) for at in grown)
 
     def allowed(self, gone: float, at: float) -> float:
-        """How long it may have taken from the one to the other."""
+        """Return the allowed time from the one moment to the other."""
         return TIMEOUT_S + 2 * TICK_S + HANDS * lost(gone, at)
 
     def lets_go(self, way: Way, number: int) -> Round:
-        """Drive, let go, and look until nothing of it can come any more."""
+        """Drive, release, and watch until nothing of the drive can arrive any more."""
         self.ready()
         self.hold()
         with way(self, number) as gone:
@@ -187,8 +194,11 @@ class Field:
 
 
 Way = Callable[[Field, int], AbstractContextManager[float]]
-"""Enters when it has let go, with the time from which that counts; leaves when all is as before.
-The number is that of the round."""
+"""A way to release the stick.
+
+It yields the time of the release, and restores everything when it leaves. The number is that of the
+round.
+"""
 
 
 @contextmanager
@@ -207,7 +217,10 @@ def second_finger(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def window_blurred(field: Field, number: int) -> Iterator[float]:
-    """The focus goes to another program. Without a screen there is none: the event alone."""
+    """The focus goes to another program.
+
+    Without a screen there is no focus, so this sends the event alone.
+    """
     begun = time.monotonic()
     field.browser.js("window.dispatchEvent(new Event('blur'))")
     yield begun
@@ -215,7 +228,7 @@ def window_blurred(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def window_minimised(field: Field, number: int) -> Iterator[float]:
-    """It loses the focus, and is hidden."""
+    """The window loses the focus, and is hidden."""
     window = field.browser.ask("Browser.getWindowForTarget")["windowId"]
     begun = time.monotonic()
     field.browser.ask(
@@ -248,7 +261,7 @@ def tab_closed(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def tab_killed(field: Field, number: int) -> Iterator[float]:
-    """The process that draws it dies."""
+    """The process that draws the page dies."""
     begun = time.monotonic()
     for pid in renderers(field.browser_pid):
         with suppress(ProcessLookupError):
@@ -259,7 +272,11 @@ def tab_killed(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def page_left(field: Field, number: int) -> Iterator[float]:
-    """What the finger was on is gone; a Chromium waits for its end there, and takes no next one."""
+    """The page under the finger disappears.
+
+    A Chromium waits for the finger's end there and accepts no next one, so a new browser is
+    started.
+    """
     begun = time.monotonic()
     field.browser.open("about:blank")
     yield begun
@@ -268,7 +285,7 @@ def page_left(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def page_stalled(field: Field, number: int) -> Iterator[float]:
-    """Script runs for longer than a page may stand still; the finger is still down after it."""
+    """A script runs for longer than a page may stand still. The finger is still down after it."""
     begun = time.monotonic()
     field.browser.js(
         "(() => { const end = performance.now() + 1200; while (performance.now() < end); })()"
@@ -300,7 +317,10 @@ def browser_frozen(field: Field, number: int) -> Iterator[float]:
 
 @contextmanager
 def network_gone(field: Field, number: int) -> Iterator[float]:
-    """Nothing arrives, either way, and nobody is told; for a second to the longest."""
+    """Nothing arrives in either direction, and no program gets an error.
+
+    This lasts for between one second and the longest time.
+    """
     length_s = 1.0 + (field.longest_s - 1.0) * ((number * GOLDEN) % 1.0)
     field.hosts.cut()
     gone = time.monotonic()
@@ -342,7 +362,7 @@ def wait_until(at: float) -> None:
 
 
 def renderers(pid: int) -> list[int]:
-    """The processes of a browser that draw its pages."""
+    """Return the processes of a browser that draw its pages."""
     found = []
     for place in Path("/proc").glob("[0-9]*"):
         try:
@@ -350,7 +370,7 @@ def renderers(pid: int) -> list[int]:
             if group == pid and b"--type=renderer" in (place / "cmdline").read_bytes():
                 found.append(int(place.name))
         except (OSError, IndexError):
-            continue  # gone meanwhile
+            continue  # it has ended meanwhile
     return found
 
 
@@ -364,7 +384,7 @@ def field(hosts: Hosts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fi
 
 
 def tell(what: str, rounds: list[Round]) -> None:
-    """One row of the table, asserted."""
+    """Check one row of the table."""
     ticks = sorted(one.took_s / TICK_S for one in rounds)
     print(
         f"\n{what:16} {len(rounds):4} times  slower after {statistics.median(ticks):5.1f} ticks "
@@ -390,7 +410,7 @@ def test_a_hundred_times(field: Field, way: Way) -> None:
 
 
 class Program:
-    """One on the other host that drives all the time, come what may, and never says zero again."""
+    """A program on the other host that drives all the time and never sends a zero again."""
 
     def __init__(self, field: Field) -> None:
         self._field = field
@@ -427,13 +447,13 @@ class Program:
 
 
 def goes_on(field: Field, number: int) -> Round:
-    """The network is away, and the program has not noticed: what it says meanwhile is backwards."""
+    """The network is cut, and the program has not noticed: it sends backwards speeds meanwhile."""
     with Program(field) as program:
         with network_gone(field, number) as gone:
             program.speed = -SPEED
             took, allowed = field.braking(gone)
-        # One connection: all that was said without a network comes before what is said now, after
-        # at most as long again as it was away.
+        # There is one connection, so messages sent without a network arrive before later ones. They
+        # need at most as long again as the network was cut.
         program.speed = SPEED
         wait_until(2 * time.monotonic() - gone + 1.0)
     lines = [one.line for one in field.peer.since(gone) if one.line != EMPTY]

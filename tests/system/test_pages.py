@@ -1,4 +1,4 @@
-"""What the pages say to type is typed here, as it stands there, beside a simulated robot.
+"""Every command that a page asks the reader to type works as written, with a simulated robot.
 
 The README's Python is run by `test_client.py`.
 """
@@ -38,7 +38,7 @@ from tests.system.test_fleet import Fleet
 from tests.system.typed import typed
 
 MARKS = {"README.md": pytest.mark.slow, "deploy/zenoh/README.md": pytest.mark.network}
-"""Of pages whose commands take their time."""
+"""Marks for pages whose commands take long."""
 
 TYPED = [
     pytest.param(
@@ -51,18 +51,18 @@ TYPED = [
 ]
 
 INSTALL_S = 300.0
-"""From an index far away."""
+"""Time limit for an install from a distant package index."""
 
 
 def find(page: str, *words: str) -> str:
-    """The one command of a page with these words."""
+    """Return the only command of a page that contains these words."""
     commands = [c for block in blocks() if block.page == page for c in block.commands()]
     (found,) = {c for c in commands if all(word in c for word in words)}
     return found
 
 
 def shell(place: Path, command: str, within: float = 60.0) -> Finished:
-    """A command typed in a directory whose `.venv` has acsard, and first on the PATH."""
+    """Run a command in a directory whose `.venv` has acsard, first on the PATH."""
     path = os.pathsep.join([str(place / ".venv/bin"), os.environ["PATH"]])
     return finish(["bash", "-c", command], place, within, environment(PATH=path))
 
@@ -78,7 +78,7 @@ def with_acsard(place: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def desk(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory whose acsard.toml is of the robot that runs, as in a clone."""
+    """Provide a directory, like a clone, whose acsard.toml is that of the running robot."""
     place = with_acsard(tmp_path_factory.mktemp("desk"))
     write_config(place / "acsard.toml", {"bus": {"listen": [shared.endpoint]}})
     return place
@@ -107,7 +107,7 @@ def test_the_flash_of_the_firmware_page_calls_avrdude_with_its_port() -> None:
     assert re.search(r"avrdude .*-P /dev/ttyACM0 .*firmware\.hex", done.out)
 
 
-# what takes longer
+# commands that take longer
 
 
 COLLECT = """\
@@ -119,7 +119,7 @@ for arguments in json.loads(sys.argv[1]):
     code = pytest.main(["--collect-only", "-qq", "-p", "no:cacheprovider", *arguments])
     print("ended", int(code), arguments, flush=True)
 """
-"""One process for all: most of the time goes into imports."""
+"""One process runs all of them, because imports take most of the time."""
 
 
 @pytest.mark.network
@@ -200,12 +200,12 @@ def test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page(tmp_p
             assert code("laptop-anna", "call", "clear") == 0
 
 
-# what installs from an index
+# commands that install from an index
 
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
-    """The files of a clone, without what has been made in it."""
+    """Copy the files of a clone, without build products."""
     place = tmp_path / "clone"
     for name in ("acsard", "deploy"):
         made = shutil.ignore_patterns("__pycache__", "build")
@@ -216,7 +216,7 @@ def clone(tmp_path: Path) -> Path:
 
 
 def of_a_stranger(**more: str) -> dict[str, str]:
-    """An environment in which only what was installed can be imported."""
+    """Return an environment that can import only installed packages."""
     env = environment(**more)
     del env["PYTHONPATH"]
     return env
@@ -225,7 +225,7 @@ def of_a_stranger(**more: str) -> dict[str, str]:
 @pytest.mark.network
 @pytest.mark.timeout(2 * INSTALL_S)
 def test_the_first_command_of_the_readme_installs_it_and_the_robot_is_up(clone: Path) -> None:
-    endpoint = free_endpoint()  # 7448 may be in use here
+    endpoint = free_endpoint()  # port 7448 may be in use here
     config = write_config(clone.parent / "other.toml", {"bus": {"listen": [endpoint]}})
     env = of_a_stranger(ACSARD_CONFIG=str(config))
     words = ["bash", "-c", find("README.md", "'.[web,top]'")]

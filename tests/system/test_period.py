@@ -21,8 +21,11 @@ TICK_S = 0.01
 
 
 def undisturbed(tmp_path: Path, length: float) -> tuple[Periods, float, bool]:
-    """So many seconds on the simulator without commands, how many it waited for a core, and whether
-    the link was up all the time."""
+    """Run on the simulator without commands.
+
+    Returns the periods, the seconds the daemon waited for a core, and whether the link was up all
+    the time.
+    """
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus, bus.follow("state") as states:
         begun = states.find(lambda state: state["link"] == "up", 5.0, "link up")
         first = begun.value
@@ -48,11 +51,14 @@ def undisturbed(tmp_path: Path, length: float) -> tuple[Periods, float, bool]:
 
 
 def is_even(periods: Periods, waited: float, up: bool) -> None:
-    """Within 1 % of the rate, but for a line at either end and for periods that the machine took,
-    and every gap counted."""
+    """The number of lines is within 1 % of the rate.
+
+    One line at either end and the periods that the machine took are allowed, and every gap is
+    counted.
+    """
     least, most = periods.elapsed * 0.99 - 1, periods.elapsed * 1.01 + 1
     assert least - waited / TICK_S <= periods.sent <= most
-    # A link that was lost may have periods in which nothing is said.
+    # A link that was lost may have periods without a line.
     assert periods.are_all_accounted_for() or not up
 
 

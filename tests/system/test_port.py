@@ -1,4 +1,4 @@
-"""The serial port itself, on a real pty: what it sends and what it does not."""
+"""The serial port on a real pty sends what it should, and nothing else."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GO = b"ap05.00,bp05.00,cp05.00,dp05.00\r\n"
 
 
 def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() -> None:
-    """The step was stopped before it wrote, and goes on later. A stop is never too old."""
+    """The step was suspended before it wrote, and goes on later. A stop is never too old."""
 
     async def offered() -> Sequence[str]:
         async with SerialPort(
@@ -59,7 +59,7 @@ def test_a_line_made_before_the_process_stood_still_does_not_leave_after_it() ->
 
 
 def test_behind_a_suspend_the_port_is_opened_anew() -> None:
-    """As its clock shows it: this machine cannot be suspended."""
+    """The clock simulates the suspend, because this machine cannot be suspended."""
     slept, told = [0], list[Event]()
 
     async def opened() -> tuple[int, bool, int]:
@@ -94,7 +94,7 @@ def test_a_port_for_which_there_was_no_thread_is_opened_by_the_next_try() -> Non
     told = list[Event]()
 
     async def opened() -> bool:
-        usual = threading.stack_size(1 << 46)  # which no machine has room for
+        usual = threading.stack_size(1 << 46)  # for which no machine has room
         try:
             port = await SerialPort(
                 path, 115200, STOP, PERIOD_NS, lambda: None, told.append
@@ -122,7 +122,7 @@ def test_a_port_for_which_there_was_no_thread_is_opened_by_the_next_try() -> Non
 
 
 def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_silence() -> None:
-    """After a stall both the clock and the reader are due, in whatever order."""
+    """After a stall both the clock and the reader are due, in any order."""
 
     async def taken() -> tuple[list[bytes], Sequence[Received], list[bytes]]:
         async with SerialPort(
@@ -131,7 +131,7 @@ def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_silence
             os.write(master, GO)
             in_time, now = port.take(), clock.now()
             end_ns = clock.mono_ns() + 5 * 10**9
-            late = port.take(now)  # no reader has run: the loop has not had its turn
+            late = port.take(now)  # no reader has run: the event loop has not reached it
             while not late and clock.mono_ns() < end_ns:
                 late = port.take(now)
             await asyncio.sleep(0.01)
@@ -151,7 +151,10 @@ def test_a_step_that_comes_late_reads_what_lies_there_before_it_judges_a_silence
 
 
 def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_no_hang_up() -> None:
-    """What lay there when the loop looked is taken by the step; the reader is called even so."""
+    """The step takes the bytes that were there when the event loop looked.
+
+    The reader is called nevertheless.
+    """
 
     async def kept() -> tuple[int, bool, str]:
         async with SerialPort(
@@ -165,7 +168,8 @@ def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_no_han
             for _ in range(10):
                 os.write(master, GO)
                 select.select([port._fd], [], [], 5.0)
-                # In the loop's list before it looks, and finds that there is something to read.
+                # The reader is in the event loop's list before the loop finds that there is
+                # something to read.
                 loop.call_soon(late_step)
                 await asyncio.sleep(0.001)
             return b"".join(taken).count(GO), port.is_open, port.trouble
@@ -184,7 +188,7 @@ def test_a_reader_whose_turn_comes_behind_a_late_step_s_finds_nothing_and_no_han
 def test_a_device_that_vanishes_while_it_is_opened_is_waited_for(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """At each call of the opening in turn, until one gets through; no attempt ends the daemon."""
+    """Suspend each call of the opening in turn until one succeeds. No attempt ends the daemon."""
     master, slave = os.openpty()
     path, real, attempts = os.ttyname(slave), getattr(termios, name), itertools.count(1)
     left = 1

@@ -51,7 +51,7 @@ int open64(const char *path, int flags, int mode)
 """Opening the device $HANGS never ends, and leaves a dot in the file $BOOK."""
 
 TRIES = 20
-"""States, ten a second: two seconds in which it would have been tried again."""
+"""Number of states, ten a second: two seconds in which the device would have been tried again."""
 
 
 def test_a_driver_that_hangs_is_tried_once_and_another_device_is_opened(tmp_path: Path) -> None:

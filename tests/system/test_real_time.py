@@ -1,4 +1,4 @@
-"""Real-time scheduling and locked memory: taken where permitted, done without where not."""
+"""The daemon uses real-time scheduling and locked memory if permitted, and runs without."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POLICY = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 
 
 def permitted() -> bool:
-    """May this process, and so the daemon it starts, become real-time and lock its memory?"""
+    """Return whether this process, and so its daemon, may become real-time and lock memory."""
     capabilities = int(Path("/proc/self/status").read_text().partition("CapEff:")[2].split()[0], 16)
     return bool(capabilities >> 23 & 1 and capabilities >> 14 & 1)  # CAP_SYS_NICE, CAP_IPC_LOCK
 
@@ -28,7 +28,7 @@ def locked_kb(pid: int) -> int:
 
 
 def held(pid: int) -> set[str]:
-    """The files it has open."""
+    """Return the files that the process has open."""
     return {os.readlink(one) for one in Path(f"/proc/{pid}/fd").iterdir()}
 
 

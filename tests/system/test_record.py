@@ -1,6 +1,6 @@
-"""The black box of the real process: killed, ended, on a full disk, on none at all.
+"""The real process keeps its recording when killed or ended, and drives on without a disk.
 
-Real disks that refuse are in `test_record_disks.py`.
+The same holds for a full disk. Real disks that fail are in `test_record_disks.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.system import bystander
 from tests.system.harness import ROOT, Bus, Daemon, acsard, environment, finish, until
 
 LOST_S = 1.5
-"""What a kill or a power cut may cost at most."""
+"""The recording that a kill or a power cut may cost at most."""
 
 
 @contextmanager
@@ -32,12 +32,15 @@ def recording(where: Path, name: str = "daemon", **how: Any) -> Iterator[tuple[D
 
 
 def files(where: Path) -> list[Path]:
-    """Those in `where/record` under their names; what is being written has a dot before it."""
+    """Return the named files in `where/record`.
+
+    A file that is being written has a dot before its name.
+    """
     return sorted(path for path in where.glob("record/*.mcap*") if path.name[0] != ".")
 
 
 def replayed(where: Path, path: Path) -> int:
-    """The number of lines, all of which come out the same."""
+    """Return the number of lines, and check that all of them replay the same."""
     ended = finish(acsard("log", "replay", str(path)), where)
     assert ended.code == 0, ended
     found = re.match(r"([\d ]+) of ([\d ]+) lines the same", ended.out)
@@ -47,7 +50,7 @@ def replayed(where: Path, path: Path) -> int:
 
 
 def last_s(where: Path, path: Path) -> float:
-    """When the last step that can be read was, wall clock."""
+    """Return the wall clock of the last step that can be read."""
     code = (
         "import sys, pathlib; from acsard.record import replayed, file;"
         "recording = file.Recording(pathlib.Path(sys.argv[1]));"
@@ -95,7 +98,7 @@ def step(robot, inputs):
     return whole(robot, inputs)
 Robot.step = step
 """
-"""Put into the daemon: a stop is beyond it."""
+"""Injected into the daemon: its step raises an exception for a stop."""
 
 
 @pytest.mark.slow
@@ -146,7 +149,7 @@ def test_an_orderly_end_is_whole_and_only_the_service_and_its_group_read_it(
 
 @pytest.mark.soak
 def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
-    full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes a file
+    full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes per file
     with recording(tmp_path, before=full) as (daemon, bus):
         with bus.commanding(0.3):
             until(lambda: "File too large" in bus.state()["recording"], 30.0, "it is said")

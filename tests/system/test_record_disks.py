@@ -1,7 +1,7 @@
-"""The black box on real disks that refuse: full, read-only, 2 s a sync. The loop does not notice.
+"""The recorder on failing real disks (full, read-only, 2 s per sync) does not disturb the loop.
 
-Beside the daemon on the bad disk runs one that records nothing: what the machine costs both is not
-the disk's. Needs root, who may mount.
+A second daemon that records nothing runs next to the one on the bad disk. Delays that both have
+come from the machine and not from the disk. The tests need root, to mount disks.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ pytestmark = [
 SPAN_S = 5.0
 
 PAGE, EDGE = 4096, 50
-"""bytes: of what a disk gives at once, and left of that behind a recording's last chunk."""
+"""Bytes that a disk allocates at once, and those left free after a recording's last chunk.
+"""
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 
@@ -61,7 +62,7 @@ int fsync(int fd)
 
 @contextmanager
 def disk(where: Path, *options: str) -> Iterator[Path]:
-    """A tmpfs of its own at `where/disk`; skips where nothing may be mounted."""
+    """Mount a tmpfs at `where/disk`. Skips if mounting is not permitted."""
     path = where / "disk"
     path.mkdir()
     words = ["mount", "-t", "tmpfs", "-o", ",".join(options), "acsard-test", str(path)]
@@ -76,7 +77,7 @@ def disk(where: Path, *options: str) -> Iterator[Path]:
 
 @contextmanager
 def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus, Bus]]:
-    """A daemon that records there, its bus, and that of one that records nothing."""
+    """A daemon that records there, its bus, and the bus of a daemon that records nothing."""
     other = where / "other"
     other.mkdir()
     with (
@@ -91,7 +92,10 @@ def both(where: Path, record: Path, **how: object) -> Iterator[tuple[Daemon, Bus
 
 
 def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
-    """Both drive for a while: as many periods are missed as beside it, but for the machine's."""
+    """Drive both for a while.
+
+    Both miss equally many periods, apart from those that the machine took.
+    """
     began, buses = time.monotonic(), (bus, beside)
     with bus.commanding(0.3), beside.commanding(0.3):
         first = [one.state() for one in buses]
@@ -104,12 +108,12 @@ def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
 
 
 def says(bus: Bus, text: str) -> None:
-    """`state` says of the recording what is wrong, or nothing for "any more"."""
+    """Wait until `state` reports this problem of the recording, or none for ""."""
     until(lambda: (told := bus.state()["recording"]) == text or (text and text in told), 30.0, text)
 
 
 def lived_again(where: Path, record: Path) -> None:
-    """Every file of it."""
+    """Return every file of the recording."""
     found = files(record.parent)
     assert found
     assert sum(replayed(where, path) for path in found) > 50
@@ -133,7 +137,7 @@ def test_a_disk_that_is_full_is_said_and_costs_only_records(tmp_path: Path) -> N
 
 
 def fill(where: Path, content: bytes, names: Iterator[str]) -> None:
-    """As many of them as there is room for, the last one cut."""
+    """Write as many of them as there is room for, the last one cut."""
     with suppress(OSError):
         for name in names:
             (where / name).write_bytes(content)
@@ -142,7 +146,7 @@ def fill(where: Path, content: bytes, names: Iterator[str]) -> None:
 
 @contextmanager
 def records(where: Path, record: Path) -> Iterator[Daemon]:
-    """A daemon that drives a while, until a second of it is on the disk."""
+    """Run a daemon that drives for a while, until a second of it is on the disk."""
     with (
         Daemon(where, words=["--record", str(record)]) as daemon,
         Bus(daemon.endpoint) as bus,
@@ -215,7 +219,7 @@ def test_for_want_of_inodes_one_recording_goes_and_no_other_where_that_does_not_
         ring = Ring(settings, run=run)
         kept = [ring.end(ring.begin(about), "kept") for _ in range(4)]
         fill(path, b"", (f"{number}" for number in range(100)))
-        for more in ("more", "most"):  # others take what is given
+        for more in ("more", "most"):  # other writers use the space that is freed
             with pytest.raises(OSError, match="No space left on device"):
                 ring.begin(about)
             ring.close()

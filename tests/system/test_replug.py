@@ -1,4 +1,4 @@
-"""The cable is pulled and put back: what is said, and what is not sent."""
+"""When the cable is pulled and put back, the daemon reports it and sends nothing unsafe."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEEN_S = 0.02
 """SAFETY: an unplugged port is seen this fast."""
 
 SLACK_S = 0.5
-"""What a noisy two-core machine may add to a bound before a test calls it broken."""
+"""The time that a noisy two-core machine may add to a bound before a test calls it broken."""
 
 
 @pytest.mark.slow
@@ -46,7 +46,7 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
             assert first < 0.5 + SLACK_S + lost(down.at, up.at)
             assert peer.session.stream.startswith(b"\r\n" + ZERO_LINE)
 
-            # The commander has never stopped sending, and never said zero.
+            # The commander has never stopped sending, and never sent a zero.
             waiting = states.find(
                 lambda state: "send a zero first" in state["reason"], 5.0, "why", after=up.at
             )
@@ -62,7 +62,7 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
             zeros = 1
 
             def drives() -> bool:
-                """It waits for another zero where the machine stood still for a second."""
+                """The daemon waits for another zero if the machine stood still for a second."""
                 nonlocal zeros
                 before = commander.wish
                 commander.wish = (
@@ -73,7 +73,8 @@ def test_unplug_and_replug_while_driving_says_so_reconnects_and_sends_nothing_ol
 
             until(drives, 5.0, "driving again")
             ramp = [wheels(line)[0] for line in peer.session.said()[1:]]
-            # Unless the kernel's thread that carries bytes through a pty had no core for so long.
+            # The exception is a kernel thread, which carries bytes through a pty, that had no core
+            # for that time.
             if zeros == 1 and not any(event["text"] for event in daemon.events("link_stale")):
                 assert ramp == sorted(ramp), "it grew from zero by its ramp"
             assert bus.state()["x"] > moved, "odometry went on from where it was"

@@ -79,7 +79,7 @@ class Robot(NamedTuple):
         return self.where / "daemon.states" / "acsar.latches.json"
 
     def moved(self, since: float) -> bool:
-        """Whether a line since then turns a wheel."""
+        """Return whether a line since then turns a wheel."""
         lines = (heard for session in self.peer.sessions for heard in list(session.lines))
         return any(heard.at > since and heard.line.strip(b"\r\n") not in STILL for heard in lines)
 
@@ -113,7 +113,7 @@ def latch(robot: Robot, bus: Bus, kind: Kind) -> None:
             robot.peer.reply = lambda speeds: PLAIN((99.0, 99.0, 99.0, 99.0))
             until(lambda: bus.state()["mode"] == "fault", 5.0, "a fault")
             robot.peer.reply = PLAIN
-            # Nobody asked for a fault, so no answer waits for the file.
+            # The fault has no caller, so no answer waits for the file.
             until(lambda: kept(robot, kind), 1.0, "the fault is in the file")
 
 
@@ -123,7 +123,7 @@ def kept(robot: Robot, kind: Kind) -> bool:
 
 
 def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
-    """The state after the commander had every chance to drive."""
+    """Return the state after the commander had every chance to drive."""
     bus.linked()
     linked = time.monotonic()
     until(lambda: time.monotonic() > linked + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")
@@ -134,7 +134,7 @@ def stands(robot: Robot, bus: Bus, mode: str, since: float) -> Any:
 
 
 def release(bus: Bus, kind: Kind) -> None:
-    """Release the latch; the same call once more has nothing to release."""
+    """Release the latch. The same call once more has nothing to release."""
     if kind == "inactive":
         assert bus.get("srv/activate")["success"]
         return
@@ -144,7 +144,7 @@ def release(bus: Bus, kind: Kind) -> None:
 
 
 def restarted(robot: Robot, kind: Kind, way: Way, spoil: Callable[[Path], None]) -> None:
-    """One latch, one end, one start, one release."""
+    """Run one latch, one end, one start and one release."""
     with robot.daemon() as daemon, Bus(robot.endpoint) as bus:
         bus.linked()
         drives(robot, bus)

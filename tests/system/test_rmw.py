@@ -1,4 +1,4 @@
-"""ROS 2 by rmw_zenoh: an implementation that is not ours, and its protocol to the letter."""
+"""ROS 2 by rmw_zenoh: an independent implementation, and its protocol to the letter."""
 
 from __future__ import annotations
 
@@ -61,14 +61,17 @@ COMMANDS = (
     ("/cmd_vel_teleop", STAMPED, 0.3),
     ("/joint_commands", JOINTS, 6.0),
 )
-"""Topic, type and how much of what: m/s or rad/s; all make 0.3 m/s."""
+"""Topic, type and the value in m/s or rad/s; all result in 0.3 m/s."""
 
 WAYS = {
     "peer of a router": COMMANDS,
     "client of a router": COMMANDS[:1],
     "no router": COMMANDS[-1:],
 }
-"""How the robot and ROS reach each other, and what is tried that way: a key is a key in all."""
+"""How the robot and ROS reach each other, and the commands tried in that way.
+
+The keys are the same in all of them.
+"""
 
 
 class Fleet(NamedTuple):
@@ -122,7 +125,7 @@ class Ground(NamedTuple):
     sdk: Sdk
     commands: tuple[tuple[str, str, float], ...]
     prefix: str
-    """In front of each ROS name."""
+    """The prefix of each ROS name."""
 
 
 @pytest.fixture(scope="module", params=WAYS)
@@ -166,7 +169,8 @@ def test_an_independent_client_drives_the_robot(ground: Ground) -> None:
         assert 0.2 <= top <= 0.31, (topic, kind)
         after = until(lambda: _standing(ground.bus.state()), 5.0, "it stands after a zero")
         assert after["x"] > before["x"] + 0.005, (topic, kind)
-        # What a new sender says before its delays were steady counts as that; nothing is refused.
+        # Commands of a new sender count as first contact until its delays are steady. None is
+        # refused.
         assert not [key for key in after["counters"] if key.startswith("command_")]
 
 
@@ -242,7 +246,7 @@ def test_nothing_of_that_was_an_exception(ground: Ground) -> None:
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """As everywhere, but quick to drive and to stand."""
+    """The usual limits, but quick to drive and to stand."""
     with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
         yield daemon
 
@@ -264,7 +268,8 @@ def test_every_token_has_the_form_the_graph_is_read_by(bus: Bus, ros: RmwClient)
     for role, name, kind, depth, transient in rows:
         _, *_, dds_type, type_hash = rmw_key(name, kind).split("/")
         mangled = "%" + name.replace("/", "%")
-        # Reliable, keep last so many; what equals rmw_zenoh's default is blank.
+        # Reliable, and keep the last `depth` samples. Fields that equal rmw_zenoh's default are
+        # blank.
         qos = f":{'1' if transient else ''}:,{depth}:,:,:,,"
         token = f"{head}/NUMBER/{role}/{node}/{mangled}/{dds_type}/{type_hash}/{qos}"
         assert token.count("/") == 12
@@ -301,7 +306,8 @@ def test_samples_carry_the_gid_of_their_publisher_s_token_and_count_without_gaps
 
 
 def test_no_message_is_made_while_no_ros_client_listens(tmp_path: Path) -> None:
-    # Each sample made counts up, so what was made unheard would be missing in the count.
+    # Each encoded sample increments the sequence, so samples encoded without a listener would leave
+    # a gap.
     with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
         ros = RmwClient(bus.session)
         bus.linked()
@@ -332,7 +338,7 @@ def test_a_late_advanced_subscriber_gets_the_static_transforms_at_once(ros: RmwC
 def test_the_static_transforms_have_the_heartbeat_of_a_late_comer_s_publisher(
     tmp_path: Path,
 ) -> None:
-    # They are put once, at the start: whoever is to see what follows must be there before.
+    # The transforms are put once, at the start: a subscriber must be there before it.
     meeting, beats = free_endpoint(), Samples()
     key = rmw_key("tf_static", TF)
     with zenoh.open(client_config(meeting, "router")) as router:
@@ -341,7 +347,8 @@ def test_the_static_transforms_have_the_heartbeat_of_a_late_comer_s_publisher(
             beat = beats.first("a heartbeat", within=2.0)
             unharmed(daemon)
         subscriber.undeclare()
-    # What it says is the number of the last one; it is no transform, nor meant for those.
+    # The heartbeat holds the number of the last sample. It is not a transform, and is not meant for
+    # those subscribers.
     assert beat.payload == struct.pack("<I", 0)
     assert not beat.attachment
 
@@ -384,16 +391,16 @@ def test_a_stop_drops_a_command_under_way_until_clear(bus: Bus, ros: RmwClient) 
         cleared = time.monotonic()
         lines = bus.count("lines_sent")
         until(lambda: bus.count("lines_sent") > lines + 20, 3.0, "20 periods")
-        # It never sent a zero: it does not drive on.
+        # This sender never sent a zero, so it does not drive on.
         assert not any(bus.state()["wheels"]), cleared
     settled(bus)
 
 
-# what is wrong is refused, counted, and harms nobody
+# bad messages are refused and counted, and disturb no other client
 
 
 class Bad(NamedTuple):
-    """How it is sent, the reason it is counted under, and a word of what is said."""
+    """The way to send it, the counter of its refusal, and a word of the logged reason."""
 
     send: Callable[[RmwClient], None]
     reason: str
@@ -493,10 +500,10 @@ def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: RmwClient, key: str
     bus.session.delete(key, attachment=ros.attachment())
     behind(bus, lambda: raw(GO, bare=True)(ros), "no_attachment")
     after = bus.state()
-    # Kept out by access rules, or refused in code.
+    # Either the access rules keep it out, or the daemon's code refuses it.
     assert changes(before, after).keys() <= {"command_no_attachment", "command_wildcard"}
     assert (after["x"], after["wheels"]) == (before["x"], before["wheels"])
-    if after["mode"] == "stopped":  # "**" is `stop` too
+    if after["mode"] == "stopped":  # "**" includes `stop`
         bus.get("srv/clear")
 
 
@@ -510,12 +517,12 @@ def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: 
 
 
 def test_a_clock_that_is_an_hour_off_harms_no_commander(bus: Bus, ros: RmwClient) -> None:
-    # Only how ages differ counts: clocks need not agree.
+    # Only differences of ages count: clocks need not agree.
     for off in (3600.0, -3600.0):
         other = RmwClient(bus.session)
         before = bus.state()
         until(partial(_put, bus, other, off, bus.count("commands") + 3), 3.0, f"zeros {off} s off")
-        # Whoever is new shows his delays first.
+        # A new sender shows its delays first.
         assert changes(before, bus.state()).keys() <= {"commands", "commands_first_contact"}
 
 
@@ -757,7 +764,7 @@ def test_no_key_is_published_by_two_robots(fleet: Fleet) -> None:
         heard.clear()
         for sample in samples.seen:
             heard.setdefault(sample.key, set()).add(sample.origin)
-        # The static transforms come but now and then.
+        # The static transforms come only now and then.
         return len(heard) >= len(keys) - 4
 
     until(all_topics, 5.0, "all topics of both")

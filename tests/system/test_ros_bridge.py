@@ -1,4 +1,4 @@
-"""ROS 2 by zenoh-bridge-ros2dds: its Zenoh half in emulation, the real one where there is one."""
+"""ROS 2 by zenoh-bridge-ros2dds: an emulation of its Zenoh half, and the real one if installed."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ pytestmark = pytest.mark.network
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """As everywhere, but quick to drive and to stand."""
+    """The usual limits, but quick to drive and to stand."""
     with Daemon(tmp_path_factory.mktemp("shared"), config=QUICK) as daemon:
         yield daemon
 
@@ -62,7 +62,7 @@ def ros(bus: Bus) -> BridgeHalf:
 
 @pytest.fixture
 def restored(bus: Bus) -> Iterator[None]:
-    """Leaves the shared robot at rest and at the origin."""
+    """Leave the shared robot at rest and at the origin."""
     yield
     for verb in ("clear", "activate"):
         bus.get(f"srv/{verb}")
@@ -127,7 +127,7 @@ def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) 
     plain = twist(0.0)
     assert (len(plain), len(stamped(0.0))) == (52, 76)
     before = bus.state()
-    # Nothing in the envelope tells them apart, and a bridge may pad either by up to 3 bytes.
+    # Nothing in the envelope distinguishes them, and a bridge may pad either by up to 3 bytes.
     for more in (b"", bytes(3)):
         ros.heard(bus, "cmd_vel", TWIST, plain + more)
         ros.heard(bus, "cmd_vel", TWIST, lambda more=more: stamped(0.0) + more)  # type: ignore[misc]
@@ -162,7 +162,7 @@ def test_a_trigger_is_answered_once_whatever_its_empty_request_looks_like(
 ) -> None:
     if verb == "clear":
         bus.get("srv/stop")
-        # A Trigger has no number, so it waits 2 s after a stop.
+        # A Trigger has no latch number, so it only works 2 s after a stop.
         stopped = time.monotonic()
         until(lambda: time.monotonic() > stopped + LOOK_FIRST_S, 5.0, "two seconds")
     called = ros.call(f"acsard/{verb}", TRIGGER, request_bytes)
@@ -185,11 +185,11 @@ def test_a_stop_stops_until_clear(bus: Bus, ros: BridgeHalf) -> None:
     assert bus.state()["mode"] == "ready"
 
 
-# what is wrong
+# bad messages
 
 
 class Bad(NamedTuple):
-    """How it is sent, the reason it is counted under, and a word of what is said."""
+    """The way to send it, the counter of its refusal, and a word of the logged reason."""
 
     send: Callable[[BridgeHalf], None]
     reason: str
@@ -246,11 +246,11 @@ def test_a_command_by_wildcard_drives_nothing(bus: Bus, ros: BridgeHalf, key: st
     bus.session.delete(key)
     behind(bus, lambda: bus.session.put("cmd_vel", b""), "malformed")
     after = bus.state()
-    # Kept out by access rules, or refused in code.
+    # Either the access rules keep it out, or the daemon's code refuses it.
     mine = {"command_malformed", "command_wildcard", "command_no_attachment"}
     assert changes(before, after).keys() <= mine
     assert (after["x"], after["wheels"]) == (before["x"], before["wheels"])
-    if after["mode"] == "stopped":  # "**" is `stop` too
+    if after["mode"] == "stopped":  # "**" includes `stop`
         bus.get("srv/clear")
 
 
@@ -286,11 +286,11 @@ def test_nothing_of_all_this_was_an_exception(bus: Bus, shared: Daemon) -> None:
 
 
 ALIVE = "acsard/acsar/alive"
-"""Declared when all else is: with it, all tokens have come."""
+"""Declared last: when it has come, all tokens have come."""
 
 
 def announced(zid: str, namespace: str, twists: bool) -> set[str]:
-    """The tokens of a bridge for all that can be announced."""
+    """Declare the tokens of a bridge for everything that it can announce."""
     head = f"@/{zid}/@ros2_lv"
     prefix = f"{namespace}§" if namespace else ""
     found = {head}

@@ -1,4 +1,4 @@
-"""The line of the pages by which a ROS user's robot moves, typed as they say."""
+"""The command on the pages with which a ROS user moves the robot works as written."""
 
 from __future__ import annotations
 

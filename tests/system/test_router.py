@@ -1,4 +1,4 @@
-"""`acsard router`: there again whatever ends it, until it is told to go."""
+"""`acsard router` restarts its router after any failure, until a signal ends it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.network, pytest.mark.timeout(60)]
 
 
 def listens(program: Program, times: int = 1) -> None:
-    """It has opened so often."""
+    """Wait until the router has opened this number of times."""
     until(
         lambda: sum("router_open" in line for line in list(program.err)) >= times,
         10.0,
@@ -26,7 +26,7 @@ def listens(program: Program, times: int = 1) -> None:
 
 
 def the_router(program: Program) -> int:
-    """The process that may be lost."""
+    """Return the child process that may be lost."""
     return until(lambda: children(program.pid, "--held"), 5.0, "its process")[0]
 
 

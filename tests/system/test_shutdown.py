@@ -30,16 +30,16 @@ SLOW_STOP = {
     "linear_acceleration": 20.0,
     "wheel_speed": 99.0,
 }
-"""From 2 m/s this ramp takes 2 s, the longest there may be: more than the way down is allowed."""
+"""From 2 m/s this ramp takes 2 s, the longest possible: more than a shutdown is allowed."""
 
 
 def ramp_after(peer: Peer, at: float) -> list[Heard]:
-    """The lines since then, without those that were on their way."""
+    """Return the lines since then, without those that were on their way."""
     return [heard for heard in peer.lines if heard.at > at]
 
 
 def last_speed(ramp: list[Heard]) -> float:
-    """The last of them that is not zero, rad/s."""
+    """Return the last speed among them that is not zero, rad/s."""
     return next(wheels(heard.line)[0] for heard in reversed(ramp) if heard.line != ZERO_LINE)
 
 
@@ -98,8 +98,8 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
     machine_s = lost(sent, sent + seconds)
     assert seconds < 1.0 + machine_s
     assert last == ZERO_LINE, "STOP is the last line"
-    # Where the machine keeps the link waiting for a tenth of a second it stops at once instead; the
-    # far end, which this process is, may be who waits.
+    # If the machine keeps the link waiting for a tenth of a second, the daemon stops at once
+    # instead. The delayed process may also be the far end, which is this test.
     heard = [sent, *(line.at for line in ramp)]
     waited = max(b - a for a, b in itertools.pairwise(heard))
     if machine_s < 0.1 and waited < 0.05:
@@ -107,7 +107,8 @@ def test_a_ramp_longer_than_0_6_s_is_cut_there_with_stop_last(tmp_path: Path, pe
         assert last_speed(ramp) > 20.0, "it was still fast when its time was up"
 
 
-# Several times: a STOP that is thrown away behind the last line is lost once in five to ten.
+# The test repeats it: a STOP that is discarded after the last line is lost once in five to ten
+# runs.
 @pytest.mark.parametrize(
     "second",
     [
@@ -135,7 +136,7 @@ def test_a_second_signal_cuts_the_ramp(tmp_path: Path, peer: Peer, second: signa
     assert code == 0
     assert last == ZERO_LINE, "STOP is the last line"
     machine_s = lost(sent, ended)
-    # 20 rad/s2: the ramp alone would be below that after its 0.6 s.
+    # At 20 rad/s2 the ramp alone would be below that after its 0.6 s.
     assert last_speed(ramp) > 28.0 - 20.0 * machine_s
     assert ramp[-1].at - hurried < 0.3 + machine_s
     assert ended - sent < 1.0 + machine_s
@@ -165,7 +166,7 @@ def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
             client.signal(signal.SIGSTOP)
             try:
                 with bus.commanding(0.5):
-                    # Enough odometry to fill every queue towards the stopped client.
+                    # This is enough odometry to fill every queue towards the stopped client.
                     until(lambda: bus.state()["x"] > 0.8, 10.0, "it drives on")
                     sent = time.monotonic()
                     daemon.signal(signal.SIGTERM)
@@ -182,8 +183,8 @@ def test_a_signal_while_a_bus_client_is_stopped_still_ends_within_1_s(
 @pytest.mark.slow
 @pytest.mark.parametrize("rounds", [1, pytest.param(8, marks=pytest.mark.soak)])
 def test_many_that_are_ended_right_after_the_start_all_exit_0(tmp_path: Path, rounds: int) -> None:
-    # At once, so that each is interrupted anywhere: a thread left behind at the interpreter's end
-    # made one in ten of them abort on a busy machine.
+    # All start at once, so that each is interrupted at a random point. A thread left running at the
+    # interpreter's end made one in ten of them abort on a busy machine.
     for _ in range(rounds):
         with ExitStack() as stack:
             daemons = [

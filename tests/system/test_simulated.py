@@ -1,4 +1,4 @@
-"""What is true of the simulated robot, beside what the daemon believes, on a real bus."""
+"""The daemon's beliefs agree with the truth of the simulated robot, on a real bus."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_a_drive_is_recorded_as_calibrate_reads_it(tmp_path: Path) -> None:
         assert ended.code == 0, ended
         (run,) = runs(read(ended.out.encode())).runs
         assert min(len(run.t), len(run.gyro)) > 100
-        # A robot that stood all the time tells nothing, in words of the calibration's own.
+        # A robot that stood all the time gives no result; the calibration says so in its own words.
         (tmp_path / "drive.csv").write_text(ended.out)
         told = finish(acsard("calibrate", "--log", "drive.csv"), tmp_path)
         assert (told.code, "drive.csv: " in told.err) == (1, True)
@@ -128,7 +128,7 @@ def test_a_gyro_on_the_bus_is_heard_and_what_is_no_sample_is_counted(
         until(used, 20.0, "the gyro is used")
 
         def refused(value: object, reason: str) -> bool:
-            bus.put("imu", value)  # at most one a millisecond is let in
+            bus.put("imu", value)  # the bus accepts at most one per millisecond
             return bus.count(f"imu_{reason}") > 0
 
         for value, reason in (

@@ -1,4 +1,4 @@
-"""From the shell to a robot that drives, and every way a start can fail."""
+"""A start from the shell leads to a robot that drives, or fails with a clear message."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path
     endpoint = free_endpoint()
     with Program(words(FIRST_ODOMETRY, endpoint), tmp_path) as watcher:
         watcher.says("ready")
-        # Nothing configured but the address, since 7448 may be in use on this machine.
+        # Only the address is configured, because 7448 may be in use on this machine.
         with Program(acsard("run", "--listen", endpoint), tmp_path) as daemon:
             first = float(watcher.says("first").split()[1])
     seconds = first - daemon.started
@@ -65,7 +65,7 @@ def test_half_a_metre_per_second_for_2_s_moves_odometry_by_1_m(tmp_path: Path) -
         until(lambda: bus.get("odom")["twist"]["twist"]["linear"]["x"] == 0.0, 3.0, "standstill")
         position = bus.get("odom")["pose"]["pose"]["position"]
     print(f"0.5 m/s for 2 s: {position['x']:.4f} m ({driven.out.strip()} s)")
-    # What comes late is driven on for: 0.5 m/s.
+    # If a message comes late, the robot drives on meanwhile: 0.5 m/s.
     assert position["x"] == pytest.approx(1.0, abs=0.02 + 0.5 * late)
     assert position["y"] == pytest.approx(0.0, abs=0.01)
 
@@ -97,7 +97,7 @@ def test_a_port_that_is_missing_at_the_start_is_said_and_picked_up_when_it_appea
 def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
     tmp_path: Path, often: int
 ) -> None:
-    # In the first milliseconds the signal meets an attempt to open the port, later a pause.
+    # In the first milliseconds the signal interrupts an attempt to open the port, later a pause.
     for pause in (0.0, 0.001, 0.3) * often:
         with Daemon(tmp_path, tmp_path / "nothing") as daemon:
             time.sleep(pause)
@@ -135,11 +135,11 @@ def test_a_second_daemon_on_the_port_ends_with_75_and_names_the_owner(
     assert f"process {first.pid}" in second.err
     assert str(peer.path) in second.err
     assert "Traceback" not in second.err
-    # Not a byte of the second: no end of line of a new session, no zero amid the driving.
+    # Not a byte of the second daemon: no line end of a new session, no zero during the drive.
     assert opened
     assert b"\r\n" not in said
-    # A commander that waits for a core may fall silent: that is a ramp, and no zero out of nothing.
-    # Nor is one without a link, which a daemon that waits for a core may lose.
+    # A commander that waits for a core may fall silent. That causes a ramp, and no sudden zero. The
+    # same holds without a link, which a daemon that waits for a core may lose.
     if not first.events("link_stale"):
         for before, line in itertools.pairwise(said):
             assert line != ZERO_LINE or wheels(before)[0] < 1.0
@@ -198,7 +198,7 @@ def test_a_second_daemon_with_the_same_id_behind_one_router_ends_with_75(
 def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_with_75(
     tmp_path: Path, peer: Peer, ros: dict[str, object]
 ) -> None:
-    """One `cmd_vel` would drive both."""
+    """One `cmd_vel` would drive both robots."""
     endpoint = free_endpoint()
 
     def robot(name: str, port: str = "sim") -> Tables:
@@ -220,7 +220,7 @@ def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_wit
             named.says("bus ")
             one.signal(signal.SIGKILL)
             one.ended(5.0)
-            # Its own tokens of before are not another's.
+            # The daemon's own earlier tokens are not those of another daemon.
             with Daemon(tmp_path, config=robot("one"), name="one") as again:
                 assert again.process.poll() is None
 
@@ -229,7 +229,7 @@ def test_a_second_robot_with_the_ros_names_of_another_behind_one_router_ends_wit
 
 
 def unprivileged() -> list[str]:
-    """Words before a command that take root's rights from it; none are needed by others."""
+    """Return the command prefix that drops root's rights; other users need none."""
     if os.geteuid() != 0:
         return []
     drop = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
@@ -242,13 +242,13 @@ def unprivileged() -> list[str]:
 def test_a_port_without_permission_ends_with_77_and_the_mend(tmp_path: Path, peer: Peer) -> None:
     drop = unprivileged()
     device = os.path.realpath(peer.path)
-    os.chmod(device, 0o000)  # not even the owner, who is root here only without root's rights
+    os.chmod(device, 0o000)  # not even for the owner, who is root here but without root's rights
     run = acsard("run", "--port", device, "--listen", free_endpoint())
     begun = time.monotonic()
     ended = finish([*drop, *run], tmp_path)
     print(f"no permission: exit {ended.code} after {ended.seconds:.2f} s")
     assert ended.code == 77
-    assert 2.0 < ended.seconds < 8.0 + lost(begun)  # udev is given 2 s to set the group
+    assert 2.0 < ended.seconds < 8.0 + lost(begun)  # udev gets 2 s to set the group
     assert device in ended.err
     assert "usermod -aG dialout" in ended.err
     assert "Traceback" not in ended.err
@@ -262,7 +262,7 @@ def test_permission_granted_within_2_s_of_the_start_is_enough(tmp_path: Path, pe
     endpoint = free_endpoint()
     run = acsard("run", "--port", device, "--listen", endpoint)
     with Program([*drop, *run], tmp_path) as daemon, alive_at(endpoint, daemon) as alive:
-        # The bus comes first, so the token says that the port is what is being tried now.
+        # The bus starts first, so the token shows that the daemon is now trying the port.
         until(alive.try_recv, START_S, "the alive token")
         os.chmod(device, 0o600)
         until(lambda: peer.lines, 3.0, "a line after permission")

@@ -1,7 +1,7 @@
-"""What those who have no business here can do: nothing from another host, and little by force.
+"""Strangers can do nothing from another host, and little by force.
 
-The other host is a network namespace, made for the test with a cable to the robot's own; without
-root, or without `ip`, those tests are skipped.
+The other host is a network namespace, made for the test with a cable to the robot's own. Those
+tests are skipped without root, or without `ip`.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ PORT, TLS_PORT = 7448, 7449
 
 
 def daemon_on(host: str, where: Path, bus: dict[str, object]) -> AbstractContextManager[Daemon]:
-    """A daemon on a host, with this bus table."""
+    """Run a daemon on a host, with this bus table."""
     return on(host, Daemon(where, config={"bus": {"listen": NEAR} | bus}))
 
 
 def visit(
     host: str, where: Path, endpoints: list[str], tls: dict[str, object] | None = None
 ) -> dict[str, Any]:
-    """What somebody on a host finds out and gets done in a second."""
+    """Return the findings and effects of a stranger on a host within a second."""
     said = [json.dumps(endpoints), json.dumps(tls)]
     with inside(host):
         done = finish(words(VISIT, 1.0, *said), where)
@@ -105,9 +105,11 @@ scouted -= set(own)
 print(json.dumps({"scouted": sorted(scouted), "opened": opened, "heard": sorted(heard),
                   "counted": counted}))
 """
-"""Scouts, joins as a peer without any configuration, and connects to each address: looks, asks and
-commands for so many seconds. Says whom it scouted, where it got in, the keys it heard, and what
-the robot said each time of the commands it had counted."""
+"""Scouts, joins as a peer without any configuration, and connects to each address.
+
+There it looks, queries and commands for the given seconds. Prints the ids it scouted, the addresses
+that admitted it, the keys it received, and the robot's command counts.
+"""
 
 ORDINARY = """\
 import sys
@@ -116,7 +118,7 @@ session = zenoh.open(zenoh.Config())
 print("here", session.zid(), flush=True)
 sys.stdin.read()
 """
-"""A Zenoh program without configuration, as anybody runs it: it lets itself be found."""
+"""A Zenoh program without configuration, as a user runs it: other programs can discover it."""
 
 
 NEAR = [f"tcp/127.0.0.1:{PORT}"]
@@ -130,7 +132,7 @@ def test_a_stranger_on_another_host_neither_sees_nor_commands_the_default_daemon
     with daemon_on(hosts.robot, tmp_path, {}), on(hosts.robot, ordinary):
         other = ordinary.says("here").split()[1]
         there = visit(hosts.stranger, tmp_path, FAR)
-        # What lets itself be found is found: the cable carries all that scouting needs.
+        # The discoverable program is found: the cable carries everything that scouting needs.
         assert there == {"scouted": [other], "opened": [], "heard": [], "counted": []}
         here = visit(hosts.robot, tmp_path, NEAR)
         assert here["scouted"] == [other]
@@ -224,21 +226,23 @@ else:
 print("done", done, flush=True)
 os._exit(0)
 """
-"""One way to be a nuisance at some doors at once, for so many seconds and at least so many times.
-It yields the processor to all others: its own work is not what is measured."""
+"""Disturbs several endpoints at once in one way, for given seconds and at least given times.
+
+It yields the processor to all others: the test does not measure its own work.
+"""
 
 
 class Figures(NamedTuple):
-    """What some time was like for the robot, for who was in, and for who came."""
+    """The effects of some time on the robot, on connected clients, and on newcomers."""
 
     periods: Periods
     calm: Periods
-    """Of a daemon beside it that nobody attacked: what the machine itself costs just now."""
+    """The periods of a second daemon that no client attacked: the cost of the machine itself."""
     grown_kb: int
     answered: float
-    """The longest that an operator who was in waited for an answer, s."""
+    """The longest wait of a connected operator for an answer, s."""
     entered: float
-    """The longest that somebody who came waited to be in and answered, s."""
+    """The longest wait of a newcomer until it is connected and answered, s."""
     came: int
 
     def __str__(self) -> str:
@@ -251,7 +255,7 @@ class Figures(NamedTuple):
 
 
 class Robot:
-    """A daemon with a plain and a TLS door."""
+    """A daemon with a plain and a TLS endpoint."""
 
     def __init__(self, where: Path, certificates: Certificates, calm: Bus) -> None:
         self._where, self._certificates, self._calm = where, certificates, calm
@@ -270,7 +274,7 @@ class Robot:
     def attacked(
         self, kind: str, doors: list[str], seconds: float, count: int = 0
     ) -> Iterator[Program]:
-        """By somebody who has a viewer's certificate where one is needed."""
+        """Run an attack by a client that has a viewer's certificate if one is needed."""
         viewer = self._certificates.robot / "clients" / "viewer"
         settings = json.dumps(self._certificates.settings(viewer))
         arguments = (kind, json.dumps(doors), settings, seconds, count)
@@ -283,7 +287,7 @@ class Robot:
         during: Callable[[], AbstractContextManager[Callable[[], bool]]],
         comers: tuple[Identity, ...] = ("local", "operator"),
     ) -> Figures:
-        """What it is like while that goes on; `comers` come again and again."""
+        """Measure while the attack goes on; `comers` connect again and again."""
         own = self._certificates.config("operator", self.plain, self.tls)
         with Bus(self.plain) as bus, zenoh.open(own) as operator:
             bus.linked()
@@ -302,7 +306,7 @@ class Robot:
         return Figures(periods, calm, grown, max(answered), max(entered, default=0.0), len(entered))
 
     def _entered(self, who: Identity) -> float:
-        """How long it takes somebody to get in and be answered, s."""
+        """Return the time until a client is connected and answered, s."""
         config = self._certificates.config(who, self.plain, self.tls)
         begun = time.monotonic()
 
@@ -319,7 +323,7 @@ class Robot:
 
 
 def _answered(session: zenoh.Session) -> float:
-    """How long an answer takes, s."""
+    """Return the time until an answer, s."""
     begun = time.monotonic()
     assert any(reply.ok for reply in session.get("acsard/acsar/state", timeout=5.0))
     return time.monotonic() - begun
@@ -332,7 +336,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
 
 @pytest.fixture(scope="module")
 def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
-    """A client of a daemon that nobody attacks."""
+    """Provide a client of a daemon that is not attacked."""
     with Daemon(tmp_path_factory.mktemp("calm")) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         yield bus
@@ -340,7 +344,7 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
 
 @pytest.fixture
 def robot(tmp_path: Path, certificates: Certificates, calm: Bus) -> Iterator[Robot]:
-    """A new one for each: what an attack leaves behind lasts."""
+    """Each test gets a new daemon, because the effects of an attack last."""
     with Robot(tmp_path, certificates, calm) as robot:
         yield robot
 
@@ -353,13 +357,13 @@ def hold(
     comers: tuple[Identity, ...] = ("local", "operator"),
     count: int | None = None,
 ) -> None:
-    """Attack these doors and see that everything a robot owes to its people holds."""
+    """Attack these endpoints and check that the robot's users lose nothing."""
     at = [door for door in (robot.plain, robot.tls) if door.startswith(doors)]
     times = TIMES[kind] if count is None else count
 
     @contextmanager
     def attack() -> Iterator[Callable[[], bool]]:
-        # The idle stay for longer than anybody watches, the others end by themselves.
+        # The idle attackers stay for longer than the test watches; the others end by themselves.
         lasts = 60.0 if kind == "idle" else seconds
         with robot.attacked(kind, at, lasts, times) as program:
             end = time.monotonic() + seconds
@@ -370,7 +374,8 @@ def hold(
 
     figures = robot.watched(attack, comers)
     print(f" times; {figures}")
-    # A few either way are the machine's, which two cores and other tests make a poor witness.
+    # A few periods in either direction are the machine's. With two cores and other tests it is a
+    # poor reference.
     assert figures.periods.missed <= 2 * figures.calm.missed + 0.01 * figures.periods.elapsed + 4
     assert figures.grown_kb < 64_000
     assert figures.answered < 1.0
@@ -379,7 +384,7 @@ def hold(
 
 
 TIMES = {"flood": 0, "huge": 0, "idle": 300, "garbage": 3000}
-"""The kinds of attack, and how many connections each makes to a door at least."""
+"""The kinds of attack, and the least number of connections that each makes to an endpoint."""
 
 SHORT, LONG = 0.5, pytest.param(20.0, marks=pytest.mark.soak)
 
@@ -416,7 +421,7 @@ def test_garbage_at_the_plain_door_costs_no_tick_and_keeps_nobody_out(
 def test_garbage_at_the_tls_door_disturbs_neither_the_loop_nor_who_is_in_nor_the_other_door(
     robot: Robot, seconds: float
 ) -> None:
-    count = 300 if seconds == SHORT else None  # as they are taken in at 10 a second
+    count = 300 if seconds == SHORT else None  # because the daemon accepts 10 a second
     hold(robot, "garbage", seconds, doors=("tls",), comers=("local",), count=count)
 
 

@@ -1,4 +1,4 @@
-"""Whatever becomes of its standard streams, the daemon drives on."""
+"""The daemon drives on, whatever happens to its standard streams."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def full_disk() -> Iterator[int]:
 
 
 def slow(value: str) -> object:
-    """Each alone, beside all at once."""
+    """Mark a stream's own test as slow, because another test covers all of them at once."""
     return pytest.param(value, marks=pytest.mark.slow)
 
 
@@ -62,7 +62,7 @@ def test_control_goes_on_when_a_stream_was_closed_before_the_start(
 
 
 def drives_and_leaves(daemon: Daemon, peer: Peer) -> None:
-    """It drives, and ends as it always does."""
+    """Check that it drives, and ends as usual."""
     with alive_at(daemon.endpoint, daemon) as alive:
         until(alive.try_recv, 5.0, "the alive token")
     with Bus(daemon.endpoint) as bus:
@@ -72,5 +72,5 @@ def drives_and_leaves(daemon: Daemon, peer: Peer) -> None:
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(5.0) == 0
     assert peer.last_line() == ZERO_LINE
-    # Nothing but lines of four wheels went to the motors, whichever descriptor they have.
+    # The motors received only lines of four wheels, whichever descriptor the streams have.
     assert {len(line) for line in peer.session.said()[1:]} == {33}

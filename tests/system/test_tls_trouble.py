@@ -24,7 +24,7 @@ ALL_NAMES = ["localhost", "127.0.0.1"]
 
 @pytest.fixture(scope="module", name="tls")
 def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority with a client's certificate, and one that has ended; and another authority's."""
+    """An authority with a client's certificate, one that has expired, and another authority's."""
     place = tmp_path_factory.mktemp("tls")
     ours = Authority.make(place / "ca", "ours", 10)
     ours.issue(place / "client", "client", [], 1)
@@ -33,7 +33,7 @@ def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ours.issue(place / "robot ended", "robot", ALL_NAMES, -1)
     ours.issue(place / "robot elsewhere", "robot", ["robot.example"], 1)
     Authority.make(place / "other ca", "other", 10).issue(place / "stranger", "client", [], 1)
-    mixed = place / "mixed"  # knows the robot's authority, shows another's certificate
+    mixed = place / "mixed"  # it knows the robot's authority but shows another's certificate
     shutil.copytree(place / "stranger", mixed)
     shutil.copy(place / "client" / "ca.pem", mixed)
     with pytest.MonkeyPatch.context() as patch:
@@ -66,7 +66,7 @@ def listening(own: Path, endpoint: str) -> zenoh.Session:
 
 @pytest.fixture(scope="module", name="robot")
 def _robot(tls: Path) -> Iterator[str]:
-    """Where a good one listens."""
+    """Run a listener with a valid certificate."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     with listening(tls / "robot", endpoint):
         yield endpoint

@@ -16,7 +16,7 @@ from tests.system.test_cli import Terminal, at_terminal
 SIZE = 80, 24
 
 FRAME = "\x1b[H"
-"""What each screen begins with: the cursor goes home."""
+"""The beginning of each screen: the cursor goes home."""
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def shown(terminal: Terminal) -> list[str]:
 
 
 def shows(terminal: Terminal, text: str, within: float) -> list[str]:
-    """The first screen with that text on it."""
+    """Return the first screen that contains that text."""
 
     def look() -> list[str] | None:
         lines = shown(terminal)
@@ -46,7 +46,7 @@ def shows(terminal: Terminal, text: str, within: float) -> list[str]:
 
 
 def piped(daemon: Daemon) -> Program:
-    """`acsard top` without a terminal, though it is told to show colours."""
+    """Run `acsard top` without a terminal, though its environment requests colours."""
     env = environment(COLUMNS="80", FORCE_COLOR="1")
     return Program(acsard("top", "--config", str(daemon.config)), daemon.config.parent, env)
 
@@ -55,7 +55,7 @@ def piped(daemon: Daemon) -> Program:
 def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon(
     tmp_path: Path,
 ) -> None:
-    # All in one, for the 2 s that a silence takes.
+    # Everything is in one test, because of the 2 s that a silence takes.
     with Daemon(tmp_path) as daemon, piped(daemon) as once, top(daemon) as (terminal, program):
         told = shows(terminal, " READY ", 10.0)
         assert len(told) == SIZE[1]
@@ -83,7 +83,7 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
             terminal.press("q")
             assert program.ended(3.0) == 0
         after = terminal.settings
-    # It leaves a cursor, and the screen and the terminal as they were.
+    # On exit it shows the cursor again, and restores the screen and the terminal.
     assert terminal.screen.endswith("\x1b[?25h\x1b[?1049l")
     assert "Traceback" not in terminal.screen + program.stderr
     assert during != after

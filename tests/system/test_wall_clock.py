@@ -1,4 +1,4 @@
-"""A wall clock that is set while a tool runs, here or at the robot, changes nothing it shows."""
+"""Setting the wall clock during a tool's run, here or at the robot, changes nothing it shows."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ sys.exit(main())
 """
 
 SET = (sys.executable, "-c", SET_AGAIN)
-"""Before the words of `acsard`: on a machine whose clock is set five times a second, by hours."""
+"""Prefix for a command: run it on a machine whose clock is set by hours five times a second."""
 
 
 class Place:
-    """A robot, and a tool beside it; the clock of one of them is set again and again."""
+    """A robot and a tool; the clock of one of them is set again and again."""
 
     def __init__(self, daemon: Daemon, before: Sequence[str]) -> None:
         self._daemon, self._before = daemon, before

@@ -1,4 +1,4 @@
-"""The robot's page: who comes sees, drives and stops, and who goes drives no more."""
+"""A client that opens the robot's page sees, drives and stops; one that leaves drives no more."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def test_recordings_are_listed_and_fetched_as_they_are(page: Page, daemon: Daemo
 
 
 async def drawn(session: aiohttp.ClientSession) -> tuple[str, dict[str, Any]]:
-    """The first recording, and what becomes of its report."""
+    """Request the report of the first recording; return the name and the result."""
     async with session.get("/api/recordings") as answer:
         name = (await answer.json())[0]["name"]
     async with asyncio.timeout(2 * PATIENCE_S):
@@ -298,7 +298,7 @@ class Terminal(Program):
         os.close(self.master)
 
     def shows(self, pattern: str) -> re.Match[str]:
-        """Waits for it on the screen."""
+        """Wait for the text on the screen."""
 
         def look() -> re.Match[str] | None:
             while select.select([self.master], [], [], 0.0)[0]:
@@ -308,7 +308,7 @@ class Terminal(Program):
         return until(look, START_S, f"{pattern} on the screen: {self.seen}")
 
     def page(self) -> list[int]:
-        """The processes of its page."""
+        """Return the processes of the page."""
         return children(self.pid, "acsard web")
 
 
@@ -329,7 +329,7 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_
             assert asyncio.run(text(f"{url}api/whoami")).startswith('{"role": "maintainer"')
 
             def listed() -> bool:
-                """Not before the recorder has made its directory."""
+                """Wait until the recorder has made its directory."""
                 status, told = asyncio.run(answer(f"{url}api/recordings"))
                 return status == 200 and ".mcap" in told
 

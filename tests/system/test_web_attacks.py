@@ -1,4 +1,4 @@
-"""Who comes to the robot's page and may not: each is refused and counted, and nothing moves.
+"""Each forbidden request to the robot's page is refused and counted, and nothing moves.
 
 With `-s` all of it is printed as a table.
 """
@@ -26,11 +26,11 @@ from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
 pytestmark = pytest.mark.network
 
 MOVED_M = 0.005
-"""Or rad."""
+"""Movement below which the robot counts as standing, m or rad."""
 
 
 class Table:
-    """What was tried, what came of it, and that the robot stood meanwhile."""
+    """The attempts, their results, and the check that the robot stood meanwhile."""
 
     def __init__(self, page: Page, daemon: Daemon) -> None:
         self.page, self._daemon = page, daemon
@@ -47,8 +47,11 @@ class Table:
         *,
         stands: bool = True,
     ) -> Iterator[None]:
-        """One attempt: refused so often for that reason, by the page or the robot; nothing moves,
-        unless somebody else may drive."""
+        """Check one attempt.
+
+        It is refused this number of times for that reason, by the page or the robot, and nothing
+        moves unless another client may drive.
+        """
         with Bus(self._daemon.endpoint) as bus:
             before, counted = bus.comes_to("ready"), self._refused(bus, reason, by)
             yield
@@ -83,7 +86,7 @@ def table(page: Page, daemon: Daemon) -> Iterator[Table]:
 
 @pytest.fixture(scope="module")
 def tokens(page: Page) -> dict[str, str]:
-    """By what they are worth."""
+    """Return one token of each kind: none, wrong, expired, revoked, and a viewer's."""
     revoked = page.invite("maintainer", "revoked")
     page.tokens("--revoke", "revoked")
     vault = Vault(page.state / "acsard-web")
@@ -172,7 +175,7 @@ ASKS: dict[str, tuple[str, str, dict[str, Any], int, str]] = {
     "a body of 10 MB": (
         "here", "/api/srv/set", {"method": "POST", "data": bytes(10_000_000)}, 413, "too_big"),
 }  # fmt: skip
-"""What somebody asks for: where, what, and the status and reason it is refused with."""
+"""A forbidden request: endpoint, path, arguments, and the expected status and reason."""
 
 
 @pytest.mark.parametrize("what", ASKS)
@@ -207,7 +210,7 @@ def test_who_asks_without_end_is_slowed_down_and_may_stop(
             for _ in range(16):
                 seen |= set(await asyncio.gather(*map(one, range(50))))
             async with session.get(f"{table.page.away}/api/whoami") as answer:
-                assert answer.status == 200  # a page that comes back is not kept out
+                assert answer.status == 200  # a page that reconnects is not locked out
             async with session.post(f"{table.page.away}/api/srv/stop") as answer:
                 return seen, answer.status
 
@@ -233,12 +236,12 @@ RAW: dict[str, str] = {
     "a head of 100 kB": f"{STOP}X: {'x' * 100_000}\r\n\r\n",
     "no HTTP": "\x16\x03\x01\x02\r\n\r\n",
 }  # fmt: skip
-"""Bytes on a connection that are no request, or by another's reading two."""
+"""Bytes on a connection that are not a request, or that another server would read as two."""
 
 
 @pytest.mark.parametrize("what", RAW)
 def test_what_is_no_plain_request_is_refused_whole(table: Table, bus: Bus, what: str) -> None:
-    # In the end it is ready: no second request, for a stop, was found in the first.
+    # The robot is ready at the end: no second request, for a stop, was found in the first.
     reason = "host" if what == "no Host" else "malformed"
     with table.attack(what, "400", reason), _opened(table.page) as opened:
         opened.sendall(RAW[what].encode("latin-1"))
@@ -270,7 +273,7 @@ def test_who_only_looks_drives_nothing_whatever_he_sends(
 
 
 async def _known(ours: Hands, bus: Bus) -> None:
-    """Known to the robot by his own clock, which drives no more."""
+    """Make the robot know the client by its own clock; the client then drives no more."""
     await ours.say(subscribe="state", rate=50)
     await ours.until_driving(0.3)
     await ours.drive(0.0)
@@ -334,7 +337,7 @@ def test_what_is_no_message_is_told_once_a_second_and_a_flood_ends(table: Table,
                 while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
                     told.append(message.data)
             assert ours.socket.close_code == 1008
-            assert sum("refused" in one for one in told) < 50  # by what goes out a second
+            assert sum("refused" in one for one in told) < 50  # limited by the send rate
 
     with table.attack("1200 messages that are none", "its connection ends", "malformed", 600):
         run(story)
@@ -369,7 +372,7 @@ def test_a_thousand_connections_leave_the_one_who_drives_his_page(table: Table, 
 
 
 async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
-    """Connections that say nothing, each of which is there."""
+    """Open connections that send nothing, and check that each of them is open."""
     idle: list[socket.socket] = []
     for _ in range(number):
         one = socket.socket()
@@ -380,7 +383,7 @@ async def _idle(host: str, port: int, number: int) -> list[socket.socket]:
 
 
 def _waits(one: socket.socket) -> bool:
-    """It was not sent away."""
+    """Check that it was not closed."""
     try:
         return one.recv(1) != b""
     except BlockingIOError:
@@ -405,7 +408,7 @@ def test_an_address_has_room_for_twenty_pages(table: Table, bus: Bus) -> None:
 
 
 def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
-    """A head by one byte a second, nothing at all, and a body that is announced and kept."""
+    """A header of one byte a second, no bytes at all, and a body that is announced but not sent."""
     begun = time.monotonic()
     with (
         table.attack("a slow loris, and who says nothing", "cut off", "slow", 2),

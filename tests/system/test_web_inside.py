@@ -1,4 +1,4 @@
-"""The page's server in this process: what no client can bring about at will."""
+"""The page's server, run in this process, for cases that no client can cause at will."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from tests.system.harness import PATIENCE_S, Daemon, seconds
 pytestmark = pytest.mark.network
 
 MISSED = 50
-"""Messages at 50 a second that one does not read."""
+"""Messages at 50 a second that one client does not read."""
 
 ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
 
 
 class Inside:
-    """All of it but the way to a robot, which is opened where a test wants one."""
+    """The whole server without a connection to a robot, which a test opens if it needs one."""
 
     def __init__(self, where: Path) -> None:
         self.counts = Counts()
@@ -61,7 +61,7 @@ class Inside:
 
     @asynccontextmanager
     async def hands(self) -> AsyncIterator[Hands]:
-        """A page that is open."""
+        """Open the page."""
         async with (
             TestServer(self.page.app) as server,
             aiohttp.ClientSession() as session,
@@ -129,14 +129,14 @@ def test_who_does_not_read_gets_the_newest_when_he_does_and_nothing_in_between(
                 stamps = [0.0]
 
                 def leaps(said: Any) -> bool:
-                    """Over most of what it did not read."""
+                    """Return whether a message skips over most of those that were not read."""
                     if "key" not in said:
                         return False
                     stamps.append(seconds(said["value"]["header"]["stamp"]))
                     return 0 < stamps[-2] < stamps[-1] - 0.5 * MISSED / 50
 
                 news = await ours.find(leaps)
-                assert news["age"] < 1000 * (stamps[-1] - stamps[-2]) / 2  # it is the newest
+                assert news["age"] < 1000 * (stamps[-1] - stamps[-2]) / 2  # it is the newest one
 
     with Daemon(tmp_path) as daemon:
         run(lambda: story(daemon))

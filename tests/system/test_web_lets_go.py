@@ -1,4 +1,4 @@
-"""Each way to let go of the robot's page ends the drive, and nothing of it is obeyed later."""
+"""Each way to leave the robot's page ends the drive, and nothing of it is obeyed later."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ OF_THE_SERVER: tuple[Way, ...] = (is_asked_to_end, is_killed)
 
 
 def let_go(daemon: Daemon, page: Page, way: Way) -> None:
-    """Drive, let go, and look at what was obeyed until well after the robot stands."""
+    """Drive, leave, and check the obeyed commands until well after the robot stands."""
     with Bus(daemon.endpoint) as bus:
         bus.at_rest()
 
@@ -72,7 +72,8 @@ def let_go(daemon: Daemon, page: Page, way: Way) -> None:
                 at_rest = bus.at_rest()
                 await asyncio.sleep(0.3)
                 after = bus.state()
-                # On its way when we looked: one, and one more that waited; then at most a zero.
+                # One command may be on its way at that moment, and one more may wait; then follows
+                # at most a zero.
                 assert after["counters"]["commands"] <= before + 3
                 assert abs(after["x"] - at_rest["x"]) < 0.005
 

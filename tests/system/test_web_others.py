@@ -1,4 +1,4 @@
-"""The other robots of a router on the page of one: seen and stopped there, and nothing else."""
+"""The page of one robot shows and stops the other robots of its router, and does nothing else."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         browser.tap("stop")
         until(lambda: two.theirs.state()["mode"] == "stopped", 5.0, "it stops")
         shows("mode", "STOPPED")
-        # Here is no Clear to press, and nothing says there is.
+        # There is no Clear button here, and no text mentions one.
         shows("reason", f"Clear is on the own page of {THEIRS}")
         assert browser.js("document.getElementById('clear').hidden") is True
         browser.tap("tab-robots")
@@ -164,7 +164,7 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         assert before == (two.theirs.count("commands"), two.ours.count("commands"))
         two.theirs.ask("srv/clear")
         shows("mode", "READY")
-        # Seen while it is driven by somebody else, and then not heard.
+        # The robot is seen while another client drives it, and then goes silent.
         with two.theirs.commanding(0.1):
             shows("mode", "DRIVING")
             shows("who", "app")

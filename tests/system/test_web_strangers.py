@@ -1,4 +1,4 @@
-"""Who comes to the robot's page from elsewhere: invited, let in, named, and sent away again."""
+"""Clients from other hosts are invited to the robot's page, admitted, named, and removed again."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.system.harness import PATIENCE_S, Bus, Daemon, until
 pytestmark = pytest.mark.network
 
 PASSES_S = 0.5
-"""For reading the tokens, and for the way of a few bytes."""
+"""Time for reading the tokens, and for the transfer of a few bytes."""
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +125,7 @@ def test_a_token_becomes_a_cookie_that_no_script_reads_and_ends_when_revoked(pag
 def test_two_pages_on_one_host_leave_each_other_s_phones_in(
     page: Page, daemon: Daemon, tmp_path: Path
 ) -> None:
-    """A browser's cookies know no ports."""
+    """A browser's cookies do not depend on ports."""
     shutil.copytree(page.tls, tmp_path / "tls")
 
     async def story() -> None:
@@ -166,7 +166,7 @@ def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_st
                 aiohttp.WSMsgType.CLOSE,
                 "your token has ended",
             )
-            # It is looked up that often, by a process that may wait for a core as this one does.
+            # The server looks it up that often, and may wait for a core as this process does.
             assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
             bus.at_rest()
             with suppress(ConnectionError):
@@ -197,13 +197,13 @@ def test_a_token_has_a_share_of_the_pages_from_however_many_addresses(
 
 
 def test_a_program_gone_wrong_shuts_out_nobody_else_at_its_address(page: Page, bus: Bus) -> None:
-    """All of them come from 127.0.0.1, the robot's own browser too."""
+    """All of them come from 127.0.0.1, including the robot's own browser."""
     few = CONNECTIONS_OF_ONE // CONNECTIONS_ALIKE + 1
     broken, *others = (page.invite("viewer", f"one{n}") for n in range(few))
     counted = page.refused().get("too_many", 0)
 
     async def taken(stack: AsyncExitStack, token: str) -> int:
-        """How many of too many this one gets."""
+        """Open more connections than one client may have; return how many succeed."""
         session = await stack.enter_async_context(page.client(token))
         got = 0
         for _ in range(CONNECTIONS_OF_ONE):
@@ -243,7 +243,7 @@ def test_one_who_follows_all_that_he_can_leaves_others_theirs(
                 await greedy.say(ping=n)
                 await greedy.find(lambda said: "pong" in said)
                 refused += any(one.get("refused") == "subscribe" for one in greedy.heard)
-            assert refused == CONNECTIONS_ALIKE - 1  # of 50 the second connection had the last 20
+            assert refused == CONNECTIONS_ALIKE - 1  # of 50, the second connection had the last 20
             ours = await stack.enter_async_context(hands(page, operator))
             await ours.say(subscribe="state", robot="r9")
             await ours.say(subscribe="state")
@@ -323,13 +323,13 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
 
 
 def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page, bus: Bus) -> None:
-    """A connection that ends before the close was answered is like a radio that is gone to it."""
+    """A connection that ends before the close was answered is equivalent to a lost radio link."""
     vault = Vault(page.state / "acsard-web")
     trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
     wishes = (json.dumps({"cmd": {"linear_x": 0}, "stamp": 1.8e12 + n}) for n in itertools.count())
 
     async def plain(name: str) -> tuple[int | None, str | None]:
-        """Reads by one task and drives by another; code and reason."""
+        """Read in one task and drive in another; return the close code and the reason."""
         async with (
             page.client(page.invite("operator", name)) as session,
             session.ws_connect(f"{page.away}/ws") as ours,
@@ -342,7 +342,7 @@ def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page
             return ours.close_code, message.extra
 
     async def other(name: str) -> tuple[int | None, str | None]:
-        """By another library, which answers by itself."""
+        """Use another library, which answers pings by itself."""
         told = {"Authorization": f"Bearer {page.invite('operator', name)}"}
         url = page.away.replace("https", "wss") + "/ws"
         async with websockets.connect(

@@ -1,4 +1,4 @@
-"""A role that may not is told so: who one is, by the access rules, in every tool."""
+"""Every tool tells a role that may not do something so, and finds its role by the access rules."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ pytestmark = pytest.mark.network
 
 
 SILENCE = "gets no answer either; yours is unlisted"
-"""Told of a silence behind which anything may be, last."""
+"""The last part of the message for a silence that may have any cause."""
 
 
 class Robot:
-    """A daemon with a door, and the certificates of its roles."""
+    """A daemon with a TLS gateway, and the certificates of its roles."""
 
     def __init__(self, where: Path) -> None:
         self.certificates, self.tls = Certificates(where), free_tls_endpoint()
@@ -154,7 +154,10 @@ def test_a_wrong_id_is_asked_about_before_any_list(
 
 
 def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
-    """What `echo` says of its certificate's end, after so many s; None when it came too late."""
+    """Return the message of `echo` about its certificate's end after this time, s.
+
+    Returns None if it started too late.
+    """
     robot.certificates.issue(own, "viewer", lasts / 86400)
     words = acsard("echo", "state", "--connect", robot.tls, "--tls", str(own))
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as one:
@@ -175,7 +178,8 @@ def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
 @pytest.mark.slow
 def test_a_certificate_that_ends_while_one_follows_is_told(robot: Robot, tmp_path: Path) -> None:
     told = None
-    for lasts in (7.0, 60.0):  # the longer one where a busy machine takes the shorter to start
+    # the longer time is for a busy machine that takes the shorter one to start
+    for lasts in (7.0, 60.0):
         if told is None:
             told = followed_to_its_end(robot, tmp_path / f"{lasts:g}", lasts)
     assert told

@@ -1,4 +1,4 @@
-"""The bytes on the line, against a serial peer that is not ours."""
+"""The bytes on the line are right, against an independent serial peer."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def running(
 
 @pytest.fixture(scope="module")
 def started(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    """What was heard of a start and half a metre per second straight ahead."""
+    """The lines received during a start and a straight drive at 0.5 m/s."""
     where = tmp_path_factory.mktemp("started")
     steady = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
     with Peer(where / "mcu") as peer, running(where, peer) as bus, bus.commanding(0.5):
@@ -116,7 +116,7 @@ def test_a_wired_sign_and_letter_apply_on_the_wire(tmp_path: Path, peer: Peer) -
 
 
 def mixture() -> Reply:
-    """Every accepted form in turn, and some in one line."""
+    """Reply in every accepted form in turn, with some lines of mixed forms."""
 
     def mixed(speeds: Speeds) -> bytes:
         a, b, c, d = (f"{'n' if speed < 0 else 'p'}{abs(speed):.3f}" for speed in speeds)
@@ -143,7 +143,7 @@ ACCEPTED: dict[str, Reply] = {
 
 
 def steady(bus: Bus) -> Any:
-    """The state when it drives at 0.4 m/s."""
+    """Return the state when the robot drives at 0.4 m/s."""
     state = bus.state()
     right = state["link"] == "up" and state["linear"] == pytest.approx(0.4, abs=0.005)
     return state if right else None
@@ -151,24 +151,24 @@ def steady(bus: Bus) -> Any:
 
 @pytest.mark.slow
 def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -> None:
-    # 0.4 m/s is 8 rad/s, which can be said with one digit and with one decimal.
+    # 0.4 m/s is 8 rad/s, which needs only one digit and one decimal.
     begun = time.monotonic()
     with running(tmp_path, peer) as bus, bus.commanding(0.4):
         until(lambda: peer.lines[-1].line.startswith(b"ap08.00"), 5.0, "steady driving")
         for name, reply in {**ACCEPTED, "mixture": mixture()}.items():
             peer.reply = reply
-            peer.await_lines(5)  # replies of the form before have been read by then
+            peer.await_lines(5)  # by then the replies in the previous form have been read
             goal = bus.state()["x"] + 0.04
             until(lambda: bus.state()["x"] > goal, 5.0, f"odometry moves by {name}")  # noqa: B023
             after = until(lambda: steady(bus), 5.0, f"the speed by {name}")
         rejects = {key for key in after["counters"] if key.startswith("line_")}
-        # A machine that takes the time of several ramp steps makes one leap of them.
+        # A machine that takes the time of several ramp steps merges them into one.
         leaps = {"line_impossible"} if lost(begun) > 0.05 else set()
         assert rejects <= leaps, after["counters"]
 
 
 def always(data: bytes) -> Reply:
-    """The same answer to everything."""
+    """Give the same answer to everything."""
     return lambda speeds: data
 
 
@@ -212,22 +212,22 @@ def test_every_refused_form_is_counted_and_only_zeros_are_sent_until_a_good_one_
             states.find(lambda state: state["link"] == "booting", 5.0, "booting")
         for name, (reason, reply) in REFUSED.items():
             before = bus.count(f"line_{reason}")
-            # Said unasked, since 10 lines a second is all a silent peer gets to answer.
+            # The peer sends unasked, because a silent peer gets only 10 lines a second to answer.
             peer.say(reply(STANDING))
-            if reason == "too_long":  # may want more than one piece to be too long
+            if reason == "too_long":  # a line may need more than one piece to be too long
                 peer.say(reply(STANDING) * 4)
             until(
                 lambda: bus.count(f"line_{reason}") > before,  # noqa: B023
                 5.0,
                 f"{name} counted as {reason}",
             )
-            # What came counts for nothing: not even together with a commander who insists.
+            # The daemon ignores these bytes, even with a commander that keeps sending.
             bus.put("cmd/app", twist(0.5))
             state = bus.state()
             assert (state["link"], state["x"], state["linear"]) == ("booting", 0.0, None), name
             assert state["counters"]["lines"] == 0, name
         assert set(peer.session.said()[1:]) == {ZERO_LINE}
-        # The next newline resynchronises: three good lines and the link is up.
+        # The next newline resynchronises: after three good lines the link is up.
         peer.say(b"\r\n")
         peer.reply = PLAIN
         bus.linked()
@@ -247,7 +247,8 @@ def test_a_peer_that_falls_silent_is_said_gets_only_zeros_and_drives_on_after_a_
         zeros = peer.await_lines(2)
         assert {heard.line for heard in zeros} == {ZERO_LINE}
         assert bus.state()["x"] == pose
-        # A silence under a second: the commander is still trusted, the ramp starts from zero.
+        # After a silence under a second the commander is still armed, and the ramp starts from
+        # zero.
         peer.reply = PLAIN
         again = until(lambda: _moving_since(peer, zeros[-1].at), 5.0, "driving again")
         assert wheels(again)[0] <= 20 * 0.05 + 0.01
@@ -262,7 +263,7 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             until(lambda: peer.lines[-1].line.startswith(b"ap10.00"), 5.0, "steady driving")
             _, stale, zeros_from = _fall_silent(peer, states)
             zeros = peer.await_lines(14)
-            # 10 Hz while nothing comes back, whatever the commander wants.
+            # The daemon sends at 10 Hz while no replies come, whatever the commander wants.
             assert {heard.line for heard in zeros} == {ZERO_LINE}
             took = zeros[-1].at - zeros[0].at
             assert 0.08 < took / 13 < 0.2 + lost(zeros[0].at, zeros[-1].at) / 13
@@ -277,14 +278,14 @@ def test_after_a_silence_of_a_second_the_commander_must_be_neutral_first(
             assert waiting.value["mode"] == "ready"
             peer.await_lines(50)
             assert _moving_since(peer, zeros_from) is None
-            commander.wish = ZERO  # for a second: only his key tells who he is
+            commander.wish = ZERO  # for a second, because the key alone identifies this sender
             until(lambda: "send a zero first" not in bus.state()["reason"], 5.0, "neutral")
             commander.wish = twist(0.5)
             until(lambda: _moving_since(peer, zeros_from), 5.0, "driving after the zero")
 
 
 def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
-    """When the peer was muted, the state that said so, and from when on only zeros came."""
+    """Return when the peer was muted, the state that reports it, and when only zeros came."""
     peer.reply = silence
     muted = time.monotonic()
     stale = states.find(lambda state: state["link"] == "stale", 5.0, "stale", after=muted)
@@ -294,7 +295,7 @@ def _fall_silent(peer: Peer, states: Following) -> tuple[float, Seen, float]:
 
 
 def _moving_since(peer: Peer, after: float) -> bytes | None:
-    """The first line since then that is not zero."""
+    """Return the first line since then that is not zero."""
     moving = (heard.line for heard in peer.lines if heard.at > after and heard.line != ZERO_LINE)
     return next(moving, None)
 

@@ -1,6 +1,7 @@
-"""What is typed at a shell, run in this process: the start of Python would be most of its time.
+"""Run a shell command in this process, because starting Python would take most of its time.
 
-For what is printed and the code. Signals, terminals, pipes and how a program ends need a process.
+It serves for the output and the exit code. Signals, terminals, pipes and the end of a program need
+a process.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from tests.system.harness import Finished
 
 
 def typed(*words: str) -> Finished:
-    """What became of `acsard` with these words; relative paths are those of this process."""
+    """Return the result of `acsard` with these words. Relative paths are those of this process."""
     out, err, begun = io.StringIO(), io.StringIO(), time.monotonic()
     with redirect_stdout(out), redirect_stderr(err):
         try:

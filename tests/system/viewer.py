@@ -1,6 +1,6 @@
-"""A viewer that is not Foxglove: speaks the websocket protocol by hand, knows nothing of acsard.
+"""An independent viewer: speaks Foxglove's websocket protocol by hand, knows nothing of acsard.
 
-JSON for all that is rare; a byte of opcode and little endian for the rest.
+Rare messages are JSON; the rest is a byte of opcode and little-endian fields.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ TWIST = (
     f"geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n{RULE}\n"
     "MSG: geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n"
 )
-"""What a panel publishes in CDR has its definition beside it."""
+"""The definition that a panel sends with its CDR messages."""
 
 
 class Came(NamedTuple):
-    """A message of a channel, when it came, and its bytes."""
+    """A message of a channel, its time of arrival, and its bytes."""
 
     at: float
     payload: bytes
@@ -43,13 +43,13 @@ PROTOCOL = "foxglove.sdk.v1"
 
 
 def opened(port: int, protocol: str = PROTOCOL) -> ClientConnection:
-    """A bare connection, of which nobody reads."""
+    """A bare connection whose data no task reads."""
     where = f"ws://127.0.0.1:{port}"
     return connect(where, subprotocols=[Subprotocol(protocol)], close_timeout=0.5)
 
 
 class Viewer:
-    """One connection; all that comes is kept by its kind."""
+    """One connection; all messages are kept by their kind."""
 
     def __init__(self, port: int, protocol: str = PROTOCOL, *, services: bool = True) -> None:
         self._opened = ExitStack()
@@ -61,7 +61,7 @@ class Viewer:
         self.removed: list[str] = []
         self.parameters: dict[str, Any] = {}
         self.replies: dict[str, dict[str, Any]] = {}
-        """The answers about parameters, by the question's id."""
+        """The answers about parameters, by the id of the request."""
         self._came: dict[int, list[Came]] = {}
         self._answers: dict[int, tuple[bool, str]] = {}
         self._numbers = iter(range(1, 1 << 30))
@@ -81,7 +81,7 @@ class Viewer:
         self._thread.join(5.0)
 
     def cut(self) -> None:
-        """The connection is gone without a word, as when a cable is pulled and the kernel tells."""
+        """Cut the connection without a close, as the kernel does when a cable is pulled."""
         self._socket.socket.shutdown(2)
 
     def _listen(self) -> None:
@@ -126,7 +126,7 @@ class Viewer:
     # looking
 
     def show(self, topic: str) -> Looked:
-        """Subscribe."""
+        """Subscribe to a channel."""
         until(lambda: topic in self.channels, 5.0, f"{topic} in {sorted(self.channels)}")
         number, channel = next(self._numbers), self.channels[topic]
         subscriptions = [{"id": number, "channelId": channel["id"]}]
@@ -138,7 +138,7 @@ class Viewer:
         self._say("unsubscribe", subscriptionIds=[number])
 
     def status(self, words: str, within: float = 5.0) -> dict[str, Any]:
-        """The first status with these words."""
+        """Return the first status with these words."""
 
         def look() -> dict[str, Any] | None:
             return next((one for one in list(self.statuses) if words in one["message"]), None)
@@ -150,7 +150,7 @@ class Viewer:
     def publish_on(
         self, topic: str, encoding: str, schema_name: str
     ) -> tuple[Callable[[bytes], None], int]:
-        """Advertise a channel of ours; what sends on it, and its number."""
+        """Advertise a channel of ours; return the function that sends on it, and its number."""
         number = next(self._numbers)
         channel = {"id": number, "topic": topic, "encoding": encoding, "schemaName": schema_name}
         if encoding == "cdr":
@@ -163,7 +163,7 @@ class Viewer:
         self._say("unadvertise", channelIds=[number])
 
     def call(self, service: str, request: object) -> Any:
-        """The answer of a service; fails when there is none."""
+        """Return the answer of a service. Fails if it refuses."""
         number, name = next(self._numbers), b"json"
         head = struct.pack("<BIII", CALL, self.services[service]["id"], number, len(name))
         self._socket.send(head + name + json.dumps(request).encode())
@@ -172,11 +172,11 @@ class Viewer:
         return json.loads(text)
 
     def get(self) -> dict[str, Any]:
-        """All parameters."""
+        """Return all parameters."""
         return self._asked("getParameters", parameterNames=[])
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
-        """Set these; what the server says they are then."""
+        """Set these parameters; return the server's resulting values."""
         wanted = [{"name": name, "value": value} for name, value in wishes.items()]
         return self._asked("setParameters", parameters=wanted)
 
@@ -188,7 +188,7 @@ class Viewer:
 
 
 class Looked:
-    """A topic that is shown."""
+    """A topic that is subscribed."""
 
     def __init__(
         self, channel: Mapping[str, Any], came: list[Came], hide: Callable[[], None]
@@ -196,12 +196,12 @@ class Looked:
         self.channel, self.came, self.hide = channel, came, hide
 
     def first(self, count: int = 1, within: float = 5.0) -> list[Came]:
-        """The first messages."""
+        """Wait for the first messages."""
         until(lambda: len(self.came) >= count, within, f"{count} of {self.channel['topic']}")
         return self.came[:count]
 
     def read(self, payload: bytes) -> Any:
-        """The message, decoded by the definition that stands beside it and by nothing else."""
+        """Decode the message by the definition that comes with its channel, and by nothing else."""
         name = self.channel["schemaName"]
         assert (self.channel["encoding"], self.channel["schemaEncoding"]) == ("cdr", "ros2msg")
         store = get_typestore(Stores.EMPTY)

@@ -52,7 +52,7 @@ def booted(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[C
 
 @pytest.fixture
 def container(booted: Container) -> Iterator[Container]:
-    """The same, with the unit stopped, its usual configuration and no record of failures."""
+    """That systemd with the unit stopped, its usual configuration and no record of failures."""
     booted.reset()
     yield booted
     booted.reset()
@@ -60,7 +60,7 @@ def container(booted: Container) -> Iterator[Container]:
 
 @pytest.fixture
 def board(container: Container) -> Iterator[Board]:
-    """A serial board at the configured port, whose times can be trusted."""
+    """A serial board at the configured port, whose times are reliable."""
     with Board(container) as board:
         yield board
     container.path(PORT).unlink(missing_ok=True)
@@ -68,6 +68,6 @@ def board(container: Container) -> Iterator[Board]:
 
 @pytest.fixture
 def driver(container: Container) -> Iterator[Driver]:
-    """A client of the bus inside the container; sends zeros until told otherwise."""
+    """A client of the bus inside the container, which sends zeros until a test sets a speed."""
     with Driver(container) as driver:
         yield driver

@@ -1,4 +1,4 @@
-"""A real systemd in a container: how it is made, booted, looked into and ended.
+"""Make, boot, inspect and end a real systemd in a container.
 
 The container has its own processes, network, mounts and cgroup, so nothing of the host's services
 is touched. Clocks are shared: a monotonic time read on either side means the same.
@@ -26,8 +26,10 @@ from tests.system.harness import ROOT, Heard, Program, until
 OURS = sys.version_info[:2]
 
 SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
-"""The Debian whose Python is ours, so that our installed packages run in there. With any other
-Python it is the Debian that we run on, and ours is lent to it."""
+"""The Debian releases with our Python version, so that our installed packages run in there.
+
+With any other Python the container is the Debian that we run on, with our Python mounted into it.
+"""
 
 PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
 
@@ -36,7 +38,7 @@ UNIT, DOOR, PAGE = "acsard.service", "acsard-door.service", "acsard-web.service"
 HOME = "/opt/acsard"
 
 LENT = f"{HOME}/python"
-"""Where our own Python is in there, if Debian's is another."""
+"""Mount point of our own Python, if Debian's is another."""
 
 PORT = "/dev/acsar"
 
@@ -49,7 +51,7 @@ ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"
 UNITS = "/etc/systemd/system"
 
 STATES = "/var/lib/private"
-"""Where the services have their state directories."""
+"""Directory of the services' state directories."""
 
 LIES = "/run/board-lies"
 """While this file is there, the board reports speeds that no wheel can have."""
@@ -58,11 +60,11 @@ ACSARD = f"{HOME}/venv/bin/acsard"
 
 
 class UnavailableError(Exception):
-    """This machine cannot do it; why."""
+    """This machine cannot do it; the message says why."""
 
 
 def unavailable(why: object) -> NoReturn:
-    """The test is skipped; where $ACSARD_TEST_SYSTEMD is "must", as in CI, it fails."""
+    """Skip the test, or fail it if $ACSARD_TEST_SYSTEMD is "must", as in CI."""
     text = f"cannot boot a systemd: {why}"
     if os.environ.get("ACSARD_TEST_SYSTEMD") == "must":
         pytest.fail(text, pytrace=False)
@@ -70,7 +72,7 @@ def unavailable(why: object) -> NoReturn:
 
 
 def suite() -> str:
-    """The Debian to boot; "" where none has our Python nor libraries for it."""
+    """Return the Debian to boot; "" if none has our Python or libraries for it."""
     if OURS in SUITES:
         return SUITES[OURS]
     try:
@@ -81,7 +83,7 @@ def suite() -> str:
 
 
 def needs() -> str:
-    """What is missing to boot a systemd here; "" when nothing is."""
+    """Return the tools that are missing to boot a systemd here; "" if none is."""
     if os.geteuid() != 0:
         return "not root"
     missing = [tool for tool in ("mmdebstrap", "systemd-nspawn") if shutil.which(tool) is None]
@@ -100,7 +102,7 @@ def _cgroups() -> Path | None:
 
 
 def build(where: Path) -> Path:
-    """A root file system at `where`, unless there is one already."""
+    """Make a root file system at `where`, unless there is one already."""
     if (where / "usr/lib/systemd/systemd").exists():
         return where
     where.parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +119,7 @@ def build(where: Path) -> Path:
 
 
 class Ran(NamedTuple):
-    """What became of a command in the container."""
+    """The result of a command in the container."""
 
     code: int
     out: str
@@ -137,7 +139,7 @@ class Container:
         assert root is not None
         self._cgroup = root / f"{name}-{os.getpid()}"
         self.leader = 0
-        """systemd's process as the host sees it."""
+        """systemd's process id on the host."""
 
     def __enter__(self) -> Container:
         try:
@@ -148,7 +150,7 @@ class Container:
         words = ["sh", "-c", 'echo $$ > "$0" && exec "$@"', str(procs), "systemd-nspawn"]
         words += ["--quiet", "--boot", "--register=no", "--keep-unit", "--private-network"]
         words += ["--volatile=overlay", f"--machine={self._name}", "--console=pipe"]
-        # Without these systemd cannot enforce IPAddressDeny= and DevicePolicy=.
+        # Without these, systemd cannot enforce IPAddressDeny= and DevicePolicy=.
         words += ["--capability=CAP_BPF", "--system-call-filter=@memlock bpf"]
         words += [f"--directory={self._rootfs}"]
         ours = ("acsard", "deploy", "acsard.toml")
@@ -171,7 +173,7 @@ class Container:
             self.__exit__()
             console = self._log.read_text(errors="replace")[-500:]
             raise UnavailableError(f"{error}: {console}") from error
-        # Before this it takes the container's cgroup for the host's.
+        # Before this, systemd mistakes the container's cgroup for the host's.
         self.run("systemctl", "daemon-reexec")
         return self
 
@@ -187,14 +189,14 @@ class Container:
             try:
                 os.rmdir(directory)
             except OSError:
-                pass  # a process of it is still being taken apart
+                pass  # the kernel is still removing one of its processes
 
     def _find_leader(self) -> int:
         if self._nspawn.poll() is not None:
             raise AssertionError(f"systemd-nspawn ended with {self._nspawn.returncode}")
         pids = Path(f"/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children").read_text()
         for pid in map(int, pids.split()):
-            with suppress(OSError):  # one that has ended meanwhile
+            with suppress(OSError):  # it has ended meanwhile
                 if Path(f"/proc/{pid}/comm").read_text().strip() == "systemd":
                     return pid
         return 0
@@ -203,7 +205,7 @@ class Container:
         return self.run("systemctl", "is-system-running").out.strip() in ("running", "degraded")
 
     def inside(self, *words: str, only: str = "muinpC") -> list[str]:
-        """The words that run a program in there; `only` some of its namespaces."""
+        """Return the words that run a program in there, in all or `only` some of its namespaces."""
         return ["nsenter", "-t", str(self.leader), *(f"-{kind}" for kind in only), "--", *words]
 
     def run(self, *words: str) -> Ran:
@@ -212,17 +214,17 @@ class Container:
         return Ran(done.returncode, done.stdout, done.stderr)
 
     def types(self, command: str, where: str = f"{HOME}/src") -> Ran:
-        """Run a line of a page as it stands there, in the clone or elsewhere."""
+        """Run a line of a page as it stands, in the clone or elsewhere."""
         ran = self.run("sh", "-c", f"cd {where} && {command}")
         assert ran.code == 0, f"{command}\n{ran.out}\n{ran.err}"
         return ran
 
     def path(self, name: str) -> Path:
-        """A file of the container as the host finds it."""
+        """Return the host's path of a file in the container."""
         return Path(f"/proc/{self.leader}/root{name}")
 
     def write(self, name: str, text: str, mode: int = 0o644) -> None:
-        """A file in there."""
+        """Write a file in there."""
         path = self.path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
@@ -231,7 +233,7 @@ class Container:
     # the program and its unit
 
     def install(self) -> None:
-        """What an administrator puts in place; the packages are ours, by a path file."""
+        """Install the files of an administrator. Our packages come in by a path file."""
         version = "python{}.{}".format(*OURS)
         packages = f"{HOME}/venv/lib/{version}/site-packages"
         python = f"{HOME}/venv/bin/python"
@@ -250,7 +252,7 @@ class Container:
         self.install_unit()
 
     def install_unit(self) -> None:
-        """What `acsard service install` would write, without starting it."""
+        """Install the files of `acsard service install`, without starting the service."""
         deploy = ROOT / "deploy" / "systemd"
         self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
         for unit in (UNIT, DOOR, PAGE):
@@ -258,7 +260,7 @@ class Container:
         self.run("systemctl", "daemon-reload")
 
     def reset(self) -> None:
-        """As after the installation."""
+        """Restore the state after the installation."""
         self.run("systemctl", "stop", PAGE, DOOR, UNIT)
         for unit in (UNIT, DOOR, PAGE):
             shutil.rmtree(self.path(f"{UNITS}/{unit}.d"), ignore_errors=True)
@@ -273,42 +275,42 @@ class Container:
             file.unlink()
 
     def drop_in(self, name: str, text: str, unit: str = UNIT) -> None:
-        """A file in a unit's drop-in directory."""
+        """Write a file in a unit's drop-in directory."""
         self.write(f"{UNITS}/{unit}.d/{name}", text)
         self.run("systemctl", "daemon-reload")
 
     def start(self, unit: str = UNIT) -> Ran:
-        """Start a unit; back when it is ready or has failed."""
+        """Start a unit; return when it is ready or has failed."""
         return self.run("systemctl", "start", unit)
 
     def show(self, name: str, unit: str = UNIT) -> str:
-        """A property of a unit."""
+        """Return a property of a unit."""
         return self.run("systemctl", "show", "--value", "-p", name, unit).out.strip()
 
     def main_pid(self, unit: str = UNIT) -> int:
-        """A unit's process as the host sees it."""
+        """Return a unit's process id on the host."""
         procs = self._cgroup / "payload" / "system.slice" / unit / "cgroup.procs"
         return int(procs.read_text().split()[0])
 
     def waited(self) -> float:
-        """For how long, in all, something in there had work but no processor, s.
+        """Return the total time in which processes in there had work but no processor, s.
 
-        systemd is an ordinary process: what else this machine does comes in between.
+        systemd is an ordinary process, so other work of this machine delays it.
         """
         try:
             some = (self._cgroup / "cpu.pressure").read_text().splitlines()[0]
         except OSError:
-            return 0.0  # a kernel that does not count it
+            return 0.0  # the kernel does not count it
         return int(some.rpartition("total=")[2]) / 1e6
 
     def journal(self) -> list[dict[str, Any]]:
-        """What the current or last run of the unit wrote."""
+        """Return the log of the unit's current or last run."""
         self.run("journalctl", "--sync")
         words = ["journalctl", "-o", "json", f"_SYSTEMD_INVOCATION_ID={self.show('InvocationID')}"]
         return [json.loads(line) for line in self.run(*words).out.splitlines()]
 
     def messages(self, unit: str = UNIT) -> str:
-        """All that was ever written about a unit."""
+        """Return everything that was ever logged about a unit."""
         self.run("journalctl", "--sync")
         return self.run("journalctl", "-o", "cat", "-u", unit).out
 
@@ -321,7 +323,7 @@ class Container:
         )
 
 
-# Forgets the exclusive lock when nobody has the port open any more, as a real port does; the
+# Forget the exclusive lock when no program has the port open any more, as a real port does. The
 # terminal of a pty lives on with its other end.
 _BOARD = """\
 import fcntl, grp, os, pty, select, sys, termios, time, tty
@@ -362,10 +364,10 @@ while True:
 
 
 class Board(Program):
-    """A serial board in the container, in a process ahead of all others: its times can be trusted.
+    """A serial board in the container, in a process ahead of all others.
 
-    Unless it lies, it answers each command with the speeds asked for two lines before. The speed of
-    wheel a is 0.01 to 0.09 off.
+    Its times are therefore reliable. Unless it lies, it answers each command with the speeds
+    requested two lines before. The speed of wheel a is 0.01 to 0.09 off.
     """
 
     def __init__(self, container: Container) -> None:
@@ -379,14 +381,14 @@ class Board(Program):
         return self
 
     def since(self, at: float) -> list[Heard]:
-        """The lines after then, without their ends; "-" for an empty one."""
+        """Return the lines after then, without their ends; "-" for an empty one."""
         for text in self.out[1 + len(self._heard) :]:
             came, _, line = text.partition(" ")
             self._heard.append(Heard(float(came), line.encode()))
         return [heard for heard in self._heard if heard.at > at]
 
     def awaits(self, line: bytes, after: float = 0.0, within: float = 5.0) -> Heard:
-        """The first line that starts so after then."""
+        """Return the first line after then that starts with this prefix."""
         return until(
             lambda: next((h for h in self.since(after) if h.line.startswith(line)), None),
             within,
@@ -441,7 +443,7 @@ class Driver(Program):
         super().__init__(words, "/", stdin=subprocess.PIPE)
 
     def sends(self, speed: float) -> None:
-        """From now on this speed."""
+        """Send this speed from now on."""
         assert self.process.stdin is not None
         self.process.stdin.write(f"{speed}\n".encode())
         self.process.stdin.flush()
@@ -453,12 +455,12 @@ class Driver(Program):
         self.process.stdin.flush()
 
     def states(self, after: float) -> list[tuple[float, str]]:
-        """When each state came after then, and its mode."""
+        """Return the time and the mode of each state after then."""
         told = [line.split(" ", 1) for line in list(self.out)]
         return [(float(at), mode) for at, mode in told if float(at) > after]
 
     def drives(self, board: Board, speed: float = 0.5) -> None:
-        """Zeros until they are obeyed, then the speed until the wheels have it."""
+        """Send zeros until they are obeyed, then the speed until the wheels have it."""
         self.sends(0.0)
         began = time.monotonic()
         obeyed = until(

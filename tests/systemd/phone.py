@@ -14,23 +14,23 @@ from tests.system.hosts import inside, ip
 from tests.systemd.container import Container, UnavailableError
 
 ROBOT_AT, PHONE_AT = "192.168.77.1", "192.168.77.2"
-"""On a network that `lan.conf` names."""
+"""An address on a network that `lan.conf` names."""
 
 STRANGE, STRANGER_AT = "203.0.113.1", "203.0.113.2"
-"""The robot and the phone on one that it does not name."""
+"""The addresses of robot and phone on a network that it does not name."""
 
 CONNECT_S = 1.0
-"""What is dropped gets no answer."""
+"""Time limit for a connection, because dropped packets get no answer."""
 
 
 class Phone:
-    """A network namespace; leaving takes it and the cable away."""
+    """A network namespace. Leaving it removes it and the cable."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
         self.name = f"acsard{os.getpid()}p"
         self.authority = container.path("/etc/acsard/tls/ca.pem")
-        """What was brought to the phone."""
+        """The authority's certificate, which was copied to the phone."""
 
     def __enter__(self) -> Phone:
         try:
@@ -53,14 +53,17 @@ class Phone:
         ip("netns", "delete", self.name, check=False)
 
     def reaches(self, port: int, at: str = ROBOT_AT) -> bool:
-        """Somebody on the phone gets a connection there."""
+        """Return whether a program on the phone can connect there."""
         with inside(self.name), suppress(OSError):
             socket.create_connection((at, port), CONNECT_S).close()
             return True
         return False
 
     def shown(self, port: int) -> str:
-        """The certificate that it is shown, "" where nobody answers; its authority's or none."""
+        """Return the presented certificate, or "" without an answer.
+
+        Verifies it by its authority or not at all.
+        """
         with inside(self.name), suppress(OSError):
             return ssl.get_server_certificate(
                 (ROBOT_AT, port), ca_certs=str(self.authority), timeout=CONNECT_S
@@ -68,12 +71,14 @@ class Phone:
         return ""
 
     def browser(self, token: str = "") -> aiohttp.ClientSession:
-        """It knows the authority and keeps cookies; or a program with a token. Made and used
-        `inside`."""
+        """Open a session that knows the authority and keeps cookies, or a program's with a token.
+
+        It is made and used `inside`.
+        """
         trusted = ssl.create_default_context(cafile=str(self.authority))
         told = {"Authorization": f"Bearer {token}"} if token else {}
         return aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(ssl=trusted),
-            cookie_jar=aiohttp.CookieJar(unsafe=True),  # of an address, not a name
+            cookie_jar=aiohttp.CookieJar(unsafe=True),  # cookies of an address, not only of a name
             headers=told,
         )

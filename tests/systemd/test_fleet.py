@@ -1,4 +1,4 @@
-"""What the page of fleets has root type for a router, in a real systemd."""
+"""The commands that the fleet page has root type for a router work in a real systemd."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ BEFORE = (
     "cp fleet/clients/router.local/*.pem .",
     "useradd --system zenohd",
 )
-"""What is brought to the server, and what zenohd's package makes."""
+"""The files that are copied to the server, and the user that zenohd's package makes."""
 
 
 def test_a_router_runs_on_the_places_that_the_page_makes_as_a_user_of_its_own(

@@ -76,7 +76,7 @@ def latch(container: Container, board: Board, driver: Driver, kind: Kind) -> flo
 
 
 def stands(container: Container, board: Board, driver: Driver, kind: Kind, since: float) -> None:
-    """See it stand although the commander had every chance to drive it."""
+    """Check that the robot stands although the commander had every chance to drive it."""
     has_mode(driver, MODES[kind])
     up = time.monotonic()
     until(lambda: time.monotonic() > up + 1.5 * CYCLE_S, 1.5 * CYCLE_S, "the time is over")
@@ -150,7 +150,7 @@ def test_a_latched_robot_stands_after_a_reboot_until_it_is_released(
                 call(container, "clear")
             drives(board)
             latch(container, board, driver, kind)
-            # As if the power failed: the services get no signal to end.
+            # It is as if the power failed: the services get no signal to end.
             os.kill(container.main_pid(), signal.SIGKILL)
 
 

@@ -1,4 +1,4 @@
-"""What systemd itself says of the unit, and the drop-ins where they can be tried."""
+"""systemd's own assessment of the unit, and the drop-ins as far as they can be tried."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_its_exposure_is_small(container: Container, unit: str) -> None:
 
 
 def opened(container: Container) -> None:
-    """The service with a door to the network."""
+    """The service with a TLS gateway."""
     made = container.run(ACSARD, "lan", "init", "--force", "--address", "127.0.0.1")
     assert made.code == 0, made.err
     listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
@@ -131,7 +131,7 @@ def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
     container.path(f"{TLS}/key.pem").unlink(missing_ok=True)
     container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text())
     assert container.start().code != 0
-    # Those of the stop script, which runs after any end.
+    # These are the lines of the stop script, which runs after any end.
     assert {heard.line for heard in board.since(0.0)} <= {ZERO, b"-"}
 
 
@@ -158,11 +158,11 @@ def test_without_its_key_the_door_or_page_waits_for_a_person_and_doctor_says_whi
     container.run("systemctl", "disable", unit)
 
 
-# the walls around it
+# the sandbox
 
 
 def reaches(container: Container, address: str) -> bool:
-    """Somebody with that address of their own gets a connection to the daemon at it."""
+    """Return whether a client with that address can connect to the daemon at it."""
     code = (
         "import socket, sys; "
         "socket.create_connection((sys.argv[1], 7448), 1.0, (sys.argv[1], 0)).close()"
@@ -197,8 +197,8 @@ def test_even_a_bus_that_is_open_by_mistake_is_closed_to_other_computers(
 def test_serial_ports_may_be_opened_and_no_other_device(
     container: Container, kind: str, major: int, minor: int, code: str
 ) -> None:
-    # None of these has anything behind it, and no driver for the first two need be loaded: one
-    # that may be opened is waited for.
+    # None of these devices has hardware, and the first two may lack a driver. If a device may be
+    # opened, opening it blocks.
     container.run("mknod", PORT, "c", str(major), str(minor))
     try:
         container.run("chgrp", "dialout", PORT)

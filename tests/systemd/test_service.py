@@ -1,4 +1,4 @@
-"""`acsard service` in a real systemd: what it installs runs, what it removes leaves nothing."""
+"""`acsard service` in a real systemd installs a service that runs, and removes all of it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RECORDINGS = ROOT / "tests" / "recordings"
 
 @pytest.fixture(scope="module")
 def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
-    """A systemd of its own: what is installed here is nothing the others could rely on."""
+    """A separate systemd: the other tests must not depend on files that are installed here."""
     try:
         with Container(rootfs, tmp_path_factory.mktemp("alone"), "acsard-service") as container:
             container.install()
@@ -45,7 +45,7 @@ def bare(alone: Container) -> Iterator[Container]:
 
 
 def listing(container: Container) -> set[str]:
-    """Every file of ours and of the administrator, with its size."""
+    """Return every file of ours and of the administrator, with its size."""
     found = set()
     for place in PLACES:
         for path in container.path(place).rglob("*"):
@@ -91,7 +91,10 @@ def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> N
 
 
 def asks(container: Container, path: str, *more: str) -> str:
-    """What the page answers to who is in there, in Python for want of curl; `more` makes a POST."""
+    """Return the page's answer to a client in there.
+
+    It uses Python for lack of curl; `more` makes a POST.
+    """
     return container.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}", *more).out
 
 
@@ -130,14 +133,14 @@ def test_the_page_runs_beside_it_within_its_limits_and_falls_alone(bare: Contain
 
 
 TLS = "/root/tls"
-"""A robot's certificate, for who comes from elsewhere."""
+"""A robot's certificate, for clients from other hosts."""
 
 STATE = "/var/lib/private/acsard"
 FORMER = "000001-20260101T000000Z.kept.mcap"
 
 
 def recorded_before(container: Container) -> bytes:
-    """A recording that an earlier version has left, which kept all for its own user of then."""
+    """A recording of an earlier version, which kept all files for its own user of that time."""
     (recording, *_) = sorted(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_size)
     container.run("sh", "-c", f"rm -rf {STATE} && install -d -m 700 {STATE.rpartition('/')[0]}")
     place = container.path(f"{STATE}/record")
@@ -185,11 +188,11 @@ print(json.dumps({
     "private": sorted(os.listdir("/var/lib/private")),
 }))
 """
-"""Run where the page runs, in all its walls."""
+"""A program that runs where the page runs, in its whole sandbox."""
 
 
 def drawn(container: Container) -> dict[str, object]:
-    """What becomes of a report of that recording."""
+    """Request a report of that recording and return the result."""
 
     def ended() -> dict[str, object]:
         told = json.loads(asks(container, f"/api/recordings/{FORMER}/report", "POST") or "{}")
@@ -224,7 +227,7 @@ def test_its_page_lists_hands_out_and_draws_recordings_and_can_change_none(bare:
 
     assert bare.run(ACSARD, "service", "uninstall", "--purge").code == 0
     assert not bare.path(STATE).exists()
-    assert not bare.path(f"{STATE}-web").exists()  # a new one takes no old invitation
+    assert not bare.path(f"{STATE}-web").exists()  # a new instance accepts no old invitation
 
 
 def test_nothing_of_somebody_else_is_overwritten_or_removed_without_force(bare: Container) -> None:

@@ -1,4 +1,4 @@
-"""The stop script by itself: zeros on the configured port at once, and it never hangs."""
+"""The stop script alone sends zeros on the configured port at once, and never hangs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SCRIPT = ROOT / "deploy" / "systemd" / "acsard-stop"
 STOP = b"\r\n" + 3 * ZERO_LINE
 
 UNREAD_AT_MOST = 4095
-"""A terminal's buffer in Linux; what is more waits behind it."""
+"""The size of a terminal's buffer in Linux. Further bytes wait behind it."""
 
 pytestmark = pytest.mark.skipif(
     shutil.which("stty") is None or shutil.which("awk") is None, reason="needs stty and awk"
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.skipif(
 
 
 class Wire:
-    """A pty: what its slave end is set to, and what came out of its master end."""
+    """A pty: the settings of its slave end, and the bytes that came out of its master end."""
 
     def __init__(self) -> None:
         self.master, self.slave = pty.openpty()
@@ -50,12 +50,12 @@ class Wire:
             return b""
 
     def unread(self) -> int:
-        """How many bytes wait at the master end."""
+        """Return how many bytes wait at the master end."""
         waiting = fcntl.ioctl(self.master, termios.FIONREAD, struct.pack("i", 0))
         return int(struct.unpack("i", waiting)[0])
 
     def fill(self) -> None:
-        """Until it takes nothing more; full only when the reading end is, too."""
+        """Write until it accepts nothing more. It is full only when the reading end is, too."""
         os.set_blocking(self.slave, False)
         while self.unread() < UNREAD_AT_MOST or select.select([], [self.slave], [], 0)[1]:
             with contextlib.suppress(BlockingIOError):
@@ -192,7 +192,7 @@ def test_a_port_that_takes_nothing_does_not_hold_it_up(tmp_path: Path, wire: Wir
         wire.fill()
         ended = stop(config(tmp_path, f'[mcu]\nport = "{wire.name}"\n'))
         if ended.code:
-            break  # else it took what was sent: a busy kernel moves on what it can much later
+            break  # otherwise it accepted more bytes: a busy kernel makes room much later
     print(f"full port: given up after {ended.seconds:.3f} s")
     assert ended.code == 1
     assert wire.name in ended.err
@@ -206,7 +206,7 @@ def test_a_device_that_is_no_port_is_said(tmp_path: Path) -> None:
 
 
 def processor_s() -> float:
-    """s that ended children have had of a processor, so far."""
+    """Return the processor time of ended children so far, s."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
@@ -223,5 +223,5 @@ def test_it_is_done_within_20_ms(tmp_path: Path, wire: Wire) -> None:
         f"stop script: {min(took):.1f} / {statistics.median(took):.1f} / {max(took):.1f} ms "
         f"(min/median/max), {statistics.median(spent):.1f} ms of the processor"
     )
-    # It waits for nothing: what it takes longer than this, others have the processor.
+    # The script waits for nothing, so in any longer time other processes had the processor.
     assert statistics.median(spent) < 20.0

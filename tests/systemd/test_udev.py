@@ -1,4 +1,4 @@
-"""The udev rules in a real udev: which boards get the name, and what comes with it."""
+"""The udev rules in a real udev give the right boards the name and the right properties."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ OTHERS = ["2341:0043", "1a86:5523", "0403:6010", "1234:0042", "0042:2341"]
 
 
 class Verdict(NamedTuple):
-    """What udev made of a device."""
+    """The result of udev's rules for a device."""
 
     properties: dict[str, str]
     log: str

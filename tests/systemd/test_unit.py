@@ -1,4 +1,4 @@
-"""The unit's life in a real systemd: ready, drives, and zeros on the wire after every end."""
+"""The unit in a real systemd becomes ready, drives, and puts zeros on the wire after every end."""
 
 from __future__ import annotations
 
@@ -24,29 +24,32 @@ STALL_BOUND_S = WATCHDOG_S + 0.32
 KILL_BOUND_S = 0.1
 
 DISTURBED_S = 0.03
-"""systemd is an ordinary process: one that waited this long for a processor says nothing of us."""
+"""systemd is an ordinary process.
+
+If it waited this long for a processor, the result does not count.
+"""
 
 
 def report(what: str, seconds: list[float]) -> None:
-    """The figures, in ms."""
+    """Print the figures, in ms."""
     ms = sorted(1000 * second for second in seconds)
     median = statistics.median(ms)
     print(f"{what}: {ms[0]:.0f} / {median:.0f} / {ms[-1]:.0f} ms (min/median/max, n={len(ms)})")
 
 
 class Fault(NamedTuple):
-    """What came of one, in seconds."""
+    """The times after one fault, in seconds."""
 
     zero: float
     """Until the first zero line on the wire."""
     waited: float
-    """How much of that other work of this machine took."""
+    """The part of that time that other work of this machine took."""
     again: float
     """Until the unit was ready again."""
 
 
 def fault(container: Container, board: Board, driver: Driver, number: signal.Signals) -> Fault:
-    """Drive, send the daemon a signal, and see it come back."""
+    """Drive, send the daemon a signal, and wait until it is back."""
     container.run("systemctl", "reset-failed", UNIT)  # the start limit has a test of its own
     driver.drives(board)
     restarts = int(container.show("NRestarts"))
@@ -58,7 +61,7 @@ def fault(container: Container, board: Board, driver: Driver, number: signal.Sig
     waited = container.waited() - waited
     container.is_active_again(restarts)
     again = time.monotonic()
-    # The driver never stopped: neither the stop script nor the next daemon lets it drive on.
+    # The commander never stopped: neither the stop script nor the next daemon lets it drive on.
     until(lambda: driver.states(again), 5.0, "the next daemon publishes")
     moving = [heard for heard in board.since(zero) if heard.line not in (ZERO, b"-")]
     assert not moving, moving[:3]
@@ -68,7 +71,7 @@ def fault(container: Container, board: Board, driver: Driver, number: signal.Sig
 def faults(
     container: Container, board: Board, driver: Driver, number: signal.Signals, times: int
 ) -> list[Fault]:
-    """Many of them, and their figures."""
+    """Cause many faults, and return their times."""
     took = [fault(container, board, driver, number) for _ in range(times)]
     report(f"{number.name} -> first zero", [one.zero for one in took])
     report("  of it, waiting for a processor", [one.waited for one in took])
@@ -80,12 +83,12 @@ def faults(
 
 
 def undisturbed(took: list[Fault]) -> list[float]:
-    """The times to a zero that other work of this machine had no part in."""
+    """Return the times to a zero in which other work of this machine had no part."""
     return [one.zero for one in took if one.waited <= DISTURBED_S]
 
 
 def within(took: list[Fault], bound: float) -> bool:
-    """The bound holds whenever the machine is calm, and mostly when it is not."""
+    """Check the bound: always when the machine is calm, and mostly when it is not."""
     mostly = statistics.median_low(one.zero for one in took) <= bound
     return mostly and max(undisturbed(took), default=0.0) <= bound
 
@@ -100,7 +103,7 @@ def test_it_starts_says_it_is_ready_publishes_and_drives(
     print(f"start: ready after {ready:.3f} s, first line after {first:.3f} s")
     assert started.code == 0, started.err
     assert container.show("SubState") == "running"
-    # Without AF_NETLINK it gets this far and then publishes nothing.
+    # Without AF_NETLINK the daemon gets this far and then publishes nothing.
     until(lambda: driver.states(began), 5.0, "it publishes")
     driver.drives(board)
     status = "driving 0.5 m/s by app"
@@ -201,7 +204,7 @@ def test_a_bad_configuration_ends_it_with_78_and_it_stays_down(
 def test_a_forbidden_port_ends_it_with_77_and_it_stays_down(
     container: Container, board: Board
 ) -> None:
-    # Followed in there: the link is the container's.
+    # Follow the link inside, because it is the container's.
     container.run("chmod", "0600", PORT)
     container.start()
     assert container.show("ExecMainStatus") == "77"

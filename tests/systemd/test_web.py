@@ -1,4 +1,4 @@
-"""The page as an installed service, opened to phones by what its page says to type."""
+"""The page as an installed service, opened to phones by the commands on its own page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.systemd.phone import ROBOT_AT, STRANGE, Phone
 pytestmark = pytest.mark.systemd
 
 AWAY = f"https://{ROBOT_AT}:8443"
-"""What the phone opens."""
+"""The address that the phone opens."""
 
 LINK = re.compile(rf"{AWAY}/#token=(\S+)")
 
@@ -36,7 +36,7 @@ SERVED_S = 20.0
 
 
 def of_the_page(language: str, words: str) -> Block:
-    """The one block of the page with these words."""
+    """Return the only block of the page with these words."""
     (found,) = (
         block
         for block in blocks(language)
@@ -46,7 +46,7 @@ def of_the_page(language: str, words: str) -> Block:
 
 
 OPENING = of_the_page("console", "acsard-web.service.d").commands()
-"""The last of them invites."""
+"""The commands that open it. The last of them invites."""
 
 REVOKING, RENEWING = of_the_page("console", "lan renew").commands()
 
@@ -62,7 +62,7 @@ print(urlopen(sys.argv[1]).read().decode())
 
 
 def clean(container: Container) -> None:
-    """No certificates and no tokens, as after the installation."""
+    """Remove certificates and tokens, as after the installation."""
     container.reset()
     container.run("systemctl", "clean", "--what=state", PAGE)
     container.run("rm", "-rf", "/etc/acsard/tls")
@@ -70,7 +70,7 @@ def clean(container: Container) -> None:
 
 @pytest.fixture(scope="module")
 def robot(booted: Container) -> Iterator[Container]:
-    """The service on the simulator, its page for this computer alone."""
+    """Run the service on the simulator, with its page for this computer alone."""
     clean(booted)
     booted.write(CONFIG, 'mcu.port = "sim"\n')
     for unit in (UNIT, PAGE):
@@ -82,7 +82,7 @@ def robot(booted: Container) -> Iterator[Container]:
 
 @pytest.fixture(scope="module")
 def phone(robot: Container) -> Iterator[Phone]:
-    """Beside the robot, whose page has been opened for it."""
+    """Provide a phone next to the robot, whose page has been opened for it."""
     try:
         with Phone(robot) as phone:
             robot.write(CONFIG, SETTINGS)
@@ -95,18 +95,18 @@ def phone(robot: Container) -> Iterator[Phone]:
 
 
 def is_served(robot: Container, phone: Phone) -> None:
-    """The page answers the phone, and so does the daemon behind it."""
+    """Check that the page answers the phone, and that the daemon behind it does."""
     until(lambda: phone.shown(8443), SERVED_S, "the page is served")
     until(lambda: '"mode"' in here(robot, "/api/state"), SERVED_S, "it hears the robot")
 
 
 def here(robot: Container, path: str) -> str:
-    """What somebody at the machine gets; "" for nothing."""
+    """Return the page's answer on the robot's own machine; "" if there is none."""
     return robot.run("python3", "-c", ASK, f"http://127.0.0.1:8080{path}").out
 
 
 def invited(robot: Container, *more: str) -> str:
-    """The token of an invitation, as the page says to make one."""
+    """Return the token of an invitation, made as the page says."""
     told = robot.types(" ".join([OPENING[-1], *more])).out
     found = LINK.search(told)
     assert found, told
@@ -114,13 +114,13 @@ def invited(robot: Container, *more: str) -> str:
 
 
 def on(phone: Phone, story: Callable[[], Awaitable[None]]) -> None:
-    """What happens on the phone."""
+    """Run the scenario on the phone."""
     with inside(phone.name):
         run(story)
 
 
 async def let_in(browser: aiohttp.ClientSession, token: str) -> str:
-    """Post a token as the page does; the cookie it becomes."""
+    """Post a token as the page does; return the cookie that it becomes."""
     posted = browser.post(f"{AWAY}/token", data={"token": token}, headers={"Origin": AWAY})
     async with posted as answer:
         assert answer.status == 200, await answer.text()
@@ -195,7 +195,7 @@ def test_the_unit_lets_in_the_networks_of_lan_conf_and_these_to_the_page_alone(
     assert not phone.reaches(8080), "without TLS for this computer alone"
     assert not phone.reaches(7448), "the bus"
     assert not phone.reaches(8443, STRANGE), "of a network that is not in it"
-    # That it was the unit, and no missing way:
+    # Check that the unit refused it, and that a route existed:
     robot.drop_in("wider.conf", "[Service]\nIPAddressAllow=203.0.113.0/24\n", PAGE)
     robot.types("systemctl restart acsard-web")
     is_served(robot, phone)

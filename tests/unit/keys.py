@@ -1,4 +1,4 @@
-"""Every key of the configuration, found by walking the structs: what no table by hand may miss."""
+"""Every key of the configuration, found by walking the structs, so that no test can miss one."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Bounded = inspect.FloatType | inspect.IntType
 
 
 class Key(msgspec.Struct, frozen=True):
-    """One key: `path` as a person writes it, the struct it is in and its field there."""
+    """One key: its written path, its struct and its field there."""
 
     path: str
     table: type[msgspec.Struct]
     field: FieldInfo
 
     def numbers(self) -> list[Bounded]:
-        """The number types its value may have, also inside a union or a list."""
+        """Return the number types that its value may have, also inside a union or a list."""
         return list(_numbers(inspect.type_info(self.field.type)))
 
     def document(self, text: str) -> str:
-        """A TOML document that gives this key, and only this, the value written as `text`."""
+        """Return a TOML document that sets only this key, with the value written as `text`."""
         if self.table is Source:
             rest = {"name": '"x"', "priority": "1"} | {self.field.name: text}
             return "[[commands.sources]]\n" + "\n".join(f"{k} = {v}" for k, v in rest.items())
@@ -34,7 +34,7 @@ class Key(msgspec.Struct, frozen=True):
 
 
 def all_keys(table: type[msgspec.Struct] = Config, path: str = "") -> Iterator[Key]:
-    """Every key that holds a value, sources included as `commands.sources[0].…`."""
+    """Yield every key that holds a value, with those of sources as `commands.sources[0].…`."""
     for field in fields(table):
         where = f"{path}.{field.name}" if path else field.name
         if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
@@ -57,4 +57,4 @@ def _numbers(kind: Any) -> Iterator[Bounded]:
 
 
 KEYS = tuple(all_keys())
-"""In the order of the file."""
+"""All keys in the order of the file."""

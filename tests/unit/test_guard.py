@@ -1,4 +1,7 @@
-"""The last look at every line: what it lets pass, what it replaces, and why."""
+"""Tests of the guard, which checks every line last.
+
+They cover the lines it passes, the lines it replaces, and its reasons.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +60,7 @@ LATE = "it still moves a wheel although the longest ramp to rest is over"
 
 
 def line(*wheels: float) -> bytes:
-    """The line for a, b, c, d; one figure is for all of them."""
+    """Return the line for a, b, c, d; one number applies to all of them."""
     return CODEC.encode(WheelSpeeds(*(wheels * 4 if len(wheels) == 1 else wheels)))
 
 
@@ -70,7 +73,10 @@ def outputs(
     age_ms: float | None = 0.0,
     at_ns: int = NOW_NS,
 ) -> Outputs:
-    """A step's outputs with this line; by default a fresh command is followed on a live link."""
+    """Return a step's outputs with this line.
+
+    By default a fresh command is followed on a live link.
+    """
     return Outputs(
         now=Instant(at_ns, at_ns),
         due=True,
@@ -89,12 +95,12 @@ def outputs(
 
 
 def coasting(data: bytes) -> Outputs:
-    """The same without any commander."""
+    """Return outputs with this line and without any commander."""
     return outputs(data, mode="ready", source="", age_ms=None)
 
 
 class Guarded:
-    """A guard, and the line that it let pass last."""
+    """A guard and the last line that it passed."""
 
     def __init__(
         self,
@@ -127,7 +133,7 @@ def guard() -> Guarded:
 
 
 def sent(guard: Guarded, *wheels: float) -> Guarded:
-    """The guard after it let a line with these speeds pass, and it went out."""
+    """Return the guard after it passed a line with these speeds and the line was sent."""
     data = line(*wheels)
     assert guard.check(outputs(data)) == data
     guard.note_sent()
@@ -135,13 +141,13 @@ def sent(guard: Guarded, *wheels: float) -> Guarded:
 
 
 def objection(guard: Guarded, found: Outputs) -> str:
-    """Why the line became STOP; "" when it passed as it is."""
+    """Return why the line became STOP, or "" if it passed unchanged."""
     passed = guard.check(found)
     assert passed == (STOP if guard.trip else found.line)
     return guard.trip
 
 
-# what passes
+# lines that pass
 
 
 def test_before_the_first_line_nothing_was_replaced(guard: Guarded) -> None:
@@ -214,7 +220,7 @@ def test_a_ramp_to_zero_passes_to_the_end(trailing_comma: bool) -> None:
         b"ap01.00 bp01.00,cp01.00,dp01.00\r\n",
         b"ap01.00, bp1.00,cp01.00,dp01.00\r\n",
         b"ap100.00,bp01.00,cp1.00,dp1.00\r\n",
-        # two lines at once: the first would be obeyed before anyone looked at it
+        # Of two lines at once, the MCU would obey the first before the guard saw it.
         b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" * 2,
         b"ap90.00,bp90.00,cp90.00,dp90.00\r\nap01.00,bp01.00,cp01.00,dp01.00\r\n",
     ],
@@ -267,7 +273,7 @@ def test_without_a_link_no_wheel_moves_not_even_more_slowly(guard: Guarded) -> N
     assert objection(guard, outputs(line(0.0, 0.0, 0.0, 0.01), linked=False)) == NO_LINK
 
 
-# growing
+# growing speeds
 
 
 @pytest.mark.parametrize("wheel", range(4))
@@ -333,19 +339,19 @@ def test_a_command_from_the_far_future_is_not_fresh(guard: Guarded) -> None:
     assert objection(guard, outputs(line(1.0), age_ms=-1000.0)) == GROWS
 
 
-# what was sent
+# the last sent line
 
 
 def test_a_line_that_did_not_go_out_is_not_what_the_next_is_compared_with(guard: Guarded) -> None:
     sent(guard, 5.0)
-    assert objection(guard, outputs(line(6.0))) == ""  # passed and not sent
+    assert objection(guard, outputs(line(6.0))) == ""  # passed but not sent
     assert objection(guard, coasting(line(6.0))) == GROWS
     assert objection(guard, coasting(line(5.0))) == ""
 
 
 def test_a_slower_line_that_did_not_go_out_does_not_lower_the_comparison(guard: Guarded) -> None:
     sent(guard, 5.0)
-    assert objection(guard, coasting(line(3.0))) == ""  # passed and not sent
+    assert objection(guard, coasting(line(3.0))) == ""  # passed but not sent
     assert objection(guard, coasting(line(4.0))) == ""
 
 
@@ -393,11 +399,11 @@ SLOW_TO_STOP = LimitsConfig(
     linear_stop_deceleration=2.0,
     angular_stop_deceleration=5.0,
 )
-"""The longest ramp takes 2 s, and 0.5 s by a stop."""
+"""Limits whose longest ramp takes 2 s, and 0.5 s after a stop."""
 
 
 class Clocked:
-    """A guard and its time, ms after the last fresh command; lines that pass go out."""
+    """A guard with its time in ms after the last fresh command; lines that pass are sent."""
 
     def __init__(self, limits: LimitsConfig = SLOW_TO_STOP) -> None:
         self.guard = Guard(STOP, Config(limits=limits))
@@ -408,7 +414,10 @@ class Clocked:
         assert self.trip(ms, "driving", speed) == ""
 
     def trip(self, ms: float, mode: str, speed: float = 10.0, line_due: bool = True) -> str:
-        """What the guard says of a line at this time; only in mode driving a command is fresh."""
+        """Return the guard's objection to a line at this time.
+
+        A command is fresh only in mode driving.
+        """
         fresh = mode == "driving"
         found = outputs(
             line(speed) if line_due else None,
@@ -430,7 +439,8 @@ def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is
     first = next(n for n, trip in enumerate(trips) if trip)
     assert trips[first] == LATE
     assert (first + 1) * 10 == 10 + 500 + MARGIN_NS // MS + 10
-    assert set(trips[first + 1 :]) == {GROWS}  # nothing starts from the stop that went out
+    # no motion may start again after the stop that was sent
+    assert set(trips[first + 1 :]) == {GROWS}
 
 
 @pytest.mark.parametrize(
@@ -537,7 +547,8 @@ def test_the_ramp_of_a_robot_that_skids_is_that_of_its_wider_track() -> None:
 def test_at_rest_new_settings_bring_their_own_ramp() -> None:
     clocked = Clocked()
     assert clocked.trip(100, "ready", 0.0) == ""
-    clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))  # 0.4 s
+    # this ramp takes 0.4 s
+    clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))
     clocked.drive(1000)
     assert clocked.trip(1700, "ready") == ""
     assert clocked.trip(1701, "ready") == LATE
@@ -548,7 +559,7 @@ def test_at_rest_new_settings_bring_their_own_ramp() -> None:
     [
         (LimitsConfig(), 1000),
         (LimitsConfig(angular_deceleration=2.0), 2000),
-        # the wheels allow only 0.5 m/s and 3.33 rad/s
+        # The wheels allow only 0.5 m/s and 3.33 rad/s.
         (LimitsConfig(linear_speed=9.0, angular_speed=0.0, wheel_speed=10.0), 500),
         (LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0), 833),
     ],
@@ -576,7 +587,7 @@ def test_a_line_that_moves_before_any_command_is_late() -> None:
 
 
 class Loop:
-    """Robot and guard, wired as the control loop does it; what goes out is in `wire`."""
+    """Robot and guard, connected as in the control loop; `wire` collects the sent lines."""
 
     def __init__(self, config: Config, wheel_speed: float | None = None) -> None:
         self.robot = Robot(config)
@@ -639,7 +650,7 @@ class Loop:
 
 
 def test_one_trip_is_one_fault_that_names_it() -> None:
-    loop = Loop(Config(), wheel_speed=5.0)  # the robot believes in 40 rad/s
+    loop = Loop(Config(), wheel_speed=5.0)  # the robot itself assumes 40 rad/s
     loop.step(heard=3)
     loop.step(loop.command(0.0))
     for _ in range(60):
@@ -652,7 +663,7 @@ def test_one_trip_is_one_fault_that_names_it() -> None:
 
 @st.composite
 def legal(draw: st.DrawFn) -> Config:
-    """A configuration whose slowest ramps are often as long as the rules allow."""
+    """Return a configuration whose slowest ramps are often as long as the rules allow."""
     drive = DriveConfig(
         draw(st.floats(0.03, 0.2)),
         draw(st.floats(0.2, 0.8)),
@@ -691,7 +702,7 @@ HAPPENINGS = (
 
 
 def happen(loop: Loop, what: str, steps: int, ms: float, full: Twist) -> None:
-    """One thing that may happen in the middle of a ramp."""
+    """Apply one event in the middle of a ramp."""
     limits = loop.config.limits
     match what:
         case "stall":
@@ -760,7 +771,7 @@ EACH_CONFIG = pytest.mark.parametrize(
 
 
 def random_walk(rng: random.Random, config: Config) -> Loop:
-    """Three seconds in which the port, the MCU, the wire and the people do what they like."""
+    """Run three seconds in which the port, the MCU, the wire and the operators behave randomly."""
     loop, port_open, heard, goes = Loop(config), True, 1, 1.0
     twist = REST
     verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate")

@@ -1,4 +1,4 @@
-"""`Robot.step`, one step at a time: link, modes, commands, lines, answers and counts."""
+"""Tests of `Robot.step`, one step at a time: link, modes, commands, lines, answers and counters."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ WALL_NS = 1_800_000_000 * NS_PER_S
 GO = Twist(0.5, 0.0)
 ZERO_LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 ROLLING = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
-"""0.5 m/s straight on."""
+"""Wheel speeds of 0.5 m/s straight on."""
 
 
 class Bench:
-    """A robot, its time, and an MCU that answers every period with `reply`."""
+    """A robot with its time and an MCU that answers every period with `reply`."""
 
     def __init__(
         self,
@@ -64,7 +64,8 @@ class Bench:
         latches: Latches = Latches(),  # noqa: B008
         fault_time: float = 0.0,
     ) -> None:
-        # Its MCU says the same whatever it is told, which `sanity` would call a fault in time.
+        # `fault_time` 0 disables contradiction faults, because this MCU always reports the same
+        # speeds.
         config = replace(config or Config(), feedback=FeedbackConfig(fault_time=fault_time))
         self.robot = Robot(config, latches)
         self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
@@ -94,10 +95,11 @@ class Bench:
         gyro: float | None = None,
         late_ms: float | None = None,
     ) -> Outputs:
-        """One period later (or `ms`): what happened meanwhile goes in, the outputs come out.
+        """Run one step a period later, or `ms` later, and return its outputs.
 
         A `clear` or `activate` names the latch of the step before, as the tools do. `gyro` is the
-        rate of a sample; the commands are stamped `late_ms` ago by a clock of their own.
+        rate of a sample. With `late_ms`, the commands carry stamps that old by a clock of their
+        own.
         """
         held = self.out.latches.in_force
         latch = held.number if ask in ("clear", "activate") and held else None
@@ -130,7 +132,7 @@ class Bench:
         return self
 
     def driving(self, twist: Twist = GO, steps: int = 60) -> Bench:
-        """Link up, open with a zero, and follow the twist until it is reached."""
+        """Link up, arm with a zero, and follow the twist until it is reached."""
         self.linked().step(REST)
         for _ in range(steps):
             self.step(twist)
@@ -138,7 +140,7 @@ class Bench:
         return self
 
     def let_go(self) -> Bench:
-        """Zeros, until one comes a timeout after the last speed."""
+        """Send zeros until one arrives a timeout after the last speed."""
         for _ in range(27):
             self.step(REST)
         return self
@@ -158,17 +160,17 @@ class Bench:
         return answer
 
     def said(self) -> WheelSpeeds | None:
-        """What the last line tells the wheels; None without a line."""
+        """Return the wheel speeds of the last line, or None without a line."""
         return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
 
     @property
     def robot_latch(self) -> int:
-        """Number of the latch that `clear` releases next."""
+        """Return the number of the latch that `clear` releases next."""
         latch = self.robot.step(Inputs(self.now, False, True, self.opened)).latches.next
         return 0 if latch is None else latch.number
 
     def set(self, settings: dict[str, Plain]) -> dict[str, float]:
-        """Change settings, and return the limits that are kept lowered then."""
+        """Change settings and return the limits that are kept lowered afterwards."""
         self.now_ns += 10 * MS
         requests = (Request("set", 7, settings=settings),)
         self.out = self.robot.step(Inputs(self.now, True, True, self.opened, requests=requests))
@@ -243,7 +245,7 @@ def test_every_feedback_line_is_an_estimate_with_its_own_stamp() -> None:
     wire_ns = 33 * 10 * NS_PER_S // 115200
     assert (first.heard_ns, second.heard_ns) == (bench.now_ns - wire_ns, bench.now_ns)
     assert second.at.mono_ns == bench.now_ns - wire_ns
-    # Nobody knows their period yet: they share the time since the line before.
+    # Their period is not known yet, so they share the time since the line before.
     assert first.at.mono_ns == second.at.mono_ns - 5_000_000
     assert first.speeds == second.speeds == ROLLING
 
@@ -326,7 +328,7 @@ def test_the_speed_grows_by_the_acceleration_up_to_the_command() -> None:
 
 def test_the_line_says_what_is_applied() -> None:
     bench = Bench().driving(Twist(0.3, 1.0), steps=100)
-    # 3 and 9 rad/s
+    # The wheels turn at 3 and 9 rad/s.
     assert bench.out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
     assert bench.out.applied == Twist(0.3, 1.0)
     assert bench.out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
@@ -444,7 +446,7 @@ def test_who_commands_while_the_port_is_closed_is_shown_all_the_same() -> None:
 
 def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there() -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
-    bench.opened = 0  # never yet
+    bench.opened = 0  # the port was never open
     bench.step(GO)
     waits = {s.name: waiting(s.waits_for) for s in bench.robot.snapshot(bench.now_ns).sources}
     assert waits["app"] == ""
@@ -474,7 +476,7 @@ def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
     bench = Bench().driving()
     bench.reply = None
     for _ in range(10):
-        bench.step(GO)  # quiet is not over yet: these still drive
+        bench.step(GO)  # the silence timeout has not passed, so these still drive
     lines = [bench.step(GO).line for _ in range(100)]
     assert [index for index, line in enumerate(lines) if line] == list(range(0, 100, 10))
     assert {line for line in lines if line} == {ZERO_LINE}
@@ -550,7 +552,7 @@ def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
     bench = Bench().driving()
     answer = bench.answer("stop")
     assert answer == Answer(7, True, "stopped and latched; srv/clear releases it")
-    # 3 m/s2: 0.03 m/s a step; 0.5 m/s take 17 of them
+    # 3 m/s2 is 0.03 m/s per step; 0.5 m/s take 17 steps.
     path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
     assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
     assert bench.mode() == "stopped"
@@ -763,7 +765,7 @@ def test_a_stop_that_comes_ahead_of_its_query_and_with_it_is_one_event() -> None
         bench.now_ns += 1500 * MS
 
 
-# what the log is told
+# logged events
 
 
 def test_a_command_that_is_refused_is_told_with_its_reason_and_who_sent_it() -> None:
@@ -840,7 +842,7 @@ def test_after_a_guard_trip_the_robot_goes_on_from_the_stop_that_was_sent() -> N
 
 
 def impossible(bench: Bench, lines: int) -> Bench:
-    """Feedback that cannot be true, and then what there was before."""
+    """Feed impossible feedback for this many lines, then the earlier reply again."""
     reply, bench.reply = bench.reply, bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
     for _ in range(lines):
         bench.step(GO)
@@ -854,7 +856,7 @@ def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration
     impossible(bench, 1)
     assert bench.mode() == "fault"
     assert bench.out.reason.startswith("impossible feedback: front_right 99.00 rad/s")
-    # 3 m/s2 x 10 ms
+    # Each step removes 3 m/s2 x 10 ms.
     assert bench.out.applied.linear == pytest.approx(0.47)
     assert bench.step(GO).applied.linear == pytest.approx(0.44)
     assert bench.counters()["line_impossible"] == 3
@@ -911,7 +913,7 @@ def test_after_a_fault_each_source_must_be_neutral() -> None:
     assert bench.mode() == "ready"
 
 
-# leaving
+# shutdown
 
 
 def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
@@ -946,11 +948,11 @@ def test_a_leaving_robot_never_drives_again() -> None:
     assert (bench.mode(), bench.out.applied) == ("leaving", REST)
 
 
-# lines that did not go
+# lines that did not leave
 
 
 def test_a_superseded_line_never_happened() -> None:
-    # Every second line goes: two periods have passed since the last one that did.
+    # Every second line leaves, so two periods have passed since the last sent one.
     bench = Bench().linked()
     bench.step(REST)
     bench.step(GO)
@@ -967,7 +969,7 @@ def test_a_superseded_line_never_happened() -> None:
 
 def test_while_lines_are_superseded_the_speed_cannot_run_away_from_the_last_line_sent() -> None:
     bench = Bench().driving(Twist(0.1, 0.0))
-    bench.step(Twist(1.0, 0.0))  # 0.11 m/s went out; from here nothing does
+    bench.step(Twist(1.0, 0.0))  # 0.11 m/s was sent; no later line leaves
     bench.step(Twist(1.0, 0.0))
     for _ in range(23):
         out = bench.step(Twist(1.0, 0.0), superseded=True)
@@ -979,7 +981,7 @@ def test_a_superseded_line_in_a_ramp_brakes_as_time_passes() -> None:
     for _ in range(26):
         bench.step()
     assert bench.out.applied.linear == pytest.approx(0.49)
-    bench.step()  # does not go
+    bench.step()  # this line does not leave
     assert bench.step(superseded=True).applied.linear == pytest.approx(0.47)  # 0.49 and 20 ms
 
 
@@ -992,9 +994,9 @@ def test_what_was_not_said_for_too_long_is_not_resumed() -> None:
 
 def test_lines_superseded_for_too_long_begin_again_from_rest() -> None:
     bench = Bench().driving()
-    bench.step(GO)  # the first that does not go; the one before it is the last the MCU heard
+    bench.step(GO)  # the first line that does not leave; the MCU received the one before it last
     path = [bench.step(GO, superseded=True).applied.linear for _ in range(26)]
-    assert path[:24] == [0.5] * 24  # 20 to 250 ms
+    assert path[:24] == [0.5] * 24  # from 20 to 250 ms
     assert path[24:] == [0.0, 0.0]
 
 
@@ -1028,8 +1030,8 @@ def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_bac
     neutral_first: bool,
 ) -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
-    bench.step(GO)  # does not go
-    bench.replug().step(GO, superseded=True)  # zero, and does not go
+    bench.step(GO)  # this line does not leave
+    bench.replug().step(GO, superseded=True)  # zero, which does not leave
     assert bench.out.applied == REST
     bench.reply = bench.codec.stop * 2
     bench.step(GO, superseded=True)
@@ -1040,7 +1042,7 @@ def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_bac
 @pytest.mark.parametrize("neutral_first", [True, False])
 def test_nor_when_the_port_was_lost_and_found_between_two_ticks(neutral_first: bool) -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
-    bench.step(GO)  # does not go
+    bench.step(GO)  # this line does not leave
     bench.replug()
     for _ in range(3):
         bench.step(GO, tick=False)
@@ -1048,7 +1050,7 @@ def test_nor_when_the_port_was_lost_and_found_between_two_ticks(neutral_first: b
     assert bench.step(GO, superseded=True).applied.linear <= 0.05
 
 
-# what changed
+# changes of the status
 
 
 def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise() -> None:
@@ -1057,7 +1059,7 @@ def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise()
     assert not bench.unplug().step().status_changed
     bench.replug()
     assert [bench.step().status_changed for _ in range(4)] == [True, False, True, False]
-    assert bench.step(REST).status_changed  # driving by app
+    assert bench.step(REST).status_changed  # driven by app
     assert not bench.step(GO).status_changed
     assert bench.step(REST, source="teleop").status_changed
     assert not bench.step(REST, source="teleop").status_changed
@@ -1073,7 +1075,7 @@ def test_the_outputs_carry_the_time_of_the_step() -> None:
 
 
 def random_walk(seed: int) -> list[Outputs]:
-    """Two hundred steps of whatever may happen."""
+    """Run two hundred steps with random events."""
     rng = random.Random(seed)
     bench = Bench(
         Config(commands=CommandsConfig(sources=(Source("app", 50), Source("teleop", 100))))
@@ -1212,8 +1214,10 @@ def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> N
 
 
 def test_bytes_faster_than_the_wire_carries_them_end_nothing() -> None:
-    """A board that babbles over USB, or a baud rate set too low: reads that have one and the same
-    time are no clock."""
+    """A board floods the USB link, or the baud rate is set too low.
+
+    Reads with one and the same time are not a clock.
+    """
     robot = Robot(Config())
     good = b"a0.00,b0.00,c0.00,d0.00\r\n"
     for n in range(2000):
@@ -1240,7 +1244,7 @@ def test_the_track_that_a_gyro_taught_is_an_event_and_is_used_from_then_on() -> 
         bench.step(gyro=0.0)
     told: list[Event] = []
     for second in range(60):
-        # Opposite wheels turn it by 1 rad/s at the configured track; it turns by 1/1.6 of that.
+        # Opposite wheels turn by 1 rad/s at the configured track; the robot turns by 1/1.6 of that.
         rate = (1.0, -1.0, 0.5, 0.0)[second % 4]
         bench.reply = bench.codec.encode(bench.robot._kinematics.wheel_speeds(Twist(0.0, rate)))
         for _ in range(100):

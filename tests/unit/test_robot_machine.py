@@ -1,8 +1,8 @@
-"""Robot and guard under any order of events hypothesis can think of, joined as the loop joins them.
+"""Robot and guard under any order of events, joined as the control loop joins them.
 
-The machine keeps its own books: who was neutral, whose command is fresh, which lines were good,
-what left for the motors. It shares nothing with the robot but the configuration, and after every
-step it holds what came out against the books.
+Hypothesis chooses the events. The machine keeps its own record: which senders were neutral, which
+command is fresh, which lines were good, and which lines left for the motors. It shares only the
+configuration with the robot. After every step it compares the outputs with its record.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from acsard.values import (
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S
 ROUNDING = 0.006
-"""rad/s; a line says hundredths."""
+"""Largest rounding error of a line, rad/s, because a line has two decimals."""
 
 SOURCES = (
     Source("teleop", 100),
@@ -89,7 +89,7 @@ KEPT = [
     Latches(STOP, FAULT, OFF),
     Latches(lowered={"limits.linear_speed": 0.6, "limits.angular_speed": 2.0}),
 ]
-"""Latches that a robot starts with; most often none."""
+"""Latches that a robot starts with; most often there are none."""
 
 Wheels = tuple[float, float, float, float]
 
@@ -101,7 +101,7 @@ places = st.floats(-1e6, 1e6)
 
 
 def read(line: bytes) -> Wheels:
-    """The wheels of a line we wrote, by fixed columns; fails on any other."""
+    """Return the wheel speeds of a line from the host, by fixed columns; fail on any other form."""
     found = []
     for letter, start in zip("abcd", (0, 8, 16, 24), strict=True):
         token = line[start : start + 7].decode("ascii")
@@ -115,7 +115,7 @@ def read(line: bytes) -> Wheels:
 
 
 def write(wheels: Wheels) -> bytes:
-    """A reply of the microcontroller."""
+    """Return a reply of the microcontroller."""
     return (
         ",".join(
             f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
@@ -126,7 +126,7 @@ def write(wheels: Wheels) -> bytes:
 
 
 def numbers(value: object) -> Iterator[float]:
-    """Every float in a tree of builtins."""
+    """Yield every float in a tree of builtins."""
     if isinstance(value, float):
         yield value
     elif isinstance(value, dict):
@@ -138,7 +138,10 @@ def numbers(value: object) -> Iterator[float]:
 
 
 class Books:
-    """What is known of one source: by the text of SAFETY section 1, not by the robot."""
+    """The test's own record of one source.
+
+    It follows the text of SAFETY section 1 and is independent of the robot.
+    """
 
     def __init__(self, source: Source, neutral_first: bool) -> None:
         self.priority = source.priority
@@ -163,12 +166,12 @@ class Books:
 
 
 def did(answer: Answer) -> bool:
-    """It was obeyed, and there was something to do."""
+    """Return whether the request was obeyed and changed something."""
     return answer.success and not answer.message.startswith("nothing")
 
 
 class RobotMachine(RuleBasedStateMachine):
-    """One robot, its guard, a port, a microcontroller and a few commanders."""
+    """One robot with its guard, a port, a microcontroller and a few commanders."""
 
     @initialize(
         config=st.sampled_from(CONFIGS), rolling=st.booleans(), latches=st.sampled_from(KEPT)
@@ -189,7 +192,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.commands: list[Command] = []
         self.requests: list[Request] = []
         self.received: list[Received] = []
-        # the microcontroller: what it hears and what it says
+        # the microcontroller: its received and sent lines
         self.told: Wheels = (0.0, 0.0, 0.0, 0.0)
         self.turning: Wheels = self.told
         self.heard_ns: int | None = None
@@ -204,7 +207,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.pose, self.sampled_ns = Pose(), self.now_ns - NS_PER_S
         self.fastest = 0.0
         self.steps: deque[float] = deque(maxlen=TAKEN_BACK + 1)
-        """m at most, of the last lines."""
+        """Largest possible motion of each of the last lines, m."""
         self.left_out: tuple[str, ...] = ()
         self.lates = 0
         self.clocks_become_known()
@@ -219,7 +222,7 @@ class RobotMachine(RuleBasedStateMachine):
             self.cruise("app", Twist(0.7, 0.5), 30, 1)
 
     def clocks_become_known(self) -> None:
-        """Zeros of all, steadily, before there is a port."""
+        """Send steady zeros from all sources before the port is open."""
         for _ in range(50):
             self.now_ns += 50 * MS
             for name in NAMES:
@@ -229,7 +232,7 @@ class RobotMachine(RuleBasedStateMachine):
             now = Instant(self.now_ns, wall_ns)
             self.robot.step(Inputs(now, tick=False, port_open=False, commands=tuple(zeros)))
 
-    # what happens
+    # events
 
     @rule(count=st.integers(1, 12), reply=st.booleans())
     def time_passes(self, count: int, reply: bool) -> None:
@@ -265,14 +268,14 @@ class RobotMachine(RuleBasedStateMachine):
     def a_prompt_stamped_command_comes(self, name: str, twist: Twist) -> None:
         known = self.books[name].promptest
         if known is None or self.now_ns - known[1] > 200 * NS_PER_S:
-            return  # so long unheard it is as good as new
+            return  # after so long a silence the clock counts as new
         self.books[name].promptest = (0, self.now_ns)
         self.command(name, twist, stamp_ns=self.now_ns + WALL_NS)
 
     @rule(name=names, twist=twists, late_ms=st.integers(20, 9000))
     def a_command_comes_late(self, name: str, twist: Twist, late_ms: int) -> None:
         book = self.books[name]
-        self.lates += 1  # none as late as those before: that would be a clock that was set
+        self.lates += 1  # never as late as those before, which would look like a clock that was set
         late_ns = book.timeout_ns + (late_ms + self.lates % 7 * 1500) * MS
         if book.promptest is not None and self.now_ns - book.promptest[1] < 9 * NS_PER_S:
             command = Command(name, twist, self.now_ns, self.now_ns + WALL_NS - late_ns, name)
@@ -304,7 +307,7 @@ class RobotMachine(RuleBasedStateMachine):
     @rule(place=st.integers(0, 30), flipped=st.sampled_from([0x80, 0xA0]))
     def a_damaged_line_comes(self, place: int, flipped: int) -> None:
         line = bytearray(write(self.turning))
-        line[place] ^= flipped  # never a line again
+        line[place] ^= flipped  # the result is never a valid line
         self.receive(bytes(line), 0)
         self.good_in_row = 0 if self.told_link != "up" else self.good_in_row
 
@@ -366,7 +369,7 @@ class RobotMachine(RuleBasedStateMachine):
 
     @rule()
     def everything_is_released(self) -> None:
-        """Clear both latches, activate, open the port: otherwise most runs end in a latch."""
+        """Clear both latches, activate and open the port; otherwise most runs end in a latch."""
         self.opened += not self.port_open
         self.port_open, self.blocked = True, False
         for _ in range(2):
@@ -408,7 +411,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.leaving = True
         self.step(reply=True)
 
-    # how it is told
+    # inputs of the robot
 
     def ask(self, verb: Verb, off: int | None = 0) -> None:
         held = self.latches.in_force
@@ -420,12 +423,12 @@ class RobotMachine(RuleBasedStateMachine):
         self, name: str, twist: Twist, arrived_ns: int | None = None, stamp_ns: int | None = None
     ) -> None:
         at_ns = self.now_ns if arrived_ns is None else arrived_ns
-        if self.commands:  # one queue: they are taken in the order they came
+        if self.commands:  # one queue: commands are taken in order of arrival
             at_ns = max(at_ns, self.commands[-1].arrived_ns)
         self.commands.append(Command(name, twist, at_ns, stamp_ns, name))
 
     def refused(self, reason: str, command: Command) -> None:
-        """A step with nothing but this command, which must be refused for this reason."""
+        """Run a step with only this command, which must be refused for this reason."""
         self.step(ms=0.2, tick=False)
         before = dict(self.robot.counters)
         self.step(ms=0.2, tick=False, unheard=(command,))
@@ -435,7 +438,7 @@ class RobotMachine(RuleBasedStateMachine):
         assert after["commands"] == before.get("commands", 0)
 
     def receive(self, data: bytes, good: int, age_us: int = 0) -> None:
-        """Bytes of so many good lines (or none) come in."""
+        """Receive bytes that contain this many good lines, or none."""
         if not self.port_open:
             return
         at_ns = max(self.now_ns - age_us * 1000, self.heard_ns or 0)
@@ -443,12 +446,12 @@ class RobotMachine(RuleBasedStateMachine):
         self.read_lines(good, at_ns)
 
     def read_lines(self, good: int, at_ns: int) -> None:
-        """Note good lines; a gap of a second between two is a new session."""
+        """Note good lines; a gap of a second between two of them starts a new session."""
         if good and self.opened == self.last_opened:
             if self.heard_ns is not None and at_ns - self.heard_ns >= NS_PER_S:
                 self.reset_seen = True
             silent = self.heard_ns is not None and at_ns - self.heard_ns > self.quiet_ns
-            if silent and self.told_link != "up":  # a stall of the loop is no silence
+            if silent and self.told_link != "up":  # a stall of the loop is not a silence
                 self.good_in_row = 0
         if good:
             self.good_in_row += good
@@ -464,7 +467,7 @@ class RobotMachine(RuleBasedStateMachine):
         reply: bool = False,
         unheard: tuple[Command, ...] = (),
     ) -> None:
-        """Let time pass and take one step, as the control loop does, with all that has come."""
+        """Let time pass and run one step with all inputs, as the control loop does."""
         passed_ms = self.period_ms if ms is None else ms
         self.now_ns += int(passed_ms * MS)
         if self.opened != self.last_opened or not self.port_open:
@@ -477,7 +480,7 @@ class RobotMachine(RuleBasedStateMachine):
         )
         self.turning = a, b, c, d
         if passed_ms > 300:
-            self.turning = self.told = (0.0, 0.0, 0.0, 0.0)  # its watchdog
+            self.turning = self.told = (0.0, 0.0, 0.0, 0.0)  # the MCU's watchdog
         if reply and self.port_open:
             self.receive(write(self.turning), 1)
         now = Instant(self.now_ns, self.now_ns + WALL_NS)
@@ -509,7 +512,10 @@ class RobotMachine(RuleBasedStateMachine):
         self.before = outputs
 
     def note_limits(self, settings: dict[str, Plain]) -> None:
-        """These hold from this step on; what would brake softer, or jump, only from rest."""
+        """Check new limits, which hold from this step on.
+
+        A lower deceleration or another wheel speed may take effect only at rest.
+        """
         before, at_rest = self.limits, self.broken or self.sent_twist == REST
         for key, value in settings.items():
             assert isinstance(value, float)
@@ -524,7 +530,7 @@ class RobotMachine(RuleBasedStateMachine):
     def keep_books(
         self, outputs: Outputs, commands: tuple[Command, ...], requests: tuple[Request, ...]
     ) -> None:
-        """Who must be neutral again, and whose command counts."""
+        """Record which sources must be neutral again and which command counts."""
         lost = self.was_open and not self.port_open
         over = lost or self.opened != self.last_opened or self.reset_seen
         over = over or any(event.name == "fault" for event in outputs.events)
@@ -546,7 +552,7 @@ class RobotMachine(RuleBasedStateMachine):
         for command in commands:
             self.books[command.source].take(command.twist, command.arrived_ns)
 
-    # what must hold
+    # invariants
 
     def check(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
         assert outputs.reason
@@ -579,7 +585,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert outputs.linked
 
     def check_latches(self, outputs: Outputs, requests: tuple[Request, ...]) -> None:
-        """Only a clear that names the latch, or that names none long after it, releases it."""
+        """Only a clear that names the latch, or names none long after it, releases it."""
         before, after = self.latches, outputs.latches
         self.latches = after
         done = [r for r, a in zip(requests, outputs.answers, strict=True) if did(a)]
@@ -605,11 +611,11 @@ class RobotMachine(RuleBasedStateMachine):
         assert not held or outputs.mode not in ("waiting", "ready", "driving")
 
     def check_odometry(self, outputs: Outputs) -> None:
-        """No step is longer than the fastest wheel of its two ends can make it in the time since.
+        """No step is longer than the fastest wheel at either of its ends allows in the time since.
 
-        Nor is it made up for long silences. A line has the time of its slot: that may be some
-        periods from its stamp, which is never later than the line. Only when a wheel is found to
-        lie is more undone at once: what its last lines can have made of the pose.
+        Long silences are not filled. A line has the time of its slot, which may be some periods
+        before its arrival and is never later than it. Only when a wheel is found faulty may more be
+        undone at once: the effect of its last lines on the pose.
         """
         drive, feedback = self.config.drive, self.config.feedback
         left_out = self.robot.snapshot(self.now_ns).doubt.left_out
@@ -619,7 +625,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert fastest <= feedback.wheel_speed * drive.wheel_radius
             dt = (estimate.at.mono_ns - self.sampled_ns) / NS_PER_S
             assert dt >= 0.0
-            # What lines are missing is made up for, but not more than a second of it.
+            # Missing lines are filled in, but not more than a second of them.
             dt = min(dt, BRIDGED_S) + 2 * self.period_ms / 1000
             fastest, self.fastest = max(fastest, self.fastest), fastest
             self.steps.append(fastest * dt)
@@ -633,7 +639,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.pose = self.robot.snapshot(self.now_ns).pose
 
     def send(self, outputs: Outputs) -> None:
-        """The rest of `ControlLoop._send`, with the wire watched."""
+        """Do the rest of `ControlLoop._send` and watch the wire."""
         line, self.trip = self.guard.check(outputs)
         assert self.trip == ""
         if line is None:
@@ -671,7 +677,7 @@ class RobotMachine(RuleBasedStateMachine):
         return wheels
 
     def check_says(self, wheels: Wheels, outputs: Outputs) -> None:
-        """The line says what is reported as applied."""
+        """The line contains the speeds that are reported as applied."""
         drive, twist = self.config.drive, outputs.applied
         half = twist.angular * drive.wheel_separation / 2
         right = (twist.linear + half) / drive.wheel_radius
@@ -680,7 +686,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert abs(said - meant) <= ROUNDING
 
     def check_commanded(self, outputs: Outputs) -> None:
-        """A fresh command of the source that counts, which has been neutral."""
+        """A command is followed only if it is fresh and its source has been neutral."""
         assert outputs.mode == "driving"
         book = self.books[outputs.source]
         assert book.neutral
@@ -711,7 +717,7 @@ class RobotMachine(RuleBasedStateMachine):
         limits, applied, last = self.limits, outputs.applied, self.sent_twist
         dt = (self.now_ns - self.sent_ns) / NS_PER_S
         if self.broken or (applied == REST and dt > 0.25):
-            last = REST  # it was cut meanwhile: there was nobody to ramp
+            last = REST  # it was cut meanwhile, so no ramp applied
         braking = outputs.mode in ("stopped", "fault", "leaving")
         longest = max(0.05, 1.5 / self.config.rate_hz)
         full = limits.wheel_speed - 0.01

@@ -1,4 +1,4 @@
-"""The nouns: wheel order, immutability, and the one error family."""
+"""Tests of the basic types: wheel order, immutability, and the common base of all errors."""
 
 from __future__ import annotations
 

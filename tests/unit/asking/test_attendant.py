@@ -1,4 +1,4 @@
-"""Who stands beside the robot: at a terminal, and nobody."""
+"""Tests of the two operator prompts: a terminal prompt, and no operator at all."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ Types = Callable[[str], None]
 
 @pytest.fixture
 def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
-    """What a person types who has read the question, for what is typed ahead is thrown away;
-    standard input is the terminal."""
+    """Return a function that types a text on the terminal that is standard input.
+
+    It types after a delay because the prompt discards everything that was typed before the question
+    appeared.
+    """
     master, slave = pty.openpty()
     hands: list[threading.Timer] = []
 

@@ -1,4 +1,4 @@
-"""The person beside the robot is asked by a program: JSON lines both ways."""
+"""Tests of the JSON prompt: a program asks the operator through JSON lines in both directions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ Talking = TypeVar("Talking", bound=JsonLines)
 
 
 class Program:
-    """Answers each question by the next of these; `said` is all that came."""
+    """A parent program that answers the prompt's questions.
+
+    It gives its next answer to each question and keeps every line in `said`.
+    """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         asked, self._to_child = os.pipe()
@@ -46,7 +49,7 @@ class Program:
 
     @contextmanager
     def hears(self, person: Talking) -> Iterator[Talking]:
-        """All that this one tells on standard output."""
+        """Send everything that the prompt prints on standard output to this program."""
         with redirect_stdout(self._told), person:
             yield person
 
@@ -74,7 +77,7 @@ class Program:
                         self.say({"answer": said["question"], "value": value})
 
     def told(self, name: str) -> list[Any]:
-        """All that came under this name; nothing comes any more."""
+        """Close the output and return the value of every message that has this key."""
         self._told.close()
         self._thread.join()
         return [one[name] for one in self.said if name in one]
@@ -153,7 +156,7 @@ def test_the_end_of_the_input_ends_it_also_while_nothing_is_asked(program: Progr
 def test_it_ends_although_nobody_is_there_to_be_told(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The program that asks has died, and what it read of standard error with it."""
+    """The parent program has died, so its end of standard error is closed as well."""
     reader, writer = os.pipe()
     os.close(reader)
     gone = open(writer, "wb", buffering=0)  # noqa: SIM115
@@ -164,7 +167,7 @@ def test_it_ends_although_nobody_is_there_to_be_told(
 
 
 def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
-    """The program that asks hangs with a full pipe, and then it is gone."""
+    """The parent program hangs while its pipe is full, and later disappears."""
     reader, writer = os.pipe()
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     os.write(writer, b"x" * 4096)

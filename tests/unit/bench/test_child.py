@@ -1,4 +1,4 @@
-"""Why a process of a benchmark ended, in words."""
+"""Tests of the sentences that say why a process of a benchmark ended."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each command finds its line and each sample its line by what it says."""
+"""A benchmark matches each command to its line and each sample to its line by their values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a benchmark concludes from what it recorded, and the lines its microcontroller says."""
+"""Tests of the conclusions that a benchmark draws from its record."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WIRINGS = [WheelMap(), WheelMap("-d", "+c", "-b", "+a")]
 
 
 def said_by_the_mcu(config: Config, count: int) -> list[tuple[int, bytes]]:
-    """Its answers to so many lines, 10 ms apart."""
+    """Return the replies of the numbered microcontroller to `count` lines that are 10 ms apart."""
     mcu, stop = NumberedMcu(config, 0), Codec(config.mcu.wheels).stop
     chunks = []
     for now_ms in range(10 * count + 30):

@@ -1,4 +1,4 @@
-"""What a benchmark's daemon runs with."""
+"""Tests of the configuration that a benchmark gives to its daemon."""
 
 from __future__ import annotations
 

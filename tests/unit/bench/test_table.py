@@ -1,4 +1,4 @@
-"""The table of a benchmark: every figure in its place, and what was not measured said."""
+"""Tests of a benchmark's table: every figure has its place, and missing measurements are marked."""
 
 from __future__ import annotations
 

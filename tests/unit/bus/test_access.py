@@ -1,4 +1,7 @@
-"""The rules Zenoh is given, read as Zenoh reads them: who may send what on which key."""
+"""Tests of the access rules: which role may send which message on which key.
+
+The tests read the rules as Zenoh reads them.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,7 @@ ZID = "0123456789abcdef"
 
 
 class Access:
-    """What the rules for a configuration let pass."""
+    """The access rules that follow from one configuration."""
 
     def __init__(
         self, rules: Callable[[Config], dict[str, object]] = access_control, **tables: Any
@@ -49,13 +52,16 @@ class Access:
         self.subjects = {subject["id"]: subject for subject in self.value["subjects"]}
 
     def rules_of(self, who: str) -> list[dict[str, Any]]:
-        """Those of a role, and of the certificate that has its name."""
+        """Return the rules of a role and of the certificate with the same name."""
         subjects = {who, f"certificate {who}"}
         policies = [p for p in self.value["policies"] if subjects & set(p["subjects"])]
         return [self.rules[name] for policy in policies for name in policy["rules"]]
 
     def lets(self, who: str, message: str, key: str, flow: str = "ingress") -> bool:
-        """Some rule allows it and none forbids it; a rule holds for the keys it includes."""
+        """Return whether a rule allows the message and none denies it.
+
+        A rule applies to every key that its key expressions include.
+        """
         asked = zenoh.KeyExpr(key)
         said = {
             rule["permission"]
@@ -81,11 +87,11 @@ FROM: dict[Role, set[str]] = {
     "operator": {"operator", "maintainer", "local"},
     "maintainer": {"maintainer", "local"},
 }
-"""Who has at least this role."""
+"""Maps a role to every subject that has at least this role."""
 
 
 def written(key: str) -> str:
-    """A row of the table with names in the places for names."""
+    """Return a key of the table with real names in place of its placeholders."""
     key = key.replace("<source>", "app").replace("<certificate>", "anna")
     return key.replace("<Type>", "Twist").replace("<role>", "operator")
 
@@ -234,7 +240,8 @@ def test_a_gyro_that_nobody_wants_is_granted_to_nobody() -> None:
 def test_beside_the_simulated_gyro_only_who_is_at_the_machine_is_heard_and_all_may_follow_it(
 ) -> None:  # fmt: skip
     simulated = Access(odometry=GYRO)
-    assert simulated.who("put", simulated.key("imu")) == {"local"}  # to be refused, and told
+    # received so that the daemon can refuse and report it
+    assert simulated.who("put", simulated.key("imu")) == {"local"}
     assert simulated.who("declare_subscriber", simulated.key("imu")) == FROM["viewer"]
 
 
@@ -263,7 +270,7 @@ def test_who_comes_late_gets_the_static_transforms_that_are_kept() -> None:
             assert DEFAULT.lets(who, "reply", f"{key}/@adv/**", "egress")
 
 
-# no way round
+# no wildcard gets around the rules
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -295,7 +302,10 @@ def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
 def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> None:
-    """A wildcard that meets a service is not let through, so neither is one that includes it."""
+    """A wildcard that matches a service is denied.
+
+    A wildcard that includes such a wildcard is therefore denied as well.
+    """
     services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
     services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]
     for rule in TRUSTING.rules_of(role):
@@ -335,7 +345,7 @@ def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> Non
     assert access.lets("viewer", "put", full_key(one, "stop"))
 
 
-# the configuration decides
+# rules that depend on the configuration
 
 
 @given(st.lists(IDS, min_size=1, max_size=5, unique=True))
@@ -408,7 +418,7 @@ def test_the_lists_of_certificates_are_the_subjects() -> None:
 
 @pytest.mark.parametrize("role", ROLES)
 def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
-    """A subject without names could be anybody."""
+    """Zenoh would apply a subject without names to every client."""
     access = Access(access=AccessConfig(**{f"{role}s": ()}))  # type: ignore[arg-type]
     assert role not in access.subjects
     assert set(access.subjects) == {*EVERYBODY} - {role}

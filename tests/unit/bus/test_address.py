@@ -1,4 +1,7 @@
-"""Which robot a program means: what it gives, else what the file of ACSARD_CONFIG says."""
+"""Tests of the choice of the robot that a program uses.
+
+The program's own arguments decide first, then the file that ACSARD_CONFIG names.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from acsard.host.errors import UnreachableError, UsageError
 HERE = Address("tcp/127.0.0.1:7448", "acsar", "")
 
 NOBODY = "tcp/127.0.0.1:1"
-"""Nobody listens there."""
+"""An endpoint on which no router listens."""
 
 FILE = f"""
 [robot]
@@ -26,7 +29,7 @@ tls = "/etc/acsard/tls"
 
 @pytest.fixture(name="named")
 def _named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file that ACSARD_CONFIG names."""
+    """Write a configuration file and point ACSARD_CONFIG at it."""
     file = tmp_path / "mine.toml"
     file.write_text(FILE)
     monkeypatch.setenv("ACSARD_CONFIG", str(file))
@@ -51,7 +54,8 @@ def test_what_is_not_given_is_the_file_s() -> None:
     assert address_by_environment(tls, None, None) == (tls, "r7", "/etc/acsard/tls")
     assert address_by_environment(None, "r8", None) == (NOBODY, "r8", "")
     assert address_by_environment(tls, "r8", "/home/a") == (tls, "r8", "/home/a")
-    assert address_by_environment("", None, None).endpoint == ""  # refused as what it is
+    # an empty endpoint is refused later, as empty
+    assert address_by_environment("", None, None).endpoint == ""
 
 
 @pytest.mark.usefixtures("named")
@@ -82,5 +86,5 @@ def test_a_file_that_cannot_be_used_is_an_error_that_names_it(
         address_by_environment(None, "r8", "")
     assert words in str(error.value)
     assert str(named) in str(error.value)
-    # Who says all himself needs no file.
+    # A program that gives endpoint, robot id and certificate itself needs no file.
     assert address_by_environment(NOBODY, "r8", "") == (NOBODY, "r8", "")

@@ -1,4 +1,4 @@
-"""The files of a TLS directory are looked at before a session is opened with them."""
+"""The files of a TLS directory are checked before a session is opened with them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,8 @@ def test_it_ends_when_the_first_of_certificate_and_authority_does(
     later = ends_ns(str(made(tmp_path, 1, 1)))
     assert ends is not None
     assert later is not None
-    expected = min(days, 5 * authority)  # an authority lasts five times as long as it is asked for
+    # an authority is valid for five times the days that were asked for
+    expected = min(days, 5 * authority)
     assert round((ends - later) / DAY_NS) == expected - 1
 
 

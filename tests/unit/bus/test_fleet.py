@@ -1,4 +1,4 @@
-"""Which robots `--id` means, and whose a key is."""
+"""Tests of the robots that `--id` selects, and of the robot that a key belongs to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The role is the highest that answers, whatever the order, and silence is none."""
+"""The role of a client is the highest role whose key answers, in any order of answers.
+
+Without an answer there is no role.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from acsard.values import ROLES
 def of(*answering: str) -> Identity:
     def ask(name: str, take: Any) -> None:
         asked.append(name)
-        if len(asked) == len(ROLES):  # all are asked before any is waited for
+        if len(asked) == len(ROLES):  # every key is queried before the first reply is awaited
             for role in answering:
                 take(SimpleNamespace(key_expr=f"acsard/acsar/whoami/{role}"))
 

@@ -1,4 +1,4 @@
-"""What a step takes of what is held, while another thread goes on putting in."""
+"""A step takes a bounded part of the inbox while another thread keeps adding to it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from acsard.bus.inbox import ARRIVALS, most_of, taken_of
 
 
 class Flooded(deque[int]):
-    """For each that is taken out one more comes in at once."""
+    """A queue that gains one item for each item that is taken out."""
 
     def popleft(self) -> int:
         first = super().popleft()

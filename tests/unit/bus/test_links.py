@@ -1,4 +1,4 @@
-"""Which of `bus.connect` is connected, by the links that Zenoh has."""
+"""Tests that find the connected endpoints of `bus.connect` from the links that Zenoh reports."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ A, B = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:7450"
     [
         ("peer", (A,), {A}, ()),
         ("peer", (A,), set(), (A,)),
-        ("peer", (A,), {"tcp/127.0.0.1:50123"}, (A,)),  # the door or a ROS node, which dialled us
+        # the TLS gateway or a ROS node connected to this process
+        ("peer", (A,), {"tcp/127.0.0.1:50123"}, (A,)),
         ("peer", (A, B), {A}, (B,)),
         ("peer", (A, B), {A, B}, ()),
         ("peer", ("tcp/localhost:7447",), {A}, ()),
         ("peer", ("tcp/localhost:7447", B), {B}, ("tcp/localhost:7447",)),
         ("peer", ("tcp/nobody.invalid:7447",), set(), ("tcp/nobody.invalid:7447",)),
-        ("peer", ("tcp/nobody.invalid:7447",), {"tcp/10.0.0.7:7447"}, ()),  # looked up before
+        # the name was resolved before
+        ("peer", ("tcp/nobody.invalid:7447",), {"tcp/10.0.0.7:7447"}, ()),
         ("peer", ("tls/nobody.invalid:7447",), {A}, ("tls/nobody.invalid:7447",)),
         ("peer", ("tls/127.0.0.1:7447",), {A}, ("tls/127.0.0.1:7447",)),
         ("peer", ("tcp/127.0.0.1:7447?rel=0",), {A}, ()),

@@ -1,4 +1,7 @@
-"""What the loop leaves for the bus: it never waits, and the newest goes out."""
+"""Tests of the outlets between the control loop and the bus.
+
+The loop never waits, and the newest value is sent.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ WAIT_S = 5.0
 
 
 class Publisher:
-    """One whose bus is locked until `free`, and that has a listener."""
+    """A publisher with a subscriber, whose put blocks until `free` is set."""
 
     matching_status = SimpleNamespace(matching=True)
 
@@ -38,7 +41,7 @@ class Publisher:
         self.sent.append(msgspec.msgpack.decode(payload, type=Twist).linear.x)
 
     def declare_publisher(self, key: str, **options: Any) -> Publisher:
-        """As a session: there is one key."""
+        """Act as the session, which declares this publisher for its only key."""
         return self
 
 

@@ -1,4 +1,4 @@
-"""Why nothing comes on a key, as far as it can be seen from here."""
+"""Tests of the reasons for a silent key, as far as this computer can find them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_of_a_robot_that_is_not_there_the_one_most_like_it_is_told_first() -> No
 
 def test_of_a_large_fleet_a_few_are_told() -> None:
     told = why("state", "robot7", PLAIN, absent(*(f"robot{n:02}" for n in range(100))))
-    assert told.count("robot") == 2 + MOST + 1  # no robot robot7, the few, and --id
+    assert told.count("robot") == 2 + MOST + 1  # "no robot robot7", the listed robots, and "--id"
     assert f"and {100 - MOST} more (`acsard fleet`)" in told
 
 

@@ -1,4 +1,7 @@
-"""Replies go out by ticket, in order, until it is retired; a client that has gone holds nobody."""
+"""Replies are sent in ticket order until their ticket is retired.
+
+A client that has gone delays no other client.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from acsard.incoming.queries import Reply
 
 
 class Asked:
-    """A query without Zenoh: what came back, the last thing being that it was let go."""
+    """A query without Zenoh. It records its replies and, at the end, that it was dropped."""
 
     def __init__(self, gone: bool = False) -> None:
         self.told: list[str] = []
@@ -41,7 +44,7 @@ def issued(replies: Replies, query: Any, key: str = "") -> int:
 
 
 def ended(replies: Replies) -> None:
-    """All that was to be sent has been."""
+    """Stop the reply thread after it has sent everything."""
     replies.start(SESSION)
     replies.stop()
     for thread in threading.enumerate():
@@ -59,7 +62,7 @@ def test_each_query_hears_what_was_sent_by_its_ticket_and_then_its_end() -> None
     replies.retire(second)
     ended(replies)
     assert one.told == ["acsard/r7/odom=1", "error=no", "dropped"]
-    assert other.told == ["acsard/stop=2", "dropped"]  # a ROS client asked on another key
+    assert other.told == ["acsard/stop=2", "dropped"]  # a ROS client sent its query on another key
 
 
 def test_a_client_that_has_gone_and_a_ticket_that_is_none_hold_nobody() -> None:

@@ -1,4 +1,4 @@
-"""A subscription gives what came on its key, in order, and is done after a silence."""
+"""A subscription returns the samples of its key in order and ends after a silence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
 
 
 class Queue:
-    """Zenoh's, without Zenoh."""
+    """A stand-in for Zenoh's queue."""
 
     def __init__(self, *keys: str) -> None:
         self.held = deque(SimpleNamespace(key_expr=key, number=n) for n, key in enumerate(keys))
@@ -27,7 +27,7 @@ class Queue:
         return self.held.popleft() if self.held else None
 
     def wait(self, seconds: float | None) -> None:
-        """Nothing more comes."""
+        """Return at once, because no further sample arrives."""
 
     def undeclare(self) -> None:
         self.open = False
@@ -64,7 +64,7 @@ def test_it_is_undeclared_after_a_silence_and_when_its_reader_leaves() -> None:
 
 
 class Closed(Queue):
-    """Of a session that has been closed behind it."""
+    """A queue whose session has been closed while the queue was still in use."""
 
     def try_recv(self) -> Any:
         if not self.held:
@@ -83,11 +83,11 @@ def test_a_closed_one_is_undeclared_without_a_word() -> None:
     Subscription(Closed()).undeclare()
 
 
-# what Zenoh's thread hands over
+# samples that Zenoh's thread hands over
 
 
 class Session:
-    """Gives what is subscribed to by hand."""
+    """A session whose subscriptions receive their samples from the test."""
 
     def __init__(self) -> None:
         self.handlers: list[Any] = []
@@ -123,14 +123,15 @@ def test_a_reader_sleeps_until_something_comes_and_ends_when_the_session_is_clos
         nonlocal looks
         looks += 1
         if looks == 1:
-            # It finds nothing at first, and looks again for what comes alone.
+            # The first look finds the queue empty. The waiter looks again only when a sample
+            # arrives.
             threading.Timer(0.2, other).start()
         return look()
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(subscription, "try_recv", counted)
         assert [one.number for one in asleep] == [0, 1, 2]
-    assert looks <= 1 + 2 * 4  # a poll every millisecond would have looked 200 times
+    assert looks <= 1 + 2 * 4  # a poll every millisecond would look 200 times
 
 
 def test_an_asyncio_reader_is_woken_by_what_comes_and_by_the_end() -> None:

@@ -1,4 +1,4 @@
-"""Why a TLS endpoint cannot be reached: each way the connection ends has its sentence."""
+"""Tests of the sentence for each way in which a TLS connection fails."""
 
 from __future__ import annotations
 

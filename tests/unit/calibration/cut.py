@@ -1,4 +1,4 @@
-"""Logs cut into what the modules take."""
+"""Helpers that cut logs into the parts that the calibration modules take."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IDEAL = {
     "rate": 0.0, "slip": 0.0, "late": 0.0, "bias": 0.0, "gyro_noise": 0.0, "place_noise": 0.0,
     "outliers": 0.0, "lever": 0j, "decimals": 6,
 }  # fmt: skip
-"""A robot that does as the model says, with sensors that are right."""
+"""Overrides for a robot that moves exactly as the model says and has perfect sensors."""
 
 
 def ideal(plan: Plan = GUIDED) -> Drive:

@@ -1,7 +1,7 @@
-"""Simulated skid-steer robots and the logs they leave: nothing here is of the code under test.
+"""Simulated skid-steer robots and their logs. This module uses none of the code under test.
 
-The truth is integrated in steps of 5 ms. Wheels are reported at 100 Hz in two decimals, as means
-of their period; the gyro at its own rate, late, with bias and noise; positions at 5 Hz.
+The truth is integrated in steps of 5 ms. Wheels are reported at 100 Hz in two decimals, as means of
+their period. The gyro has its own rate, a delay, a bias and noise. Positions arrive at 5 Hz.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ RADIUS, SEPARATION = 0.05, 0.30
 STEP = 0.005
 
 Plan = list[tuple[float, float, float]]
-"""(seconds, m/s, rad/s) as the wheels are told, for a robot that does not skid."""
+"""Commanded wheel motion as (seconds, m/s, rad/s), valid for a robot that does not skid."""
 
 GUIDED: Plan = [
     (3, 0, 0), (6, 0.4, 0), (1, 0, 0), (8, 0, 1.5), (1, 0, 0), (8, 0, -1.5), (1, 0, 0),
     (6, -0.4, 0), (6, 0.3, 0.8), (6, 0.3, -0.8), (8, 0, 0.8), (8, 0, -0.8), (6, 0.4, 0),
     (6, 0.4, 0.4), (6, 0.4, -0.4), (3, 0, 0),
 ]  # fmt: skip
-"""83 s: what a person would be told to drive."""
+"""The drive that the guide would ask a person for; it lasts 83 s."""
 
 
 def wander(rng: np.random.Generator, seconds: float) -> Plan:
-    """A random drive with stops."""
+    """Return a random drive with stops."""
     plan: Plan = [(2.0, 0.0, 0.0)]
     while sum(part[0] for part in plan) < seconds:
         lasts = float(rng.uniform(1.0, 4.0))
@@ -39,12 +39,12 @@ def wander(rng: np.random.Generator, seconds: float) -> Plan:
 
 @dataclass
 class Robot:
-    """What is true of one robot and its sensors."""
+    """The true properties of one robot and its sensors."""
 
     chi: float = 1.6
-    """Effective track over wheel separation, when it turns slowly."""
+    """Effective track divided by wheel separation, when the robot turns slowly."""
     rate: float = 0.08
-    """Its growth for each rad/s."""
+    """Growth of `chi` for each rad/s."""
     left: float = 0.998
     right: float = 1.002
     bias: float = 0.01
@@ -56,14 +56,17 @@ class Robot:
     outliers: float = 0.02
     lever: complex = 0.05 + 0.02j
     slip: float = 0.01
-    """Standard deviation of what each wheel side loses, as a share, for a second or so."""
+    """Standard deviation of the share of motion that each side loses to slip.
+
+    The share varies over about a second.
+    """
     decimals: int = 2
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
 
 @dataclass
 class Drive:
-    """A log, and what was true while it was made, at the wheels' times."""
+    """A log and the true motion at the wheels' sample times."""
 
     t: Floats
     left: Floats
@@ -77,7 +80,7 @@ class Drive:
     where: npt.NDArray[np.complex128]
 
     def csv(self, *, gyro: bool = True, places: bool = True, run: str = "") -> str:
-        """As a file: a row for each sample of each sensor, in order of time."""
+        """Return the log as CSV, with one row per sensor sample in order of time."""
         rows = [(t, f"{t:.6f},{a:.2f},{b:.2f},,,") for t, a, b in
                 zip(self.t, self.left, self.right, strict=True)]  # fmt: skip
         if gyro:
@@ -91,7 +94,7 @@ class Drive:
 
 
 def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
-    """The log of a plan."""
+    """Return the log and the truth of a robot that drives this plan."""
     rng = robot.rng
     v, w = _smooth(plan)
     count = len(v)
@@ -130,7 +133,7 @@ def drive(robot: Robot, plan: Plan, start: float = 0.0) -> Drive:
 
 
 def _smooth(plan: Plan) -> tuple[Floats, Floats]:
-    """The plan with ramps of 0.3 s."""
+    """Return the speeds of the plan with ramps of 0.3 s."""
     v = np.concatenate([np.full(round(s / STEP), v) for s, v, _ in plan])
     w = np.concatenate([np.full(round(s / STEP), w) for s, _, w in plan])
     kernel = np.full(60, 1 / 60)

@@ -1,4 +1,4 @@
-"""What is wrong with a log is named: every sign, side and unit on whole logs."""
+"""Calibration names the error in a log: every wrong sign, side and unit, on whole logs."""
 
 from __future__ import annotations
 
@@ -81,14 +81,14 @@ def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: s
 
 
 def test_rpm_are_refused_also_with_the_configuration_of_another_robot() -> None:
-    """Its radius may be a larger share of its separation than the default's."""
+    """Its radius may be a larger share of its separation than in the default configuration."""
     with pytest.raises(RefusedError, match="rpm"):
         turn_units("yaw_rate", 1.9 * 2 * np.pi / 60, 1.9 * 2 * np.pi / 60, BASE)
     turn_units("yaw_rate", 1 / 3.5, 1 / 3.5, BASE)
 
 
 def odometry(robot: Drive) -> Drive:
-    """With what its own driver makes of the wheels as positions, and as a turn rate."""
+    """Return the log with the driver's own wheel odometry as its positions and turn rate."""
     turn = (robot.right - robot.left) * 0.05 / 0.45
     yaw = np.cumsum(turn) * 0.01
     ahead = np.exp(1j * (yaw - turn * 0.005))

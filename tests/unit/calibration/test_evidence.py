@@ -1,4 +1,4 @@
-"""Sums over blocks, and what outliers count."""
+"""Tests of the sums over blocks and of the weight of outliers."""
 
 from __future__ import annotations
 

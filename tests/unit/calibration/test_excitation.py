@@ -1,4 +1,4 @@
-"""Logs with too little in them, and what is said to drive."""
+"""Tests of logs with too little motion, and of the advice on which motions to drive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton and the jackknife on a model of two numbers that is easily known."""
+"""Tests of Gauss-Newton and the jackknife on a linear model with a known answer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ TRUTH = np.array([0.99, 1.01, 0.7])
 
 
 def fitted(rng: np.random.Generator, shared: float, own: float, blocks: int = 20) -> Fit:
-    """30 rows a block, linear in left, right and turn; `shared` noise is one for a block."""
+    """Fit blocks of 30 rows, linear in left, right and turn.
+
+    The `shared` noise is equal within a block.
+    """
     block = np.repeat(np.arange(blocks), 30)
     columns = rng.normal(size=(len(block), 3))
     noise = rng.normal(0, own, len(block))

@@ -1,4 +1,4 @@
-"""What improves is measured on what was left out of the fit."""
+"""The improvement is measured on data that the fit did not use."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_without_anything_to_tell_an_error_by_there_is_none() -> None:
 
 
 def test_a_slow_curve_is_no_straight() -> None:
-    """It turns as slowly as a straight drive may, and much more in each metre."""
+    """The robot turns as slowly as a straight drive may, but turns much more in each metre."""
     slow = (60.0, 0.04, 0.06)
     made = ready(ideal([*GUIDED, slow]).csv(places=False))
     fitted = fit(made.sources, made.start, places=False)

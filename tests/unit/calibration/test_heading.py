@@ -1,4 +1,4 @@
-"""The gyro's bias and time, and the rows that come of it."""
+"""Tests of the gyro's bias and delay and of the rows that follow from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters as settings."""
+"""Tests that turn fitted parameters into settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.unit.calibration.cut import BASE, ideal, ready
 
 
 def fit_of(rate: float, varies: float) -> Fit:
-    """Parameters that are known as well as can be, but for what the track does."""
+    """Return a fit with nearly exact parameters, except for the track, which varies."""
     parameters = np.array([0.99, 1.01, 0.625, rate, *[0.0] * (COUNT - 4)])
     normal = np.tile(np.eye(COUNT) * 1e12, (12, 1, 1))
     return Fit(
@@ -56,7 +56,7 @@ def test_what_is_configured_is_taken_as_it_is() -> None:
 
 
 def test_what_all_three_have_in_common_is_told_apart_from_what_each_has_alone() -> None:
-    # Scale off by 1 %, radii by 0.1 % each on its own, track by 2 %: all independent.
+    # The scale is off by 1 %, each radius by another 0.1 %, the track by 2 %. All are independent.
     values = np.array([1.6, 1.1, 1.0])
     shares = np.diag([0.02, 0.001, 0.001]) ** 2 + 0.01**2
     own, scale = Multipliers(values, shares * np.outer(values, values)).own()

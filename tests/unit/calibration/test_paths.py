@@ -1,4 +1,4 @@
-"""Wheel angles, rests and blocks."""
+"""Tests of wheel angles, rests and blocks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ HEADER = "t,left,right,yaw_rate\n"
 
 
 def drive(*parts: tuple[float, float, float]) -> str:
-    """(from, to, rad/s) at 100 Hz, the right side turning back."""
+    """Return a log of parts (from, to, rad/s) at 100 Hz; the right side turns backward."""
     lines = []
     for begin, end, speed in parts:
         lines += [f"{t:.2f},{speed},{-speed}," for t in np.arange(begin, end, 0.01)]

@@ -1,4 +1,4 @@
-"""Paths, their slopes, and how they are laid onto positions."""
+"""Tests of paths, their derivatives, and their alignment with positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A log is cut and begun with what is nearly right."""
+"""Tests that prepare a log: it is cut, and the fit starts from nearly right values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bus says becomes rows that a calibration reads."""
+"""Tests that turn bus messages into the rows that a calibration reads."""
 
 from __future__ import annotations
 

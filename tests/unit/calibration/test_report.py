@@ -1,4 +1,4 @@
-"""The three forms of a calibration agree."""
+"""The three output forms of a calibration agree."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows in any order -> drives."""
+"""Tests that turn rows in any order into runs."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_four_wheels_are_the_means_of_two_sides() -> None:
 
 
 def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() -> None:
-    """At 5 Hz among rows at 100 Hz, every cell filled."""
+    """The logger repeats positions of 5 Hz in rows of 100 Hz, so that every cell is filled."""
     rows = [f"{i / 100},{4 * (i >= 300)},{4 * (i >= 300)},{max(0, i // 20 - 15) * 0.04:.3f},0"
             for i in range(1000)]  # fmt: skip
     log = runs(read(("t,left,right,x,y\n" + "\n".join(rows)).encode()))
@@ -164,7 +164,10 @@ def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() 
 
 
 def test_a_position_of_the_way_is_none_of_the_rest_after_it() -> None:
-    """At 1 Hz, every cell filled: the last of the way stands in the rows after the stop."""
+    """The logger repeats positions of 1 Hz in every row.
+
+    The rows after the stop therefore still hold the last position of the drive.
+    """
     way = [0.04 * min(i, 550) for i in range(1000)]
     rows = [f"{i / 100},{4 * (i < 550)},{4 * (i < 550)},{way[i // 100 * 100]:.3f},0"
             for i in range(1000)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""The search has to end near enough, from any configured track and with any sign."""
+"""The search must end near the truth from any configured track and with any sign."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ def test_late_positions_are_found() -> None:
 
 
 def squares(chi: float) -> Plan:
-    """To both sides, turned in place by 90 deg of a robot with that track."""
+    """Return a plan of squares to both sides.
+
+    The turns in place are 90 deg for a robot with this track ratio.
+    """
     side = [(5, 0.4, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * chi / 4), (0.5, 0, 0)]
     return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]
 
@@ -54,7 +57,7 @@ def squares(chi: float) -> Plan:
 @pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
 @pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
 def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:
-    """Positions alone are the same after 90 deg to the left, 270 to the right and 450."""
+    """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
     seen = drive(robot, squares(chi))
     assert begun(seen).parameters[TURN] == pytest.approx(1 / chi, rel=0.05)

@@ -1,4 +1,7 @@
-"""Robots each way: the heading improves, and the standard deviations cover the truth."""
+"""Tests with simulated robots of each kind.
+
+The heading improves, and the standard deviations cover the truth.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,10 @@ so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest
 
 @cache
 def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
-    """Each robot's calibration, and a random drive of five minutes that it never saw."""
+    """Return each robot's calibration and a random drive of five minutes.
+
+    The calibration did not use the random drive.
+    """
     gyro, places = WAYS[way]
     made = []
     for seed in range(count):
@@ -48,7 +54,7 @@ def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
 
 
 def off(seen: Drive, values: Floats) -> float:
-    """rad rms by which the heading is off after 10 s."""
+    """Return the rms error of the heading after 10 s, rad."""
     track, left, right = values
     turns = (right * seen.right - left * seen.left) * RADIUS / (SEPARATION * track) * 0.01
     ends = np.arange(0, len(turns), 1000)
@@ -68,14 +74,14 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
 @so_many
 @each_way
 def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
-    """The track from its slowest turn to a fast one; both radii, or left to right by a gyro."""
+    """Check the track from slow to fast turns, and both radii; a gyro gives only their ratio."""
     found = [c.found for c, _ in robots(way, count)]
     z = [(f.values[0] - 1.6 * (1 + 0.08 * rate)) / f.std[0] for f in found for rate in (0, 0.5, 1)]
     for index, true in ((1, 0.998), (2, 1.002)):
         z += [(f.values[index] - true) / f.std[index] for f in found]
     rms = np.sqrt(np.mean(np.square(z)))
     print(f"{way}: {np.mean(np.abs(z) < 2):.1%} of z within 2, rms {rms:.2f}")
-    # Of the few one more than one in twenty may be chance.
+    # In a small sample, chance alone may put more than one in twenty outside.
     assert np.mean(np.abs(z) < 2) >= (0.95 if count == MANY else 0.85)
 
 
@@ -96,7 +102,7 @@ def test_bias_and_time_offset_are_told(count: int) -> None:
 
 
 def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
-    """A curve to one side is what a bias looks like, in every block alike."""
+    """A gyro bias looks like a curve to one side that is equal in every block."""
     z = []
     for seed in range(12):
         robot = Robot(gyro_noise=0.06, slip=0.003, rng=np.random.default_rng(seed))
@@ -109,7 +115,10 @@ def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
 
 
 def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
-    """20 counts a turn at 1 kHz are 0 or 314 rad/s: of their squares nothing is to be told."""
+    """At 1 kHz, 20 counts per turn read as 0 or 314 rad/s.
+
+    The mean of their squares therefore says nothing.
+    """
     seen = usual(plan=wander(np.random.default_rng(2), 100.0))
     t = np.arange(seen.t[0], seen.t[-1], 0.001)
     counted = [
@@ -124,7 +133,7 @@ def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
 
 @pytest.mark.parametrize("places", [False, True])
 def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
-    """1 % is usual; positions tell it, and nothing else does."""
+    """A scale error of 1 % is normal for a gyro. Only positions reveal it."""
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
     found = calibrated(replace(seen, gyro=seen.gyro * 1.01).csv(places=places)).found
@@ -138,11 +147,11 @@ def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
     worth = calibrated(replace(seen, gyro=seen.gyro * 1.02).csv(places=True)).gain
-    assert (worth.turn.then or math.inf) < 3.0  # deg in 360, of which 2 % are 7
+    assert (worth.turn.then or math.inf) < 3.0  # deg in 360; 2 % of that are 7 deg
 
 
 def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
-    """One small square: in pieces of four seconds it is straights, and noise."""
+    """The robot drives one small square. Pieces of four seconds are straights and noise."""
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
     robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
     found = calibrated(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]).csv()).found
@@ -152,7 +161,7 @@ def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
 AHEAD: Plan = [
     (6, 0.4, 0), (8, 0.3, 1.2), (6, 0.5, 0), (8, 0.3, 0.5), (6, 0.2, -0.6), (8, 0.4, 1.4),
 ] * 2  # fmt: skip
-"""Never at rest, always ahead, mostly to the left: no mean of it is zero."""
+"""The robot never rests, always drives forward and mostly turns left, so no mean is zero."""
 
 
 def test_a_log_without_a_rest_tells_the_same_of_the_drive_as_one_with_rests() -> None:

@@ -1,4 +1,4 @@
-"""Cells that cannot be a measurement, beside turns that can."""
+"""Cells that cannot be a measurement are removed, and real turns are kept."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_spike_is_found_between_rows_of_other_sensors() -> None:
 
 
 def mostly_standing(rng: np.random.Generator) -> dict[str, Floats]:
-    """Half an hour at 100 Hz, of which it turns for 20 s."""
+    """Return half an hour at 100 Hz in which the robot turns for 20 s."""
     t = np.arange(180_000) / 100
     rate = np.where((t > 900) & (t < 920), 1.0, 0.0) + 0.03 + rng.normal(0, 0.003, len(t))
     wheels = np.where((t > 900) & (t < 920), 4.8, 0.0)

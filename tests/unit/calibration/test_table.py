@@ -1,4 +1,4 @@
-"""CSV files of strangers: what is read, what is left out, and what a refusal says."""
+"""Tests of CSV files from other loggers: the rows read, the rows left out, and the refusals."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_text_that_is_not_looked_at_may_have_a_number_sign() -> None:
 
 
 def test_a_number_that_a_sign_spoils_is_none() -> None:
-    """As C on Windows writes NaN; the half before it is no speed."""
+    """C on Windows writes NaN like this. The number before the sign is not a speed."""
     table = read(HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,--,4\n")
     assert table.columns["t"].tolist() == [1.0, 3.0]
     assert np.isnan(table.columns["left"][1])
@@ -131,7 +131,7 @@ def test_columns_that_are_not_used_are_told() -> None:
     assert read(b"t,left,right,yaw_rate,volts\n1,2,3,4,5\n").notes == ('columns not used: "volts"',)
 
 
-# as others write them
+# files as other loggers write them
 
 ROWS = [(i / 100, i % 7 + 0.25, i % 5 + 0.5, 0.125) for i in range(40)]
 NAMES = ["t", "left", "right", "yaw_rate"]

@@ -1,4 +1,4 @@
-"""A tape tells how large the wheels are."""
+"""A tape measurement determines the size of the wheels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NAMES = ("turns", "straight")
 
 
 def follow(values: np.ndarray, number: int) -> Way:
-    """5 m for wheels as configured, or 9 m that end where they began."""
+    """Return a way of 5 m for wheels as configured, or of 9 m that ends near its start."""
     size = float(values[1:].mean())
     return Way(5.0 * size, 5.0 * size) if number else Way(0.1 * size, 9.0 * size)
 

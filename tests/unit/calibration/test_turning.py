@@ -1,4 +1,4 @@
-"""Turns by a sensor as evidence."""
+"""Tests of turns measured by a sensor as evidence."""
 
 from __future__ import annotations
 
@@ -35,6 +35,6 @@ def test_slopes_are_those_of_what_the_wheels_say() -> None:
             turning.NOISE * rows.seconds, turning.SHARE * turning.turned(rows, BASE, AT)
         )
         weight = huber(residual / usual, 1.0)
-        # The rate's own change with the other parameters is of second order.
+        # The other parameters also change the rate term, but only to second order.
         assert score[index] == pytest.approx(float(slope @ (weight * residual)), rel=0.15)
     assert not score[[LATE, AHEAD, ASIDE]].any()

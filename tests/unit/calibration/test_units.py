@@ -1,4 +1,4 @@
-"""Units behind the names of columns."""
+"""Tests of the units behind the names of columns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Robots on blocks for the tests of the check: a fake MCU, a wire in virtual time, a person."""
+"""Simulated robots on blocks for the tests of the checkup.
+
+They consist of a fake MCU, a wire in virtual time, and a person.
+"""
 
 from __future__ import annotations
 
@@ -23,17 +26,17 @@ SHORT = dict(zip(("fr", "fl", "rl", "rr"), range(4), strict=True))
 
 
 class Robot(VirtualWire):
-    """A robot with these faults, and what it was sent."""
+    """A robot with these faults that records every line it receives."""
 
     def __init__(self, *faults: str, config: Config | None = None, **mcu: Any) -> None:
-        """`config` is how it is built; `mcu` the keys the host has otherwise."""
+        """`config` describes the hardware, and `mcu` the keys of the host that differ from it."""
         self.built = config or Config()
         self.config = configured(self.built, **mcu)
         super().__init__(FakeMcu(self.built))
         self.faults = faults
         self.sent: list[bytes] = []
         self.turned: dict[int, bool] = {}
-        """Which wheels have turned since this was last emptied, and whether forward first."""
+        """Maps each wheel that turned since the last clear to whether it first turned forward."""
         self.opened: list[int] = []
 
     def open(self, baud_rate: int) -> None:
@@ -56,7 +59,10 @@ class Robot(VirtualWire):
 
     @contextmanager
     def board(self, rest: bool = True) -> Iterator[Board]:
-        """The board alone, the line open and the motors known to stand, if they can say so."""
+        """Yield the board alone, with the line open.
+
+        By default the motors are proven to stand still.
+        """
         with self.faulty(), Board(self, self.config.mcu, self.config.rate_hz) as board:
             if rest:
                 board.rest()
@@ -64,14 +70,17 @@ class Robot(VirtualWire):
             yield board
 
     def later(self) -> list[float]:
-        """What the motors are told to do once all that was sent has arrived."""
+        """Return the motors' set points after everything that was sent has arrived."""
         self.mcu.advance(self.now_ns() + 1000 * MS)
         return [abs(speed) for speed in self.mcu.vehicle.set_points]
 
 
 class Busy(Robot):
-    """On a computer with more to do than it can: of every so many waits the last ends `late_s` too
-    late, and what came meanwhile lay in the kernel. So it is until `until_s` of the check."""
+    """A robot on an overloaded computer, until `until_s` of the check.
+
+    Every `every`-th wait ends `late_s` too late, and the kernel holds the bytes that arrived
+    meanwhile.
+    """
 
     def __init__(
         self, *faults: str, late_s: float, every: int, until_s: float = math.inf, **how: Any
@@ -81,7 +90,7 @@ class Busy(Robot):
         self._waits = 0
 
     def wakes_late(self) -> bool:
-        """Out of the wait that begins now."""
+        """Return whether the wait that starts now ends late."""
         self._waits += 1
         return self._waits % self._every == 0 and self.now_ns() < self._until_ns
 
@@ -93,8 +102,10 @@ class Busy(Robot):
 
 
 class Starved(Busy):
-    """The same computer, and the board is a program of it: that one reads and writes too late, and
-    the kernel tells for how long it has waited."""
+    """A robot on an overloaded computer on which the simulated board runs as well.
+
+    The board reads and writes too late, and the kernel reports how long it waited for a core.
+    """
 
     def __init__(self, *faults: str, **how: Any) -> None:
         super().__init__(*faults, **how)
@@ -125,13 +136,13 @@ class Starved(Busy):
 
 
 def configured(config: Config, **mcu: Any) -> Config:
-    """The configuration with other keys of `[mcu]`."""
+    """Return the configuration with these keys of `[mcu]` replaced."""
     changed = msgspec.structs.replace(config.mcu, **mcu)
     return msgspec.structs.replace(config, mcu=changed)
 
 
 class Nobody:
-    """Confirms, and sees nothing: `--yes`."""
+    """An operator who confirms everything and sees nothing, as with `--yes`."""
 
     def say(self, text: str) -> None: ...
 
@@ -140,7 +151,7 @@ class Nobody:
 
 
 class Person(Nobody):
-    """Stands beside the robot and says what its wheels did."""
+    """An operator next to the robot who reports how its wheels turned."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -150,7 +161,7 @@ class Person(Nobody):
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         assert not any(abs(v) > 0.5 for v in self._robot.mcu.vehicle.speeds), "asked at speed"
-        self._robot.listen(self._robot.now_ns() + 20_000 * MS)  # people take their time
+        self._robot.listen(self._robot.now_ns() + 20_000 * MS)  # people are slow to answer
         seen = self._robot.turned
         if len(answers) == 1:
             return answers[0]
@@ -161,7 +172,7 @@ class Person(Nobody):
 
 
 class Checked:
-    """What a check of a robot found."""
+    """The findings of a check of one robot."""
 
     def __init__(self, robot: Robot, person: bool = False) -> None:
         self.findings: list[Finding] = []
@@ -172,7 +183,7 @@ class Checked:
         self.changes = advice.changes(self.findings, robot.config)
 
     def __getitem__(self, name: str) -> Finding:
-        """The finding whose name begins so."""
+        """Return the finding whose name starts with this text."""
         return next(f for f in self.findings if f.name.startswith(name))
 
     def named(self, verdict: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""From findings to the lines of acsard.toml."""
+"""Tests that turn findings into lines of acsard.toml."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The board: what goes out, what counts as an answer, and when it ends a check."""
+"""Tests of the board: lines it sends, lines it accepts as answers, and reasons to end a check."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
     assert end.value.finding.name == "stop"
     assert f"{2 * MOTOR_S:g} s" in end.value.finding.figure
     assert "motor a (front right)" in end.value.finding.text
-    assert robot.sent[-1].startswith(b"\r\n")  # once, then silence
+    assert robot.sent[-1].startswith(b"\r\n")  # one line, then silence
     assert not robot.sent[-2].startswith(b"\r\n")
     assert len(robot.sent) == sent
 
@@ -161,7 +161,7 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
     with robot.board() as board:
         board.drive((0.0, 0.0, 0.0, SPEED), 4.0)
         began = robot.now_ns()
-        board.rest()  # by the second wait
+        board.rest()  # the second wait succeeds
         assert PATIENCE_S * 1e9 < robot.now_ns() - began < 2 * PATIENCE_S * 1e9
         assert not board.latched
         assert not board.comma

@@ -1,4 +1,4 @@
-"""Counts against speeds."""
+"""Tests that compare encoder counts with speeds."""
 
 from __future__ import annotations
 
@@ -126,5 +126,6 @@ def test_where_lines_are_lost_no_counts_are_proposed_but_those_that_are_configur
         assert (finding.verdict, finding.keys) == (verdict, keys)
         if verdict == "SKIPPED":
             assert "0.5% of the lines are lost" in finding.text
-        board.identity = {"counts": "3200"}  # what the board names itself is no measure
+        # a count that the board states itself needs no measurement
+        board.identity = {"counts": "3200"}
         assert counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}

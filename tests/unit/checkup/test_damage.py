@@ -1,4 +1,4 @@
-"""Broken lines: none is a line, and firmware that takes one is told."""
+"""The host accepts no damaged line, and the check reports firmware that accepts one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_none_of_the_broken_lines_is_a_line(comma: bool, sealed: bool) -> None:
     for what, line in lines:
         assert protocol.whole(line) is None, what
         if "last number" in what:
-            continue  # the host reads replies with other decimals
+            continue  # the host also reads replies with another number of decimals
         with pytest.raises(FrameError):
             Codec(WheelMap()).decode(line.rstrip())
 
@@ -47,7 +47,7 @@ def test_firmware_that_takes_parts_is_told(fault: str, verdict: str) -> None:
 
 def test_firmware_that_reads_a_last_number_that_is_cut_is_told() -> None:
     def scanned(line: bytes) -> protocol.Command | None:
-        """As `sscanf` reads: the last number as far as it goes."""
+        """Parse as `sscanf` does: it reads the last number as far as it goes."""
         got = re.match(rb"ap(\d\d\.\d\d),bp(\d\d\.\d\d),cp(\d\d\.\d\d),dp([\d.]+),?\r\n\Z", line)
         return got and protocol.Command({m: float(got[m + 1]) for m in range(4)})
 

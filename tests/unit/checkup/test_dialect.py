@@ -1,15 +1,17 @@
-"""The language of the MCU, step by step."""
+"""Tests that determine the MCU's line format step by step."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from acsard.checkup import dialect
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
+from acsard.checkup.manual import find
 from acsard.config.settings import Config, McuConfig
+from acsard.mcu.hearing import Look
 from tests.unit.checkup.robots import Checked, Robot
 
 
@@ -29,6 +31,12 @@ def test_garbage_is_told_from_silence() -> None:
         with Robot(fault).board(rest=False) as board, pytest.raises(StoppedError) as end:
             dialect.baud(board)
         assert end.value.finding.figure.startswith(word)
+
+
+def test_every_diagnosis_of_the_received_bytes_has_an_outcome_of_its_own() -> None:
+    for look in get_args(Look):
+        finding = find(f"baud rate: {look}", heard="2 lines", configured=115200)
+        assert finding.verdict == "FAIL", look
 
 
 def test_the_identification_is_kept_and_missed_without_fault() -> None:
@@ -54,7 +62,7 @@ def test_the_form_of_its_replies_is_told(faults: tuple[str, ...], figure: str) -
 
 
 class Particular(Robot):
-    """Takes lines with a comma at their end only, or without only."""
+    """A robot that accepts lines only with a final comma, or only without one."""
 
     def __init__(self, comma: bool, **mcu: Any) -> None:
         super().__init__("plain_only", **mcu)

@@ -1,4 +1,4 @@
-"""Names for motors by what is configured."""
+"""Tests of motor names that follow from the configuration."""
 
 from __future__ import annotations
 

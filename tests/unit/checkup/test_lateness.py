@@ -1,4 +1,4 @@
-"""What is worth nothing, since this computer was late."""
+"""Findings are not judged when this computer was late."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lost and damaged lines: how many, and never too few to be told."""
+"""Lost and damaged lines are counted, and a rate is given only for enough lines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.unit.checkup.robots import Robot, check, configured
 
 
 def known(board: Board) -> None:
-    """As far as the check is before it counts."""
+    """Run the steps of the check that come before the count."""
     for step in (dialect.baud, pace.rate, dialect.check):
         step(board)
 

@@ -1,4 +1,7 @@
-"""On which way lines are lost: found out with motors, and not told where they cannot tell."""
+"""The check turns motors to find the direction in which lines are lost.
+
+It states no direction if the motors cannot show it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each outcome has its words, and says what to look at."""
+"""Each outcome has its text and says where to look."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def test_every_outcome_is_whole(outcome: str) -> None:
     assert not {"{", "}", "  ", "->"} & {*found.figure, *found.text.split(" "), *found.mend}
     if found.verdict in ("FAIL", "WARN"):
         assert found.text
-        # What nobody mended or could mend by a look at the board has none.
+        # These two outcomes have no repair text, because a look at the board would not help.
         assert found.mend or outcome in ("encoder counts: many", "wheels: not lifted")
 
 
 class Seen(float):
-    """Anything that was seen: a number, or words."""
+    """A stand-in for any observation: a number or words."""
 
     def __format__(self, how: str) -> str:
         return "seen"

@@ -1,4 +1,4 @@
-"""What replies say of movement."""
+"""Tests of the conclusions about movement that follow from replies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acsard.mcu.check import Reading
 def course(
     speed: float, per_turn: int, period_ms: int = 20, seconds: float = 1.0, sampled: bool = False
 ) -> list[Reply]:
-    """Replies with the speed of motor b as whole counts tell it, from one to the next."""
+    """Return replies in which whole counts between two replies give the speed of motor b."""
     found, before = [], 0
     for n in range(1, int(seconds * 1000 / period_ms)):
         counts = math.floor(speed * n * period_ms / 1000 / math.tau * per_turn)

@@ -1,4 +1,4 @@
-"""What is handed to the check is what it asks for."""
+"""Objects handed to the check satisfy the protocols that it requires."""
 
 from __future__ import annotations
 

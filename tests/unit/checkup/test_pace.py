@@ -1,4 +1,4 @@
-"""How often and how soon the MCU answers."""
+"""Tests of the rate and the delay of the MCU's answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole check in virtual time: good robots pass, each planted fault is found and named."""
+"""Tests of the whole check in virtual time: good robots pass, and each planted fault is named."""
 
 from __future__ import annotations
 
@@ -33,11 +33,10 @@ MOTORS = "abcd"
 
 
 def slow(value: object) -> object:
-    """One more of a kind."""
     return pytest.param(value, marks=pytest.mark.slow)
 
 
-# robots that are right
+# robots without a fault
 
 GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "plain": (("plain_only",), {}),
@@ -157,7 +156,7 @@ def test_a_planted_fault_is_found_and_named(
     assert text in finding.text
     assert mend in finding.mend
     assert changes.items() <= checked.changes.items()
-    # What it is not is said to be right.
+    # Everything that this fault does not affect is judged to be right.
     expected = {"swapped_motors=a:b": 2, "comma_latched": 3}.get(fault, verdict == "FAIL")
     assert len(checked.failed) == expected
     assert not checked.left_turning
@@ -262,7 +261,7 @@ def test_several_faults_at_once_are_all_found() -> None:
     assert not checked.left_turning
 
 
-# what keeps it safe
+# safety of the check
 
 
 def zero(line: bytes) -> bool:
@@ -286,7 +285,7 @@ def test_nothing_but_zeros_goes_out_before_the_wheels_are_confirmed_to_be_lifted
 
 
 class Trouble(Robot):
-    """Something happens with the n-th line."""
+    """A robot that raises an error at the n-th line."""
 
     def __init__(self, number: int, error: BaseException, *faults: str) -> None:
         super().__init__(*faults)
@@ -378,21 +377,25 @@ def test_a_runaway_stops_it_at_once() -> None:
     assert "watchdog" in checked[REST].text
     told = [max(float(token[2:7]) for token in line.split(b",")[:4])
             for _, line in robot.mcu.heard if line.startswith(b"a")]  # fmt: skip
-    # Motor a has had its 3 rad/s; b never was told more than what already looked like a runaway.
+    # Motor a was commanded its 3 rad/s. Motor b got no command above the speed that already looked
+    # like a runaway.
     assert max(told) <= 3.0
     assert not checked.left_turning
 
 
 class Regulates(Robot):
-    """Its firmware regulates: a motor whose encoder is dead or reversed goes to full speed, a
-    reversed one also when told zero, unless it stands; only the watchdog cuts it."""
+    """A robot whose firmware regulates speed.
+
+    A motor with a dead or reversed encoder runs to full speed. One with a reversed encoder does so
+    even at a command of zero, unless it stands still. Only the watchdog stops it.
+    """
 
     FULL = 20.0
 
     def __init__(self, *faults: str, lag: float = 0.3) -> None:
         super().__init__(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
         self.full_s = 0.0
-        """For how long a motor was faster than 6 rad/s."""
+        """Return for how long a motor was faster than 6 rad/s."""
         self.mcu.understand = self._regulated
 
     def _regulated(self, line: bytes) -> protocol.Command | None:
@@ -430,7 +433,7 @@ def test_firmware_that_regulates_is_not_left_at_full_speed(fault: str, most_s: f
 
 
 def zeros_after(sent: Sequence[bytes]) -> int:
-    """How many writes there are after the last that tells a speed."""
+    """Return the number of writes after the last one that commands a speed."""
     return next(n for n, line in enumerate(reversed(sent)) if b"3.00" in line)
 
 
@@ -571,7 +574,7 @@ def test_no_motor_is_told_more_than_3_rad_s_nor_for_longer_than_it_takes() -> No
 
 def test_zeros_that_the_last_motor_obeys_only_with_a_comma_are_told_though_it_turns() -> None:
     def obeys(line: bytes) -> protocol.Command | None:
-        """Plain lines; a zero for motor d needs a comma after it."""
+        """Parse plain lines; a zero for motor d is accepted only with a comma after it."""
         command = None if b"#" in line else protocol.whole(line)
         if command and not command.values[3] and not line.endswith(b",\r\n"):
             command.values.pop(3)
@@ -586,11 +589,11 @@ def test_zeros_that_the_last_motor_obeys_only_with_a_comma_are_told_though_it_tu
     assert checked.changes["mcu.trailing_comma"] is True
 
 
-# a computer that is late
+# a computer that runs late
 
 
 def names(checked: Checked) -> set[str]:
-    """What was not judged."""
+    """Return the names of the findings that were not judged."""
     return {f.name for f in checked.findings if f.figure == "not judged"}
 
 
@@ -640,7 +643,7 @@ def test_what_a_late_moment_spoilt_is_looked_at_again() -> None:
 
 @pytest.mark.slow
 def test_lines_of_a_board_whose_pace_was_not_measured_are_not_counted() -> None:
-    """Those that come by its own clock are not one to each of ours."""
+    """Lines that the board sends on its own clock do not match our lines one to one."""
     unpaced = 0
     for until_s in range(2, 10):
         late = Busy(
@@ -698,7 +701,7 @@ def test_a_board_that_falls_silent_is_not_excused() -> None:
 
 
 def test_no_motor_is_turned_again_behind_a_silence() -> None:
-    """However late this computer was in it."""
+    """This holds no matter how late this computer was during the check."""
 
     class Sags(Busy):
         silences = 0
@@ -745,12 +748,12 @@ def test_a_fault_beyond_what_the_lateness_explains_is_told(
 ) -> None:
     checked = Checked(computer(fault, late_s=0.03, every=3))
     assert checked[name].verdict == "FAIL"
-    assert type(checked[name]) is Finding  # no more goes to programs
+    assert type(checked[name]) is Finding  # programs receive no further fields
 
 
 def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not() -> None:
     class Refuses(Busy):
-        """Late, and deaf to lines without a comma, while the form of the lines is looked at."""
+        """A robot that is late and ignores lines without a comma in the line format step."""
 
         looked = False
 

@@ -1,4 +1,4 @@
-"""What is printed of the findings."""
+"""Tests of the printed findings."""
 
 from __future__ import annotations
 

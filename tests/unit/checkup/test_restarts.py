@@ -1,5 +1,7 @@
-"""A board that starts anew in the middle of the check is a finding of its own, whatever it says;
-what was being looked at is looked at again."""
+"""A restart of the board during the check is a finding of its own.
+
+The interrupted step is repeated.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ TEXT = b"Booting v2"
 
 
 class Restarting(Robot):
-    """Starts anew at these times."""
+    """A robot that restarts at these times."""
 
     def __init__(self, at_s: Sequence[float], *faults: str) -> None:
         super().__init__(*faults)
@@ -104,7 +106,7 @@ def test_one_that_starts_anew_again_and_again_is_left_alone_soon(every_s: float)
 
 
 class Weak(Robot):
-    """Its supply gives in whenever this wheel turns."""
+    """A robot whose supply voltage drops whenever this wheel turns."""
 
     def __init__(self, wheel: int) -> None:
         super().__init__()
@@ -130,7 +132,7 @@ def test_a_supply_that_gives_in_each_time_a_motor_turns_is_named_and_not_tried_f
 
 
 class Resetting(Robot):
-    """Its watchdog restarts the whole board when no line comes."""
+    """A robot whose watchdog restarts the whole board when no line arrives."""
 
     silence_ns = 500 * MS
     spoken_ns = 0
@@ -200,7 +202,7 @@ def reply(at_s: float, mcu_ms: int) -> Reply:
 
 
 def heard(*replies: Reply) -> Restarts:
-    """It answered so."""
+    """Return the restart detector after it has seen these replies."""
     restarts = Restarts()
     for one in replies:
         assert restarts.look(b"", one.at_s, one) is None
@@ -228,7 +230,8 @@ def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> N
         restarts.sent(ZERO, 0.0)
     assert restarts.look(TEXT, 0.1, None) is None
     restarts.sent(ZERO, 0.1)
-    assert restarts.look(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) is None  # damaged, no text
+    # a damaged line is not taken for text
+    assert restarts.look(b"ap0\x00.00,b~p00.00#0AFFE", 0.2, None) is None
     assert "text" in sign(restarts.look(TEXT, 0.2, None))
 
 

@@ -1,4 +1,4 @@
-"""Turning motors: at speed for a moment, at rest afterwards."""
+"""A tested motor runs at speed for a moment and stands still afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The watchdog's time, by each way of finding it out."""
+"""Tests of each way to measure the watchdog's time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ALL = (0, 1, 2, 3)
 
 
 class ByItsOwnClock(Robot):
-    """Firmware whose speeds are those of the moment, as a fixed control period measures them."""
+    """A robot whose firmware reports momentary speeds, as a fixed control period measures them."""
 
     def __init__(self, *faults: str, config: Config | None = None) -> None:
         super().__init__(*faults, config=config)
@@ -125,10 +125,10 @@ def test_what_cannot_be_told_finely_is_not_said_to_be_right(
         assert time_s != 0.3 or verdict == "WARN"
 
 
-# the time alone, before it is judged
+# the measured time alone, before it is judged
 
 SLACK_S = 0.02
-"""A reply's own time, which the interval does not hold."""
+"""Delay of a reply, which the interval does not include."""
 
 
 def silence(robot: Robot) -> Between:

@@ -1,4 +1,4 @@
-"""Judging channels: plain functions of what was seen."""
+"""Tests of the findings about motor and encoder channels: pure functions of the observations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The options of `acsard bench`."""
+"""Tests of the options of `acsard bench`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`acsard calibrate` in this process, on files."""
+"""Tests of `acsard calibrate` on files, inside this process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ GOOD = usual().csv(places=False)
 
 
 def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
-    """The exit code of `acsard calibrate --log drive.csv` with these words."""
+    """Return the exit code of `acsard calibrate --log drive.csv` with these further arguments."""
     (where / "acsard.toml").write_text(text)
     (where / "drive.csv").write_text(log)
     parser = argparse.ArgumentParser()
@@ -78,7 +78,8 @@ def test_a_distance_measures_the_wheels(tmp_path: Path, capsys: pytest.CaptureFi
     assert found["left_wheel_radius"] == pytest.approx(0.055, rel=0.02)
     written = parse((tmp_path / "acsard.toml").read_bytes())
     assert written.drive.left_wheel_radius_multiplier == pytest.approx(1.1, rel=0.02)
-    # How sure the tape is of all distances is said apart: it makes no heading doubtful.
+    # The tape's common uncertainty of all distances is stated apart, because it does not affect the
+    # heading.
     deviations = found["odometry"]
     assert written.odometry.distance_scale_std == deviations["distance_scale_std"] > 0.0
 
@@ -160,7 +161,7 @@ def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
 
 
 def driving(*words: str) -> int:
-    """`acsard calibrate` with these words, where nobody is at a terminal."""
+    """Return the exit code of `acsard calibrate` with these arguments and no terminal."""
     parser = argparse.ArgumentParser()
     calibrate.add(parser.add_subparsers())
     args = parser.parse_args(["calibrate", *words])

@@ -1,4 +1,4 @@
-"""What a service says that goes to one robot."""
+"""Tests of the output of a service call to one robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`acsard check` prints the configuration in force, or says what is wrong with it."""
+"""`acsard check` prints the configuration in force or says which part of it is wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the configuration is looked for, in which order, and what a bad one says."""
+"""Tests of the search order for the configuration file, and of the errors for a bad one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from acsard.host.exits import Exit, ExitError
 
 
 class Places:
-    """The four places, each an empty slot in a temporary directory."""
+    """The four places for a configuration file, all empty and in a temporary directory."""
 
     def __init__(self, root: Path) -> None:
         self.option = root / "option.toml"
@@ -39,7 +39,10 @@ class Places:
 
 @pytest.fixture(name="places")
 def _places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Places:
-    """An empty machine: nothing named, nothing here, nothing in /etc."""
+    """Set up a machine without any configuration.
+
+    No file is named, and there is none in this directory or in /etc.
+    """
     places = Places(tmp_path)
     places.here.parent.mkdir()
     monkeypatch.chdir(places.here.parent)
@@ -198,7 +201,7 @@ def test_a_key_that_nobody_has_is_warned_of_but_not_a_stranger_s_command(
     assert err.strip().isprintable()
 
 
-# keys of another kind than was thought
+# keys of another type than the program expected
 
 
 @pytest.mark.parametrize(

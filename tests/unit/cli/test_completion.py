@@ -1,4 +1,4 @@
-"""What a shell and `man` know of the command line is what the parsers know."""
+"""Shell completion and the man page list exactly the commands and options of the parsers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ VALUES = [
     ("acsard drive --source tele", {"teleop"}),
     ("acsard sim --fault bit", {"bit_errors"}),
 ]
-"""What is typed, and all that may follow."""
+"""Pairs of typed text and all words that may complete it."""
 
 
 def require(shell: str) -> None:
@@ -48,7 +48,7 @@ def require(shell: str) -> None:
 
 
 def offers(*words: str) -> list[str]:
-    """What a shell prints, of each line the word without its description."""
+    """Return the words that a shell command prints, without their descriptions."""
     done = subprocess.run(words, capture_output=True, text=True, timeout=30.0)
     assert done.returncode == 0, done
     return [line.split("\t")[0] for line in done.stdout.splitlines() if line]
@@ -56,7 +56,7 @@ def offers(*words: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def scripts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The script of each shell."""
+    """Return the path of each shell's completion script."""
     made = {}
     for shell in SHELLS:
         ended = typed("completion", shell)

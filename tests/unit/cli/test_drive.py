@@ -1,4 +1,4 @@
-"""What the keys ask of the robot: a press drives for a while, then zeros, then silence."""
+"""Tests of keyboard driving: a key press drives for a while, then zeros follow, then silence."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MOVES = [
     (",", -1, 0), (".", -1, 1), ("m", -1, -1),
     (UP, 1, 0), (DOWN, -1, 0), (LEFT, 0, 1), (RIGHT, 0, -1),
 ]  # fmt: skip
-"""As teleop_twist_keyboard has them (moveBindings: x and th), and the arrows as one expects."""
+"""Key bindings of teleop_twist_keyboard (moveBindings: x and th), and of the arrow keys."""
 
 SPEEDS = [
     ("q", 1.1, 1.1), ("z", 0.9, 0.9), ("w", 1.1, 1.0), ("x", 0.9, 1.0), ("e", 1.0, 1.1),
@@ -39,7 +39,7 @@ SPEEDS = [
 
 
 def silent() -> Teleop:
-    """A teleop that has sent its opening zeros, at 0.5 m/s and 2 rad/s."""
+    """Return a teleop at 0.5 m/s and 2 rad/s that has sent its initial zeros."""
     teleop = Teleop(0.5, 2.0)
     while teleop.send(0.0) is not None:
         pass
@@ -47,7 +47,7 @@ def silent() -> Teleop:
 
 
 def pressed(key: str, now: float) -> Teleop:
-    """A teleop after a silence, that key, and the zero that leads every drive."""
+    """Return a teleop after a silence, this key, and the zero that precedes every drive."""
     teleop = silent()
     teleop.press(key, now)
     assert teleop.send(now) == REST
@@ -159,11 +159,14 @@ def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
     assert split("".join(keys)) == keys
 
 
-# what is heard of the robot
+# the robot's published state
 
 
 class Robot:
-    """A client whose robot has said these, and whose router's storage keeps the last of them."""
+    """A client whose robot has published these states.
+
+    A storage in the router keeps the last one.
+    """
 
     source, sender = "teleop", "joe/1/aa"
 
@@ -179,7 +182,7 @@ class Robot:
             take(sample_of(self.stored))
 
     def send(self, linear: float, angular: float = 0.0) -> None:
-        """It is dead."""
+        """Do nothing, because this robot no longer receives."""
 
 
 def sample_of(state: RobotState) -> Any:
@@ -188,7 +191,7 @@ def sample_of(state: RobotState) -> Any:
 
 
 def heard_after(robot: Any, seconds: float, monkeypatch: pytest.MonkeyPatch) -> float:
-    """The age that is shown so long after the begin, s."""
+    """Return the age of the state that is displayed after this many seconds, s."""
     now = [100.0]
     monkeypatch.setattr(drive, "time", SimpleNamespace(monotonic=lambda: now[0]))
     ride = Ride(robot, Teleop(0.5, 2.0), "acsar", "tcp/127.0.0.1:7448")
@@ -241,7 +244,7 @@ def test_so_are_they_when_its_clock_was_set_back(monkeypatch: pytest.MonkeyPatch
 
 
 def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
-    """Those that are printed when these are there at these times, s."""
+    """Return the states that are printed when these states arrive at these times, s."""
     news = News()
     return [state for now, state in states if news.tell(replace(SEEN, state=state), now)]
 
@@ -265,7 +268,7 @@ def test_the_help_comes_again_before_news_shoves_it_off_the_terminal() -> None:
     page, shown = Page(), list[str]()
     for number in range(100):
         shown += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
-        # The last line of a terminal is empty: there is the cursor.
+        # The last line of a terminal stays empty, because the cursor is there.
         assert list(HELP) == [line for line in shown[-23:] if line in HELP]
     assert shown.count(HELP[0]) < 30
     assert shown[-4:-3] == ["news 99"]

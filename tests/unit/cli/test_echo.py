@@ -1,4 +1,4 @@
-"""A payload as one line of JSON, whatever it is encoded in."""
+"""Tests that print a payload of any encoding as one line of JSON."""
 
 from __future__ import annotations
 

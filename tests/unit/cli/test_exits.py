@@ -1,4 +1,4 @@
-"""Each family of errors has its exit code, and is what Python calls such a thing."""
+"""Each family of errors has its exit code and a fitting built-in base class."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PROMISED = [
     (errors.CertificateError, ValueError, 78),
     (errors.RouterFileError, ValueError, 78),
 ]
-"""DESIGN section 6."""
+"""Error class, built-in base class and exit code, as section 6 of DESIGN lists them."""
 
 
 @pytest.mark.parametrize(("kind", "builtin", "code"), PROMISED)

@@ -1,4 +1,7 @@
-"""`acsard foxglove` before it connects: what it says of its library and of an address."""
+"""Tests of the errors that `acsard foxglove` reports before it connects.
+
+They concern its library and its address.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ def test_without_its_library_it_says_which_extra_to_install(
 ) -> None:
     for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "foxglove", None)  # as if it were not installed
+    monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
     with pytest.raises(ExitError, match=r"pip install .*\[foxglove\]'") as told:
         foxglove.main(argparse.Namespace())
     assert told.value.code == Exit.FAILURE

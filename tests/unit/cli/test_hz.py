@@ -1,4 +1,4 @@
-"""Rate and evenness of arrival times, against figures worked by hand."""
+"""Tests of rate and jitter of arrival times against figures worked out by hand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ def test_fewer_than_two_messages_have_no_rate(times: list[float]) -> None:
 
 
 def test_three_messages_worked_by_hand() -> None:
-    # gaps of 10 and 20 ms: mean 15, deviation 5, the 99th percentile 99 % of the way up
+    # The gaps are 10 and 20 ms: mean 15, deviation 5, and the 99th percentile lies 99 % of the way
+    # up.
     assert rate([1.0, 1.01, 1.03]) == {
         "count": 3,
         "hz": 66.67,

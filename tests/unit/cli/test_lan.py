@@ -1,4 +1,4 @@
-"""`acsard lan`: the certificates it makes, who may read them, and what it says."""
+"""Tests of `acsard lan`: the certificates it makes, their file permissions, and its output."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ ROLES = ("viewer", "operator", "maintainer")
 
 
 def lan(*words: str) -> int:
-    """Run `acsard lan`; how it ended."""
+    """Run `acsard lan` and return its exit code."""
     try:
         return main(["lan", *words])
-    except SystemExit as end:  # the parser's way out
+    except SystemExit as end:  # the parser exits this way
         return int(end.code or 0)
 
 
@@ -52,13 +52,13 @@ def common_name(name: x509.Name) -> str:
 
 
 def files(directory: Path) -> dict[str, bytes]:
-    """All files below, by name."""
+    """Return the content of every file below this directory, by relative path."""
     found = (path for path in directory.rglob("*") if path.is_file())
     return {str(path.relative_to(directory)): path.read_bytes() for path in found}
 
 
 def tables(printed: str) -> bytes:
-    """The lines of acsard.toml among those printed."""
+    """Return those printed lines that are a part of acsard.toml."""
     lines = printed.splitlines()
     keep, inside = [], False
     for line in lines:
@@ -69,7 +69,7 @@ def tables(printed: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `lan init` makes; only to be looked at."""
+    """Return the directory that `lan init` makes. Tests must not change it."""
     directory = tmp_path_factory.mktemp("lan") / "tls"
     address = ("--address", "192.0.2.7", "--address", "robot.example", "--address", "2001:db8::7")
     assert lan("init", "--directory", str(directory), *address, "--days", "30") == 0
@@ -78,14 +78,14 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(name="own")
 def _own(made: Path, tmp_path: Path) -> Path:
-    """The same again, to be changed."""
+    """Return a copy of that directory that a test may change."""
     return Path(shutil.copytree(made, tmp_path / "tls"))
 
 
 PLACES = (".", *(f"clients/{role}" for role in ROLES))
 
 
-# what is made
+# files of `lan init`
 
 
 def test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role(made: Path) -> None:
@@ -168,7 +168,7 @@ def test_no_two_certificates_have_the_same_serial_number(made: Path) -> None:
     assert len({*numbers, certificate(made, "ca.pem").serial_number}) == len(PLACES) + 1
 
 
-# keys are nobody's business, at no time
+# no other user can read a key at any time
 
 
 WATCHED = """\
@@ -182,7 +182,7 @@ sys.addaudithook(hook)
 os.umask(0)
 sys.exit(main(["lan", *sys.argv[1:]]))
 """
-"""Takes nothing away from the modes files are made with, and tells when one is changed later."""
+"""A program without umask that reports every later change of a file's mode."""
 
 
 def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_key_is_not_written_through_a_link_that_lies_in_its_place(
     assert not (own / "key.pem").is_symlink()
 
 
-# what is there already
+# files that already exist
 
 
 def test_init_overwrites_nothing_without_force(
@@ -255,7 +255,7 @@ def test_add_does_not_replace_a_certificate(own: Path, capsys: pytest.CaptureFix
     assert "exists" in capsys.readouterr().err
 
 
-# what it says
+# printed output
 
 
 def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
@@ -293,7 +293,7 @@ def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
     assert listed == {r: (r, name) if r == role else (r,) for r in ROLES}
 
 
-# what is refused
+# refusals
 
 
 @pytest.mark.parametrize(
@@ -392,7 +392,10 @@ sys.exit(main(["lan", *sys.argv[1:]]))
 
 @pytest.fixture
 def locked() -> Iterator[Path]:
-    """A directory all may enter and nobody may write to; not in one that only root may enter."""
+    """Yield a directory that everyone may enter but nobody may write to.
+
+    It is not inside a directory that only root may enter.
+    """
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         directory.chmod(0o555)
@@ -416,7 +419,7 @@ def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
     assert list(locked.iterdir()) == []
 
 
-# the configuration it writes
+# the configuration that `lan init` writes
 
 
 def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
@@ -433,7 +436,8 @@ def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
     told = capsys.readouterr().out
     assert str(file) in told
     assert "systemctl restart acsard" in told
-    assert "listen = [" in told.partition("\n")[0]  # what it has set, and nothing to paste
+    # it lists the settings it made and prints no lines to paste
+    assert "listen = [" in told.partition("\n")[0]
     assert "[bus]" not in told
 
 
@@ -492,7 +496,7 @@ def test_without_an_authority_nothing_is_renewed(
     assert "acsard lan init" in capsys.readouterr().err
 
 
-# what a person would lose
+# files that the operator would lose
 
 
 def names_of(directory: Path) -> set[str]:

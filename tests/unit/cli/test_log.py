@@ -1,4 +1,4 @@
-"""`acsard log`: the list, the story, the replay, the recovered file."""
+"""Tests of `acsard log`: the list, the timeline, the replay and the recovered file."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 
 HARMED = 40
-"""Files, of which each verb sees all."""
+"""Number of damaged files; every verb processes each of them."""
 
 NEW = {"show": "", "replay": "", "export": ".mcap", "report": ".html", "recover": ".new.mcap"}
-"""The verbs that take a file, and what they make of it."""
+"""Maps each verb that takes a file to the suffix of the file that it makes."""
 
 
 @pytest.fixture(scope="module")
 def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two recordings, the second cut."""
+    """Return a directory with two recordings, of which the second is truncated."""
     where = tmp_path_factory.mktemp("record")
     for number, seconds in ((1, 2.0), (2, 4.0)):
         tape = Tape()
@@ -70,7 +70,7 @@ def test_the_list_has_a_line_each_and_says_what_happened(
 def test_the_list_tells_a_start_from_a_file_that_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whole, cut, and made whole beside it or in its place."""
+    """The files are whole, truncated, recovered into a second file, and recovered in place."""
     tape = Tape(every=200)
     world = World(recorder=tape)
     world.drive(0.5, seconds=4.0)
@@ -131,15 +131,19 @@ def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
 
 
 def starts_at(world: World, hours: int, minutes: int, seconds: float, days: int = 0) -> None:
-    """Set its clock to that time of day."""
+    """Set the world's clock to this time of day."""
     day = time.localtime(START.wall_ns / 1e9)
     begin = (day.tm_year, day.tm_mon, day.tm_mday + days, hours, minutes, 0, 0, 0, -1)
     world.wall_offset_ns = int((time.mktime(begin) + seconds) * 1e9) - world.now_ns
 
 
 def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
-    """Two seconds before midnight until three after it, a stop in the first second of the new day;
-    or the clock is set in the place of midnight."""
+    """Record from two seconds before midnight to three seconds after it.
+
+    With `set_to`, the clock is set at midnight instead.
+
+    A stop happens in the first second of the new day.
+    """
     tape = Tape()
     world = World(recorder=tape)
     starts_at(world, 23, 59, 58.0)
@@ -191,7 +195,7 @@ def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
         assert log(capsys, tmp_path, "export", "1", f"{name}.csv", "--csv", *words)[0] == 0
         rows[name] = len((tmp_path / f"{name}.csv").read_text().splitlines()) - 1
     assert abs(rows["old"] + rows["new"] - rows["all"]) <= 1
-    assert 1.2 < rows["new"] / rows["old"] < 1.8  # 3 s and 2 s, and a start
+    assert 1.2 < rows["new"] / rows["old"] < 1.8  # 3 s and 2 s, and one start
     assert log(capsys, tmp_path, "report", "1", "new.html", "--from", "00:00")[0] == 0
     assert re.search(r"<dt>How long</dt><dd>(2\.9|3\.0) s", (tmp_path / "new.html").read_text())
 
@@ -271,7 +275,7 @@ def test_a_replay_says_what_it_has_compared(
 
 
 def test_a_replay_of_what_was_cut_says_so(where: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = log(capsys, where, "replay")  # without a name: the newest
+    code, _, err = log(capsys, where, "replay")  # without a name it takes the newest
     assert code == 0
     assert "no end" in err
 
@@ -356,7 +360,10 @@ def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recordin
 
 
 def harmed(data: bytes, dice: random.Random) -> bytes:
-    """Cut, before its first chunk or behind, or damaged in one place or in many."""
+    """Return the data with one kind of damage.
+
+    They are truncated before or after the first chunk, or damaged in one or many places.
+    """
     begin = chunks(data)[0][0]
     kind = dice.randrange(4)
     if kind < 2:
@@ -371,7 +378,7 @@ def harmed(data: bytes, dice: random.Random) -> bytes:
 def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Recordings of a start, those that begin with a robot, those that a fault of our own ended."""
+    """The recordings begin at a start, begin with a saved state, or end by an internal error."""
     tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
     world = World(recorder=tape)
     world.drive(0.5, seconds=2.0)

@@ -1,4 +1,4 @@
-"""`acsard log export`, and `acsard calibrate --log` of a recording as it is."""
+"""Tests of `acsard log export`, and of `acsard calibrate --log` with a recording as its input."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RECORDED = "000007-20270115T080000Z.kept.mcap"
 
 @pytest.fixture(scope="module")
 def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with one recording."""
+    """Return a directory with one recording."""
     where = tmp_path_factory.mktemp("record")
     tape = Tape()
     World(recorder=tape).drive(0.5, seconds=1.5)
@@ -49,7 +49,7 @@ def test_the_newest_becomes_a_file_beside_you_with_a_name_of_its_own(
 ) -> None:
     assert export(where, *words) == 0
     told = capsys.readouterr()
-    assert told.err == ""  # no terminal, no progress
+    assert told.err == ""  # without a terminal there is no progress line
     assert told.out.endswith(f" in {name}\n")
     assert [path.name for path in here.iterdir()] == [name]
 
@@ -126,7 +126,7 @@ def test_what_is_no_recording_is_refused(
 
 
 def spin_and_curve(world: World) -> None:
-    """Standing, straight on and back, turns both ways: what calibration asks for."""
+    """Drive the motions that calibration asks for: rest, straight both ways, turns both ways."""
     world.run(3.0)
     for linear, angular, seconds in (
         (0.5, 0.0, 5.0), (-0.5, 0.0, 5.0), (0.0, 1.5, 8.0), (0.0, -1.5, 8.0),
@@ -144,7 +144,8 @@ def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
     tape = Tape()
     world = World(config, recorder=tape)
     spin_and_curve(world)
-    tape.write(here / "drive.log", config)  # by what is in it, not by its name
+    # calibrate recognizes the format by its content, not by its name
+    tape.write(here / "drive.log", config)
     (here / "acsard.toml").write_text("")
     assert main(["calibrate", "--log", "drive.log", "--json"]) == 0
     by_recording = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""What takes minutes says on a terminal how far it is, on one line that is gone at the end."""
+"""Long commands show their progress on one terminal line, which they erase at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`acsard log report`: a recording as one HTML file."""
+"""Tests of `acsard log report`, which writes a recording as one HTML file."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def report(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str
 
 
 def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """The traces of each picture in the file."""
+    """Return the traces of each plot in the file, by name."""
     text = path.read_text(encoding="utf-8")
     (data,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', text)
     return {figure["name"]: figure["data"] for figure in json.loads(data)}
@@ -36,7 +36,7 @@ def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
 
 @lru_cache
 def ends_at() -> tuple[float, float]:
-    """Where the recording says that the robot was last."""
+    """Return the robot's last recorded position, m."""
     poses = [pose for step in steps(Recording(QUIET)) for pose in step.said.poses]
     return poses[-1][0] / MICRO, poses[-1][1] / MICRO
 
@@ -91,7 +91,8 @@ def test_what_was_there_goes_only_when_all_of_the_new_one_is(
     assert new.read_text() == "mine"
     before = new.stat().st_ino
     assert report(capsys, QUIET, new, "--force")[0] == 0
-    assert new.stat().st_ino != before  # another file in its place, not the old one written over
+    # a new file replaces the old one; the old one is not overwritten
+    assert new.stat().st_ino != before
     assert [*tmp_path.iterdir()] == [new]
 
 

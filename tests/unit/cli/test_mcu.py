@@ -1,4 +1,4 @@
-"""`acsard mcu check` in this process, on the built-in simulator."""
+"""Tests of `acsard mcu check` on the built-in simulator, inside this process."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.unit.checkup.robots import Busy, Robot
 
 
 def called(where: Path, *words: str, text: str = "") -> int:
-    """The exit code of a check with this configuration."""
+    """Return the exit code of a check with this configuration."""
     file = where / "acsard.toml"
     if not file.exists():
         file.write_text(text)
@@ -232,16 +232,16 @@ def test_a_person_is_asked_until_the_answer_is_one(
 
 
 def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:
-    """What standard error, a terminal so wide, was written meanwhile."""
+    """Run `do` with a terminal of this width as standard error and return the text it wrote."""
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
     with os.fdopen(slave, "w") as end, monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", end)
         do()
-        end.write("$")  # the end, so that there is something to read
+        end.write("$")  # a mark for the end, so that there is always something to read
         end.flush()
         written = b""
-        while not written.endswith(b"$"):  # it comes in pieces
+        while not written.endswith(b"$"):  # the text arrives in pieces
             written += os.read(master, 1 << 16)
     os.close(master)
     return written.decode().removesuffix("$")

@@ -1,4 +1,4 @@
-"""The options of `acsard odom`."""
+"""Tests of the options of `acsard odom`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The configuration keys that the command line of `run` can give."""
+"""Tests of the configuration keys that the command line of `run` can set."""
 
 from __future__ import annotations
 
@@ -105,5 +105,5 @@ def test_where_a_person_looks_on_the_page_is_served_unless_it_is_not_wanted_or_n
     assert words is not None
     assert words[:3] == ["web", "--id", "acsar"]
     assert run.page(Config(web=WebConfig(page=False)), "nowhere.toml") is None
-    monkeypatch.setattr(run, "find_spec", lambda name: None)  # the extra is not installed
+    monkeypatch.setattr(run, "find_spec", lambda name: None)  # as if the extra were not installed
     assert run.page(Config(), "nowhere.toml") is None

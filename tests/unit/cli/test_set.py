@@ -1,4 +1,4 @@
-"""What is typed after `acsard set` is settings by their keys."""
+"""The words after `acsard set` are settings by their keys."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_key_without_a_value_is_told_how_to_write_it() -> None:
 def test_the_help_and_the_ros_page_say_what_write_does_not_write(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A source's timeout is set and refused with --write."""
+    """Both pages say that `--write` refuses a source's timeout, which `set` alone accepts."""
     with pytest.raises(SystemExit):
         parser().parse_args(["set", "--help"])
     page = (Path(__file__).parents[3] / "deploy" / "ros2" / "README.md").read_text()

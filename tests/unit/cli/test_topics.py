@@ -1,4 +1,7 @@
-"""`acsard topics --ros` lists what a ROS machine will see; none when both trees are off."""
+"""`acsard topics --ros` lists the topics that a ROS machine will see.
+
+It lists none when both trees are off.
+"""
 
 from __future__ import annotations
 

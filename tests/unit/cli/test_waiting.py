@@ -1,4 +1,4 @@
-"""A wait is explained once, and only where nothing comes."""
+"""A wait is explained once, and only if no message arrives."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_who_leaves_leaves_nobody_behind() -> None:
 
 
 def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
-    """What has been told once it is so many lines."""
+    """Return everything on standard error as soon as it has this many lines."""
     said, end = "", time.monotonic() + 10.0
     while said.count("\n") < lines:
         assert time.monotonic() < end, f"told only: {said}"

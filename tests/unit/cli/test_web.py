@@ -1,4 +1,4 @@
-"""`acsard web`: what it says where nobody could come, and of tokens."""
+"""Tests of `acsard web`: its errors when no browser could connect, and its tokens."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("acsard.toml").touch()  # as in a clone, and the service's is another
+    Path("acsard.toml").touch()  # as in a clone of the repository; the service uses another file
     assert main(["web", "--invite", "viewer"]) == 2
     told = capsys.readouterr().err
     assert "acsard.toml" in told
@@ -28,7 +28,10 @@ def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
 def told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., str]:
-    """What a call that goes well says, with a certificate and a state directory of its own."""
+    """Return a function that runs a successful call and returns its output.
+
+    The call has its own certificate and state directory.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     Authority.make(Path("tls"), "test", 1).issue(Path("tls"), "robot", ["localhost"], 1)

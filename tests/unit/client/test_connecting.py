@@ -1,4 +1,7 @@
-"""What stands in the way of a connection, and under which names a program finds all of it."""
+"""Tests of the errors that prevent a connection.
+
+The client exports every one of these errors.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ NOBODY_LISTENS = "tls/127.0.0.1:1"
 
 @pytest.fixture
 def shared() -> Iterator[Path]:
-    """A directory that all may enter, also where `tmp_path` is in one that only root may."""
+    """Yield a directory that every user may enter, even when `tmp_path` is inside a private one."""
     with tempfile.TemporaryDirectory() as name:
         Path(name).chmod(0o755)
         yield Path(name)

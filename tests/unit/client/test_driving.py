@@ -1,4 +1,4 @@
-"""A drive of the client, step by step in virtual time: it follows `state` and ends by it."""
+"""Tests of the client's drive in virtual time, step by step: it follows `state` and ends by it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ HIGHER = replace(
 )
 
 Says = Callable[[float, float, list[float]], RobotState | None]
-"""What the daemon says at a time, s, with the last command for m/s, and all of them."""
+"""Returns the daemon's state from the time in s, the last commanded m/s, and all commands."""
 
 
 def sample_of(state: RobotState) -> Any:
@@ -62,7 +62,7 @@ def sample_of(state: RobotState) -> Any:
 
 
 class World:
-    """A robot, a clock and a daemon that says its state ten times a second."""
+    """A robot, a clock and a daemon that publishes its state ten times a second."""
 
     source, sender = "app", US
 
@@ -73,10 +73,10 @@ class World:
         self.subscribed = self.answers = True
         self.published = True
         self.dies = math.inf
-        """From when on, s, only a storage of a router answers, with the last state."""
+        """Time after which only a router's storage answers, with the last state, s."""
         self.stored: Any = None
         self.set_back = math.inf
-        """When the robot's clock is, by 50 s."""
+        """Time at which the robot's clock is set back by 50 s."""
         self._says, self._told = says, 100.0
 
     def send(self, linear: float, angular: float = 0.0) -> None:
@@ -110,7 +110,7 @@ class World:
         return sample_of(replace(state, stamp=Time.from_ns(int(clock * NS_PER_S))))
 
     def drive(self, monkeypatch: pytest.MonkeyPatch, seconds: float = 1.0) -> float:
-        """How long a drive of 0.5 m/s takes, s."""
+        """Drive at 0.5 m/s and return how long it took, s."""
         monkeypatch.setattr(driving, "time", SimpleNamespace(monotonic=lambda: self.now))
         robot: Any = self
         with closing(drive(robot, 0.5, 0.0, seconds)) as steps:
@@ -120,7 +120,7 @@ class World:
 
 
 def followed(t: float, last: float, sent: list[float]) -> RobotState:
-    """Neutral is known after 0.3 s; it rolls on for 0.4 s after the last command."""
+    """Return a state that is armed after 0.3 s and rolls on for 0.4 s after the last command."""
     if t < 0.3:
         return OPENING
     return replace(FOLLOWED, linear=last or (0.2 if any(sent) and t < 1.8 else 0.0))
@@ -134,7 +134,7 @@ def test_a_drive_opens_with_zeros_drives_and_returns_when_the_robot_stands(
     first = world.sent.index(0.5)
     assert set(world.sent[:first]) == {0.0}
     assert first >= 40
-    assert world.sent.count(0.5) in (20, 21)  # the last may be of a rest of the time
+    assert world.sent.count(0.5) in (20, 21)  # the last one may cover a fraction of a period
     assert world.sent[-1] == 0.0
     assert 1.8 <= took < 2.1
     assert not world.subscribed
@@ -152,7 +152,10 @@ def test_a_state_that_is_published_seldom_is_asked_for(monkeypatch: pytest.Monke
 def test_an_answer_that_comes_on_another_thread_is_read_on_the_one_that_drives(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Else what was heard, when, and whether it objects could be of two states."""
+    """The received state, its time and its objection must belong to one state.
+
+    With two threads they could belong to two.
+    """
     world, readers = World(followed), set()
     world.published = False
     made = world._sample
@@ -271,7 +274,7 @@ def test_a_moment_without_the_robot_does_not_end_a_drive(monkeypatch: pytest.Mon
 def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
     monkeypatch: pytest.MonkeyPatch, seconds: float, dies: float
 ) -> None:
-    """Of a router, which answers with the last one there was."""
+    """The storage belongs to a router and answers with the robot's last state."""
     world = World(followed)
     world.dies = dies
     with pytest.raises(NoAnswerError, match="no word"):
@@ -293,7 +296,10 @@ def test_the_state_that_a_storage_has_of_a_robot_that_is_long_dead_begins_no_dri
 
 
 def test_a_robot_whose_clock_was_set_back_drives_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What it publishes is no storage's, whatever its stamp."""
+    """A state that the robot publishes itself never comes from a storage.
+
+    This holds for any stamp.
+    """
     world, made = World(followed), sample_of(FOLLOWED)
     monkeypatch.setattr(world, "_sample", lambda: made)
     world.drive(monkeypatch)
@@ -303,7 +309,7 @@ def test_a_robot_whose_clock_was_set_back_drives_on(monkeypatch: pytest.MonkeyPa
 def test_so_does_one_that_publishes_seldom_when_its_clock_is_set_back_on_the_way(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """All its answers are older than what came before."""
+    """Every answer has an older stamp than the state received before it."""
     world = World(followed)
     world.published, world.set_back = False, 101.0
     world.drive(monkeypatch, 5.0)
@@ -362,7 +368,7 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
     ("state", "words"),
     [
         (FOLLOWED, ""),
-        (replace(FOLLOWED, sender=""), ""),  # of a daemon that does not tell
+        (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
         (replace(FOLLOWED, sources=[source("1 more of its senders: the first")]), ""),
         (replace(FOLLOWED, sender=OTHER), f"another program drives as app, {OTHER}"),
         (OPENING, NEUTRAL),

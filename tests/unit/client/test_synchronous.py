@@ -1,4 +1,4 @@
-"""What the client puts on each command, without a bus."""
+"""Tests of the attachment that the client puts on each command, without a bus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 
 
 class Session:
-    """Takes what is put, as the daemon would hear it."""
+    """A session that records each put as the daemon would receive it."""
 
     def __init__(self, zid: str) -> None:
         self._zid = zid
@@ -33,7 +33,7 @@ class Session:
         return None
 
     def get(self, key: str, *_: Any, **__: Any) -> list[Any]:
-        return []  # nobody answers
+        return []  # no robot answers
 
     def put(self, key: str, payload: bytes, *, encoding: str, attachment: bytes, **_: Any) -> None:
         key = key.removeprefix("acsard/acsar/")
@@ -66,7 +66,7 @@ def test_each_command_has_its_sender_its_number_and_when_it_was_sent(session: Se
 
 
 def test_two_of_one_connection_keep_their_commands_apart_too(session: Session) -> None:
-    """What comes to the daemon within a millisecond of another on its key is left out."""
+    """The daemon drops a command that arrives within a millisecond of another one on its key."""
     one = client_of(session)
     other = one.like("acsar")
     begun = time.monotonic()

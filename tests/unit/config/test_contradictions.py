@@ -1,4 +1,4 @@
-"""What contradicts in the bus, access and ROS tables, each with its mend."""
+"""Tests of contradictions in the bus, access and ROS tables, each with its correction."""
 
 from __future__ import annotations
 

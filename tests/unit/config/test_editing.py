@@ -1,4 +1,4 @@
-"""Changing the text of an acsard.toml: comments stay, and what cannot be changed is refused."""
+"""Tests of edits to the text of an acsard.toml: comments stay, and impossible edits are refused."""
 
 from __future__ import annotations
 

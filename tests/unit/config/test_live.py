@@ -1,4 +1,7 @@
-"""What can be set while the daemon runs, and that a change is judged as the file is."""
+"""Tests of the settings that can change while the daemon runs.
+
+A change is checked by the same rules as the file.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ def problems(
 
 
 def by_file(wishes: dict[str, object]) -> Config | list[str]:
-    """What a file with these settings makes, or its problems."""
+    """Return the configuration that a file with these settings gives, or its problems."""
     tables: dict[str, Any] = effective(CONFIG)
     tables["commands"]["sources"] = list(tables["commands"]["sources"])
     for key, value in wishes.items():

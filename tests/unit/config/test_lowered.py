@@ -1,4 +1,4 @@
-"""Limits that stay lowered over a restart: which count, and what an edited file does to them."""
+"""Tests of lowered limits that survive a restart, and of the effect of an edited file on them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ SOFT = 0.5
         (LimitsConfig(linear_speed=0.3, linear_jerk=5.0), {"limits.linear_speed": 0.3}),
         (LimitsConfig(linear_speed=1.5, linear_jerk=5.0), {}),
         (LimitsConfig(linear_jerk=2.0), {"limits.linear_jerk": 2.0}),
-        # A lower deceleration brakes more softly, which is not the safer value.
+        # A lower deceleration brakes more softly, so it is not the safer value.
         (replace(FILE, linear_deceleration=SOFT, angular_deceleration=SOFT), {}),
         (replace(FILE, linear_stop_deceleration=SOFT, angular_stop_deceleration=SOFT), {}),
         (replace(FILE, linear_acceleration=SOFT), {"limits.linear_acceleration": SOFT}),
-        # No limit of the jerk at all is more than any.
+        # Zero means an unlimited jerk, which is more than any limit.
         (LimitsConfig(linear_jerk=0.0), {}),
     ],
 )

@@ -1,4 +1,7 @@
-"""What would not stop in time, or fault while it drives as it is told, is refused with its mend."""
+"""A configuration with dangerous limits is refused with a correction.
+
+The robot could not stop in time, or would fault in normal driving.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ DT = 0.01
 
 
 def thousandths(low: float, high: float) -> st.SearchStrategy[float]:
-    """Numbers as people write them."""
+    """Return a strategy for numbers with three decimals, as people write them."""
     return st.integers(round(low * 1000), round(high * 1000)).map(lambda number: number / 1000)
 
 
@@ -44,7 +47,7 @@ limits = st.builds(
 
 
 def mended(config: Config, line: str) -> Config:
-    """The configuration with the number that the line says to write."""
+    """Return the configuration with the number that the error message proposes."""
     found = re.match(r"(\w+)\.(\w+) = .*?write ([0-9.]+)", line)
     assert found is not None
     table, key, number = found.groups()
@@ -133,14 +136,14 @@ def test_a_stop_that_is_both_too_soft_and_softer_than_the_ramp_is_told_once() ->
 
 
 def test_what_the_wheels_cannot_reach_needs_no_braking() -> None:
-    # 10 rad/s on 0.05 m are 0.5 m/s
+    # 10 rad/s on a radius of 0.05 m are 0.5 m/s.
     slow = LimitsConfig(linear_speed=10.0, wheel_speed=10.0, linear_deceleration=0.1)
     assert problems(Config(limits=slow)) == []
 
 
 @pytest.mark.parametrize(("wheel_speed", "good"), [(35.2, True), (35.1, False), (20.0, False)])
 def test_feedback_must_leave_room_for_what_the_limits_ask(wheel_speed: float, good: bool) -> None:
-    # (1.0 m/s + 4.0 rad/s x 0.15 m) / 0.05 m = 32 rad/s, and a tenth more
+    # The limits ask for (1.0 m/s + 4.0 rad/s x 0.15 m) / 0.05 m = 32 rad/s, and a tenth is added.
     found = problems(Config(feedback=FeedbackConfig(wheel_speed=wheel_speed)))
     assert (found == []) is good
 

@@ -1,4 +1,4 @@
-"""Faults as a person names them."""
+"""Tests of faults written by name in the configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A word that nothing is called: what was probably meant."""
+"""Tests of the suggestion for a misspelt word."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Every mistake in a configuration is told at once, a line each, with key, value and mend."""
+"""All mistakes in a configuration are reported at once.
+
+Each has a line with key, value and correction.
+"""
 
 from __future__ import annotations
 
@@ -217,7 +220,7 @@ PLANTED = [
         "1",
         "did you mean timeout?",
     ),
-    # keys that contradict each other
+    # contradictory keys
     ("[mcu]\nbaud_rate = 9600", "control.rate", "100", "mcu.baud_rate = 38400 or more"),
     ('[mcu.wheels]\nfront_right = "-b"', "mcu.wheels.front_left", '"b"', "write another"),
     ('[joints]\nfront_left = "x"\nrear_left = "x"', "joints.rear_left", '"x"', "write another"),
@@ -246,7 +249,7 @@ PLANTED = [
         '"x"',
         "write another",
     ),
-    # what would not stop, or fault while it drives as it is told
+    # robots that would not stop in time, or would fault in normal driving
     (
         "[limits]\nlinear_deceleration = 0.19",
         "limits.linear_deceleration",
@@ -362,7 +365,10 @@ def test_rules_between_keys_are_told_with_the_mistakes_of_other_keys() -> None:
 
 
 def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
-    """Of 100 Hz at the baud rate by default, of endpoints whose insecure was mistyped."""
+    """The rules must not complain about keys whose values are unknown.
+
+    These are 100 Hz at the default baud rate, and endpoints whose `insecure` was misspelt.
+    """
     text = """
         [mcu]
         baudrate = 9600
@@ -488,7 +494,7 @@ def test_an_automatic_rate_is_always_comfortable(baud: int, comma: bool) -> None
     assert config.rate_hz * (34 if comma else 33) * 10 <= 0.8 * baud
 
 
-# who can reach the bus (SAFETY section 3)
+# clients that can reach the bus (SAFETY section 3)
 
 
 @pytest.mark.parametrize("key", ["listen", "connect"])
@@ -529,7 +535,7 @@ def test_one_bad_endpoint_among_good_ones_is_found() -> None:
     assert line.startswith('bus.listen = "tcp/10.0.0.1:2"')
 
 
-# contradictions at their edges
+# contradictions at their limits
 
 
 def test_a_stop_may_brake_exactly_as_hard_as_a_timeout() -> None:
@@ -566,7 +572,7 @@ def test_the_defaults_give_no_warning() -> None:
     assert warnings(Config()) == []
 
 
-# anything at all
+# random input
 
 NAMES = sorted({key.path.rpartition(".")[2] for key in KEYS} | {"id_", "x", "prot"})
 TABLES = sorted({key.path.rpartition(".")[0] for key in KEYS} - {"commands.sources[0]"})
@@ -590,7 +596,7 @@ LINES = st.one_of(
 
 
 def outcome(data: bytes) -> Config | list[str]:
-    """The configuration or its problems; anything else that `parse` raises fails the test."""
+    """Return the configuration or its problems. Any other error from `parse` fails the test."""
     try:
         return parse(data)
     except ConfigError as error:

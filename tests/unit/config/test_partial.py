@@ -1,4 +1,4 @@
-"""A configuration with keys that could not be read."""
+"""Tests of a configuration in which some keys could not be read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_what_is_not_spoilt_reads_as_ever() -> None:
     "read",
     [
         lambda config: config.mcu.baud_rate,
-        lambda config: config.mcu.line_bytes,  # by a property, and two more
+        lambda config: config.mcu.line_bytes,  # a property that reads this key and two more
         lambda config: config.limits.linear_speed,
     ],
 )

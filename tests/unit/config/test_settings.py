@@ -1,4 +1,4 @@
-"""The keys: their defaults as the design fixes them, and every range at its very edges."""
+"""Tests of the keys: their defaults match the design, and their ranges hold at both edges."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FLOATS = [key for key in NUMBERS if isinstance(key.numbers()[0], inspect.FloatTy
 
 
 def accepts(key: Key, value: float) -> bool:
-    """The key's own range takes `value` (in every place, where it is a list)."""
+    """Return whether the key's own range accepts `value`, in every element if the key is a list."""
     raw: Any = [value] * len(key.field.default) if "diagonal" in key.path else value
     table = {key.field.name: raw}
     if key.table is Source:

@@ -1,6 +1,6 @@
-"""The generic part of configuration: a table becomes a struct or one line per mistake.
+"""Tests of generic validation: a table becomes a struct, or one line per mistake.
 
-Tested with structs of its own: it knows msgspec types and nothing of robots.
+The tests define their own structs, because validation knows msgspec types and nothing about robots.
 """
 
 from __future__ import annotations

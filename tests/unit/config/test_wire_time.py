@@ -1,4 +1,4 @@
-"""Wire time, wire use, and the rates that fit."""
+"""Tests of wire time, wire use, and the rates that fit."""
 
 from __future__ import annotations
 
@@ -48,7 +48,8 @@ def test_a_command_is_as_long_as_the_seed_line_in_either_dialect() -> None:
 def test_the_longest_line_of_either_direction_is_what_counts() -> None:
     assert line_bytes(False, check=True) == 41
     assert line_bytes(True, check=True) == 42
-    assert line_bytes(False, check=True, sample=True) == 62  # the reply; the command has 42
+    # the reply is longer; the command has 42
+    assert line_bytes(False, check=True, sample=True) == 62
     assert line_bytes(True, check=True, sample=True) == 62
 
 

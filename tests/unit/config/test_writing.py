@@ -1,4 +1,4 @@
-"""A configuration written as TOML means the same."""
+"""A configuration that is written as TOML reads back with the same meaning."""
 
 from __future__ import annotations
 

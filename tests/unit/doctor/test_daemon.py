@@ -1,4 +1,4 @@
-"""What the doctor makes of two clocks."""
+"""Tests of the doctor's findings about the two clocks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ S = 10**9
 
 
 def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -> Running:
-    """Of a daemon whose clock is `apart` s ahead, asked within `trip` s."""
+    """Return the view of a daemon whose clock is `apart` s ahead, queried within `trip` s."""
     state = replace(STATE, stamp=Time.from_ns(NOW + int(apart * S)), counters=counters)
     return Running(INFO, Config(), state, state, NOW, int(trip * S), (), here)
 

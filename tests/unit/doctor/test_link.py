@@ -1,4 +1,4 @@
-"""What the doctor makes of a link that is not there, or loses lines."""
+"""Tests of the doctor's findings about a link that is down or loses lines."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_wheel_that_is_left_out_is_told() -> None:
 
 
 DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
-"""At 100 Hz."""
+"""Line counters after 40 days at 100 Hz."""
 
 
 def test_after_months_what_is_wrong_now_is_told_and_no_old_accident() -> None:

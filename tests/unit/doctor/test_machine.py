@@ -1,4 +1,4 @@
-"""What the doctor says of real time is what a daemon gets."""
+"""The doctor's finding about real-time scheduling matches the scheduling that a daemon gets."""
 
 from __future__ import annotations
 

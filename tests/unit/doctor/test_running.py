@@ -1,4 +1,4 @@
-"""What the doctor makes of a daemon that runs with other values than the file has."""
+"""Tests of the doctor's findings about a daemon whose settings differ from its file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_each_key_that_is_otherwise_is_told_with_both_values() -> None:
     assert finding.level == "ok"
     assert 'mcu.port = "/dev/pts/3", not "sim"' in finding.text
     assert "to keep them, write" in finding.mend
-    assert "anew" not in finding.mend  # would lead back to the simulator
+    assert "anew" not in finding.mend  # a restart would lead back to the simulator
 
 
 def test_what_run_was_told_by_an_option_is_offered_as_lines_of_the_file() -> None:

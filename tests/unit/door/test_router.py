@@ -1,4 +1,7 @@
-"""What `acsard router` takes for a router's configuration, and what it says of anything else."""
+"""Tests of the router configurations that `acsard router` accepts.
+
+All others get an error.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,8 @@ def test_it_takes_the_fleets_file_as_it_is() -> None:
     [
         ('{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }', "not a router's"),
         ('{ mode: "router", listen: { endpoints: [] } }', "not a router's"),
-        ('{ mode: "router" }', "needs mode"),  # Zenoh would listen everywhere, in clear
+        # Zenoh would listen on every address without encryption
+        ('{ mode: "router" }', "needs mode"),
         ('{ mode: "ruter" }', "; correct it"),
         ("", "router.json5"),
     ],

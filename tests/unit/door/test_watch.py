@@ -1,4 +1,7 @@
-"""What the door sees of itself: what it tells, and when it has to be opened anew."""
+"""Tests of the TLS gateway's watch over itself.
+
+It reports events and finds reasons to reopen the gateway.
+"""
 
 from __future__ import annotations
 

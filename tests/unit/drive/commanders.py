@@ -1,4 +1,4 @@
-"""Commanders of an arbiter, and its time."""
+"""Commanders for the tests of the arbiter, with a simulated time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LOW = Source("low", 10)
 
 
 class Bench:
-    """An arbiter and its time; `offset_ns` is how far the senders' clocks are ahead."""
+    """An arbiter with its own time. The senders' clocks are ahead by `offset_ns`."""
 
     def __init__(
         self,
@@ -53,28 +53,28 @@ class Bench:
         twist: Twist = GO,
         sender: str = "",
     ) -> str:
-        """Send a command that was stamped `late_ms` ago by the sender's clock."""
+        """Send a command that the sender stamped `late_ms` ago."""
         stamp_ns = self.now_ns + self.offset_ns - int(late_ms * MS)
         return self.arbiter.accept(
             Command(source.name, twist, self.now_ns, stamp_ns, clock, sender)
         )
 
     def known(self, source: Source, clock: str = "", sender: str = "") -> Bench:
-        """Zeros, until the clock that stamps them is known."""
+        """Send zeros until the arbiter knows the clock that stamps them."""
         for _ in range(60):
             self.wait(50).stamped(source, 0.0, clock, REST, sender)
         assert self.stamped(source, 0.0, clock, REST, sender) == ""
         return self
 
     def unreadable(self, source: Source, sender: str = "") -> None:
-        """Something that could not be decoded came from there."""
+        """Record that an undecodable command arrived from this sender."""
         self.arbiter.notice(source.name, sender, self.now_ns)
 
     def choice(self) -> Choice:
         return self.arbiter.choose(self.now_ns)
 
     def driver(self) -> str:
-        """Whose command is followed now, "" if nobody's."""
+        """Return the source whose command is followed now, or "" if there is none."""
         choice = self.choice()
         return "" if choice.twist is None else choice.source
 

@@ -1,9 +1,9 @@
-"""Drives as four encoders tell them, of which one may begin to lie: what judges
-`drive/lying_wheels/verdict.py`.
+"""Simulated drives as four encoders report them, of which one may fail, to judge `verdict.py`.
 
-Each wheel has a motor with its own lag, a tyre and load of its own, and stands anywhere within a
-count of its encoder; a line says counts over its period in two decimals. Written in numpy from that
-alone; shares no code with what it judges. All a robot does is in its seed.
+Each wheel has its own motor lag, tyre and load, and starts anywhere within one count of its
+encoder. A line reports counts over its period in two decimals. The module
+`drive/lying_wheels/verdict.py` is judged by these drives, so this one uses only numpy and shares no
+code with it. The seed determines everything that a robot does.
 """
 
 from __future__ import annotations
@@ -27,22 +27,29 @@ Array = NDArray[np.float64]
 PERIOD, RADIUS, TRACK = 0.01, 0.05, 0.30
 AT = Instant(0, 0)
 SIDES = (1, -1, -1, 1)
-"""Which way a wheel goes in a turn to the left, in `WHEELS` order."""
+"""Direction of each wheel in a left turn, in `WHEELS` order."""
 
 
 class Robot(Struct, frozen=True):
-    """How its wheels differ: standard deviations, shares of a lag of 0.05 s and of the way."""
+    """How the wheels of one robot differ.
+
+    `lag` is the mean motor lag in s. `lags` and `tyres` are standard deviations, as shares of the
+    lag and of the distance.
+    """
 
     counts: int = 3200
     lag: float = 0.05
     lags: float = 0.1
     tyres: float = 0.015
     load: float = 0.0
-    """Share of its speed that a wheel lacks in a turn of 1 rad/s, at most."""
+    """Largest share of its speed that a wheel loses in a turn of 1 rad/s."""
 
 
 def commands(rng: np.random.Generator, seconds: float, stops: float = 0.15) -> Array:
-    """(lines, 4): what the wheels are told, rad/s, on a drive at random within the limits."""
+    """Return commanded wheel speeds of a random drive, rad/s, shape (lines, 4).
+
+    The drive stays within the limits.
+    """
     v = w = 0.0
     rows: list[list[float]] = []
     while len(rows) * PERIOD < seconds:
@@ -57,7 +64,7 @@ def commands(rng: np.random.Generator, seconds: float, stops: float = 0.15) -> A
 
 
 def rolled(told: Array, robot: Robot, rng: np.random.Generator) -> Array:
-    """(lines, 4): by how much each wheel has turned since the start, rad."""
+    """Return the angle that each wheel has turned since the start, rad, shape (lines, 4)."""
     lag = robot.lag * (1 + robot.lags * rng.standard_normal(4))
     size = 1 + robot.tyres * rng.standard_normal(4)
     rest = np.exp(-PERIOD / lag)
@@ -75,7 +82,7 @@ def rolled(told: Array, robot: Robot, rng: np.random.Generator) -> Array:
 
 
 def said(angles: Array, counts: int) -> Array:
-    """(lines, 4): what encoders of so many counts make of it, rad/s."""
+    """Return the speeds that encoders with this many counts report, rad/s, shape (lines, 4)."""
     count = math.tau / counts
     whole = np.floor(angles / count)
     steps = np.diff(whole, axis=0, prepend=whole[:1])
@@ -83,7 +90,7 @@ def said(angles: Array, counts: int) -> Array:
 
 
 Lie = Callable[[Array, int, int], Array]
-"""(what is said, wheel, line from which on) -> what is said then."""
+"""Maps (reported speeds, wheel, first false line) to the reported speeds with the failure."""
 
 
 def dead(speeds: Array, wheel: int, begun: int) -> Array:
@@ -108,7 +115,10 @@ LIES: dict[str, Lie] = {"dead": dead, "reversed": reversed_, "stuck": stuck}
 
 
 def lines(speeds: Array, counts: int = 0) -> list[Feedback]:
-    """With the steps of encoders of so many counts, as the session tells them; 0 is none."""
+    """Return feedback lines with the quantization step of encoders with this many counts.
+
+    With 0 counts the lines have no known step.
+    """
     step = math.tau / counts / PERIOD if counts else 0.0
     return [Feedback(AT, WheelSpeeds(*row), PERIOD, steps=(step,) * 4) for row in speeds.tolist()]
 
@@ -122,12 +132,12 @@ def odometry(counts: int = 0) -> Odometry:
 
 
 def apart(a: Pose, b: Pose) -> tuple[float, float]:
-    """m and rad between two poses."""
+    """Return the distance in m and the angle in rad between two poses."""
     return math.dist((a.x, a.y), (b.x, b.y)), abs(math.remainder(a.yaw - b.yaw, math.tau))
 
 
 class Plain:
-    """The mean of front and rear, integrated: what odometry was before it doubted any wheel."""
+    """Odometry that integrates the mean of front and rear wheels and excludes no wheel."""
 
     def __init__(self) -> None:
         self._kinematics, self._path, self._lost = Kinematics(DriveConfig()), Path(), 0.0

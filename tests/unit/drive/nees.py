@@ -1,11 +1,11 @@
-"""Drives, and where robots end on them whose wheels err as declared: the truth for NEES.
+"""Simulated drives and true end poses of robots with the declared errors: the truth for NEES.
 
-Written from the declared model alone (`acsard.toml`, `drive/noise.py`'s docstring), in numpy, for
-many robots at once; shares no code with what it judges. The encoders say what the wheels were told;
-the ground, and the robot's true size, make something else of it.
+This module implements only the declared model (`acsard.toml`, the docstring of `drive/noise.py`),
+in numpy, for many robots at once. It shares no code with the module that it judges. The encoders
+report exactly the commanded speeds; the ground and the robot's true size change the actual motion.
 
-NEES is e' P^-1 e with e = log(estimate^-1 truth) and P the published covariance turned by -yaw. Its
-mean over many runs is 3 and 95 % of it below 7.815 where P tells the truth.
+NEES is e' P^-1 e, with e = log(estimate^-1 truth) and P the published covariance rotated by -yaw.
+If P is right, the mean of NEES over many runs is 3, and 95 % of its values are below 7.815.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 RADIUS, TRACK, PERIOD = 0.05, 0.30, 0.01
 AT = Instant(0, 0)
 REGION = 7.815
-"""95 % of chi square with three degrees of freedom."""
+"""The 95 % quantile of chi-squared with three degrees of freedom."""
 
 
 class Model(Struct, frozen=True):
@@ -53,11 +53,11 @@ class Model(Struct, frozen=True):
 
 K = 1e-5
 WHEELS = Model(K / 2, 2 * K / TRACK**2, 0.0)
-"""k = 1e-5 of each side, and nothing else."""
+"""A model with only the wheel noise of each side, k = 1e-5."""
 DEFAULT = Model(1e-4, 1e-4, 1e-2)
 
 Legs = list[tuple[float, float, float]]
-"""m/s, rad/s, s."""
+"""Parts of a drive as (m/s, rad/s, s)."""
 
 
 def circle(_: np.random.Generator) -> Legs:
@@ -88,7 +88,7 @@ def random(rng: np.random.Generator, seconds: float = 90.0) -> Legs:
 
 
 Heard = Callable[[Array, np.random.Generator], list[Feedback]]
-"""What comes of a drive's lines."""
+"""Returns the feedback lines that arrive from a drive."""
 
 Scenario = Callable[[np.random.Generator], Legs]
 SCENARIOS: dict[str, Scenario] = {
@@ -101,7 +101,10 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def reports(legs: Legs) -> Array:
-    """(lines, 2): both sides' speed in every line, two decimals, at 1 m/s2 and 4 rad/s2."""
+    """Return both sides' speeds in every line, in two decimals, shape (lines, 2).
+
+    The drive accelerates at 1 m/s2 and 4 rad/s2.
+    """
     v = w = 0.0
     rows = []
     for linear, angular, seconds in legs:
@@ -113,7 +116,7 @@ def reports(legs: Legs) -> Array:
 
 
 def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Generator) -> Array:
-    """(3, drives, robots): x, y, yaw at the end of each drive, of so many robots on each."""
+    """Return x, y and yaw at the end of each drive, shape (3, drives, robots)."""
     shape = (len(drives), robots)
     steps = np.zeros((max(map(len, drives)), len(drives), 2))
     for i, drive in enumerate(drives):
@@ -122,7 +125,8 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
     along, yaw = model.distance - k / 2, model.yaw - 2 * k / TRACK**2
     left_off, right_off = 1 + model.radius_std * rng.standard_normal((2, *shape))
     track = TRACK * (1 + model.track_std * rng.standard_normal(shape))
-    pose = 1e-3 * rng.standard_normal((3, *shape))  # as certain as at the start
+    # the same uncertainty as the default at the start
+    pose = 1e-3 * rng.standard_normal((3, *shape))
     for step in steps:
         left, right = step[:, :1], step[:, 1:]
         if not step.any():
@@ -139,7 +143,7 @@ def true_ends(drives: list[Array], robots: int, model: Model, rng: np.random.Gen
 
 
 def fold(lines: Iterable[Feedback], model: Model, counts: int = 0) -> tuple[Array, Array]:
-    """The pose that odometry ends at, and its covariance."""
+    """Return the final pose and covariance of odometry."""
     robot = Odometry(model.config(), Kinematics(DriveConfig()), counts)
     for line in lines:
         estimate = robot.fold(line)
@@ -149,12 +153,12 @@ def fold(lines: Iterable[Feedback], model: Model, counts: int = 0) -> tuple[Arra
 
 
 def plain(drive: Array) -> list[Feedback]:
-    """The lines of a drive."""
+    """Return the feedback lines of a drive."""
     return [Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD) for le, r in drive.tolist()]
 
 
 def errors(pose: Array, ends: Array) -> Array:
-    """(3, robots): log(estimate^-1 truth)."""
+    """Return log(estimate^-1 truth), shape (3, robots)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     dx, dy = ends[0] - pose[0], ends[1] - pose[1]
     yaw = np.remainder(ends[2] - pose[2] + math.pi, math.tau) - math.pi
@@ -164,7 +168,7 @@ def errors(pose: Array, ends: Array) -> Array:
 
 
 def nees(pose: Array, covariance: Array, ends: Array) -> Array:
-    """Of each robot that has ended at `ends`."""
+    """Return the NEES of each robot that truly ended at `ends`."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     turned = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     e = errors(pose, ends)
@@ -180,7 +184,10 @@ def study(
     heard: Heard | None = None,
     counts: int = 0,
 ) -> Array:
-    """NEES of `runs` robots, on so many drives, by all lines or by what is `heard` of them."""
+    """Return the NEES of `runs` robots, spread over `drives` drives.
+
+    Odometry receives every line, or only the lines that `heard` returns.
+    """
     rng = np.random.default_rng(seed)
     paths = [reports(scenario(rng)) for _ in range(drives)]
     ends = true_ends(paths, runs // drives, model, rng)

@@ -1,4 +1,4 @@
-"""A link that loses lines is told once, whichever way they are lost."""
+"""A link that loses lines is reported once, in whichever direction they are lost."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from acsard.drive.answered import LOST, WINDOW, Answered
 
 
 def told(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:
-    """What is told of a link on which every n-th line is lost."""
+    """Return the events of a link that loses every n-th line."""
     answered = Answered(period)
     events = [
         answered.look(sent, sent - sent // every if every else sent, linked)

@@ -1,4 +1,4 @@
-"""Who drives: priority, timeouts, who came first, and what each source waits for."""
+"""Tests of the arbiter: priority, timeouts, order of arrival, and waiting sources."""
 
 from __future__ import annotations
 
@@ -338,7 +338,10 @@ def armed_in_turn(bench: Bench, senders: list[str]) -> None:
 
 
 def drives(bench: Bench, sender: str) -> bool:
-    """Whether it may, asked when all others are silent; it is then silent itself."""
+    """Send as this sender while all others are silent, and return whether it drives.
+
+    The sender is silent again afterwards.
+    """
     bench.wait(300).send(HIGH, GO, sender)
     allowed = bench.driver() == "high"
     bench.wait(300)
@@ -356,9 +359,10 @@ def test_a_seventeenth_sender_takes_the_place_of_the_one_silent_for_longest() ->
     bench = Bench(HIGH, armed=False)
     senders = [f"sender {number}" for number in range(16)]
     armed_in_turn(bench, senders)
-    bench.wait(300).send(HIGH, GO, senders[0])  # now number 1 is the one noticed longest ago
+    # now the first sender is the one noticed longest ago
+    bench.wait(300).send(HIGH, GO, senders[0])
     assert bench.wait(300).send(HIGH, REST, "one more") == ""
-    # Asked last: who is new again takes a place too.
+    # That sender is checked last, because a forgotten sender takes a place again when it returns.
     asked = ("one more", senders[0], senders[2], senders[1])
     assert [drives(bench, sender) for sender in asked] == [True, True, True, False]
 
@@ -421,11 +425,11 @@ def test_the_crowd_of_one_source_is_none_of_another() -> None:
     assert bench.driver() == "low"
 
 
-# what does not move the robot, and lasts
+# commands that last but do not move the robot
 
 
 def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> Wait:
-    """Send that ten times a second, for so long; what is said then."""
+    """Send this twist ten times a second for this time and return the reported wait."""
     for _ in range(round(10 * seconds)):
         bench.wait(100).send(source, twist)
     return bench.choice().wait
@@ -482,7 +486,7 @@ def test_who_must_be_neutral_and_sends_on_is_told_that_it_lasts() -> None:
     assert held(bench, HIGH, 0.2, GO) == Wait("neutral", "high", 1.0, lasts=3.0)
 
 
-# what state shows
+# the published state
 
 
 def test_the_sources_are_listed_by_priority() -> None:

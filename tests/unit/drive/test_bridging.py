@@ -1,4 +1,4 @@
-"""A line -> the wheel angles since the last one that was believed."""
+"""Tests of gap filling: a line gives the wheel angles since the last accepted line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def near(*values: float) -> Any:
 
 
 def total(rolled: Rolled) -> float:
-    """rad of the first wheel."""
+    """Return the angle of the first wheel, rad."""
     return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
 
 
@@ -60,14 +60,14 @@ def test_counts_go_before_the_speed() -> None:
     counted = (0.05, 0.05, 0.05, 0.05)
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
     assert rolled.pieces == (counted,)
-    assert rolled.seen == all_four(0.04)  # a count made good is nothing that it did now
+    assert rolled.seen == all_four(0.04)  # a corrected count is not a motion of this line
     turned = (0.06, 0.06, 0.06, 0.06)
     rolled = Rolling().take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
     assert (rolled.turned, rolled.pieces, rolled.seen) == (turned, (), turned)
 
 
 def test_counts_of_a_line_passed_over_behind_a_silence_are_told_once() -> None:
-    """Its own time is nothing: the silence has it."""
+    """The line has no duration of its own, because the silence before it covers that time."""
     rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
     rolling.skip(Feedback(AT, FOUR, 0.0, gap=0.5, turned=turned))
     first = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)

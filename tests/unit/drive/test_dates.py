@@ -1,4 +1,4 @@
-"""`utc` agrees with the standard library's calendar."""
+"""`utc` agrees with the calendar of the standard library."""
 
 from __future__ import annotations
 

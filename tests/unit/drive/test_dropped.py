@@ -1,4 +1,4 @@
-"""Too many dropped lines are told, once in a window, with what to do."""
+"""A window with too many dropped lines is reported once, with its correction."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MOST = int(SHARE * WINDOW)
 
 
 def told(dropped: Dropped, bad: int, lines: int = WINDOW) -> list[Event]:
-    """The events of a window whose first lines are bad."""
+    """Return the events of a window whose first `bad` lines are dropped."""
     events = [dropped.line(WHY if i < bad else "") for i in range(lines)]
     return [event for event in events if event is not None]
 

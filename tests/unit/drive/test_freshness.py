@@ -1,4 +1,4 @@
-"""A command counts only when its delay is known to be short, whatever the clocks say."""
+"""A command counts only when its delay is known to be short, whatever the clocks show."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ def test_one_that_falls_silent_meanwhile_begins_again() -> None:
 @pytest.mark.parametrize("faster", [0.98, 0.9, 0.8, 1.02, 1.1, 1.3, 2.0, 5.0, 50.0])
 @pytest.mark.parametrize("heaps", [1, 6])
 def test_a_backlog_never_counts_however_fast_or_slowly_it_pours(faster: float, heaps: int) -> None:
-    # 20 Hz for a minute, `faster` than it was sent, one by one or some at a time.
+    # The sender sends at 20 Hz for a minute. The backlog arrives `faster` than it was sent, one by
+    # one or in groups.
     clock = Clock(known=False)
     for number in range(1200):
         after = 0.0 if number % heaps else heaps * 50 / faster
@@ -81,7 +82,10 @@ def test_jitter_keeps_nobody_out_for_three_seconds(jitter: float) -> None:
 def test_first_contact_through_jitter_of_60_ms_takes_2_s_in_the_median_and_mostly_under_5_s(
     hz: float,
 ) -> None:
-    """The jitter is exponential and nothing overtakes, as on TCP. It took 4 s, at worst 14 s."""
+    """The jitter is exponential and no command overtakes another, as on TCP.
+
+    An earlier version took 4 s, and 14 s at worst.
+    """
     took = []
     for seed in range(100):
         dice, clock, arrival = random.Random(seed), Clock(known=False), 0.0
@@ -113,7 +117,7 @@ def test_a_zero_among_jitter_is_not_forgotten_before_its_clock_is_known(
 def test_a_zero_at_the_head_of_a_backlog_is_forgotten() -> None:
     bench = Bench(HIGH, armed=False)
     for number in range(300):
-        bench.wait(40 if number < 200 else 50)  # then it has caught up
+        bench.wait(40 if number < 200 else 50)  # by then the backlog is gone
         late = max(0.0, 2000 - 10.0 * number)
         bench.stamped(HIGH, late, twist=GO if number else REST)
     assert bench.choice().wait.what == "neutral"
@@ -134,7 +138,7 @@ def test_a_proof_takes_the_source_s_timeout_but_no_more_than_two_seconds() -> No
         assert answers.index("") == 10 * seconds
 
 
-# known
+# a known clock
 
 
 def test_a_command_later_than_the_promptest_by_more_than_the_timeout_is_stale() -> None:
@@ -166,7 +170,7 @@ def test_a_backlog_is_not_obeyed_and_what_is_fresh_again_is() -> None:
     bench.wait(3000)
     ages = [float(age) for age in range(3000, -1, -50)]
     answers = [bench.stamped(HIGH, late_ms=age) for age in ages]
-    # silent for 3 s: the promptest may have risen by 3 s x 2e-4 = 0.6 ms
+    # After a silence of 3 s the minimum delay may have risen by 3 s x 2e-4 = 0.6 ms.
     assert answers == ["stale" if age > 250.6 else "" for age in ages]
 
 
@@ -184,7 +188,7 @@ def test_a_command_without_a_stamp_is_as_old_as_its_arrival() -> None:
 
 @pytest.mark.parametrize("drift", [1e-4, -1e-4])
 def test_an_hour_with_a_drifting_clock_loses_no_command(drift: float) -> None:
-    # 1e-4 x 3600 s = 360 ms: more than the timeout, if nothing followed it
+    # 1e-4 x 3600 s = 360 ms, which exceeds the timeout if the estimate did not follow the drift.
     bench = Bench(HIGH).known(HIGH)
     for _ in range(3600 * 5):
         bench.offset_ns -= int(drift * 200 * MS)
@@ -244,7 +248,7 @@ def test_one_who_comes_late_among_others_who_send_as_well_begins_anew_at_best() 
     )
 )
 def test_what_is_forgotten_would_have_begun_anew(order: list[tuple[int, float]]) -> None:
-    """Each sender is judged among the others as if it were alone."""
+    """Each sender among others gets the same verdicts as if it were alone."""
     among = Clock(known=False)
     alone = {name: Clock(known=False) for name in range(5)}
     for name, after in order:
@@ -265,7 +269,7 @@ def test_no_command_within_the_timeout_is_ever_stale(jitter: list[float], offset
         assert bench.wait(250).stamped(HIGH, late_ms=late) == ""
 
 
-# stepped
+# a clock that was set
 
 
 @pytest.mark.parametrize("step", [300.0, 10_000.0, -100.0, -10_000.0])
@@ -291,7 +295,8 @@ def test_one_stamp_that_is_wrong_costs_nothing_but_itself(step: float) -> None:
 
 
 def test_delays_that_keep_falling_below_the_promptest_do_not_count() -> None:
-    # A clock set forward hides how late they are: what falls like a backlog is one.
+    # A clock set forward hides a delay, so delays that fall like those of a backlog are treated as
+    # one.
     clock = Clock()
     verdicts = [clock.sends(-50.0 * n, 10.0) for n in range(100)]
     assert verdicts[0] == "fresh"
@@ -339,11 +344,11 @@ def test_a_clock_that_was_set_has_its_sender_let_go_first() -> None:
     assert bench.driver() == "high"
 
 
-# a clock is a sender's on every source
+# one clock per sender, on all its sources
 
 
 def driving(bench: Bench, source: Source, late_ms: float, ms: float) -> list[str]:
-    """The same sender's speeds at 20 Hz for so long."""
+    """Send speeds from the same sender at 20 Hz for this many ms and return the verdicts."""
     return [bench.wait(50).stamped(source, late_ms, "joe", GO, "joe") for _ in range(int(ms / 50))]
 
 
@@ -400,7 +405,7 @@ def test_a_foreign_clock_is_forgiven_a_second_and_a_second_more_each_minute() ->
     clock = Clock()
     late, forgiven = 0.0, 0.0
     for _ in range(20 * 300):
-        late += 1.0  # 2 %
+        late += 1.0  # a drift of 2 %
         if clock.sends(late) == "set":
             forgiven = late
     total = clock.freshness.forgiven_ns / NS_PER_S
@@ -413,8 +418,8 @@ def test_a_jump_of_over_a_second_is_forgiven_only_where_the_clock_shows_it(
     step: float,
 ) -> None:
     held = Clock()
-    held.now += step  # nothing arrives meanwhile, and then all of it late
-    waited = 58 * (step - 1000) - 1000  # the budget has 1 s, and 1 s more each minute
+    held.now += step  # nothing arrives during the step, and afterwards everything is late
+    waited = 58 * (step - 1000) - 1000  # the budget starts at 1 s and grows by 1 s each minute
     assert set(held.steadily(step, waited)) == {"stale"}
     assert "set" in held.steadily(step, 20_000), "it is never locked out for ever"
     shown = Clock()
@@ -444,7 +449,10 @@ def test_the_budget_is_never_more_than_its_limit() -> None:
 
 
 def test_a_minimum_that_fell_for_a_moment_still_bounds_a_steady_clock() -> None:
-    """After first contact at 70 ms and three commands at 5 ms, a plateau of 30 s was believed."""
+    """An earlier version accepted a plateau of 30 s in this case.
+
+    It followed first contact at 70 ms and three commands at 5 ms.
+    """
     clock = Clock(known=False, steady=True)
     clock.steadily(70.0, 1000)
     clock.steadily(5.0, 150)

@@ -1,4 +1,4 @@
-"""What is not known of a way without lines."""
+"""Tests of the uncertainty of the distance covered without lines."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def test_a_steady_drive_makes_gaps_certain() -> None:
 
 
 def test_a_jerky_drive_is_measured_as_what_it_is() -> None:
-    # 0.1 s at 0.4 m/s, 0.1 s at 0.6 m/s and so on: a span begins and ends at one of them
+    # The speed alternates between 0.4 and 0.6 m/s every 0.1 s. A span begins and ends at one of
+    # them.
     gaps = Gaps()
     for i in range(30_000):
         gaps.follow(Twist(0.4 if i // 10 % 2 else 0.6, 0.0), 0.01)

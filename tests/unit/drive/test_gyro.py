@@ -1,4 +1,4 @@
-"""Gyro samples beside feedback lines -> the turn of each line, or none."""
+"""Gyro samples and feedback lines give the turn of each line, or none."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ DT = 0.01
 
 Rate = Callable[[float], float]
 REST_FIRST = 1.0
-"""s after which the bias is known."""
+"""Time after which the bias is known, s."""
 
 
 class Bench:
-    """A robot that stands for a second and then turns as told; wheels say `skid` times as much."""
+    """A robot that rests for a second and then turns as commanded.
+
+    Its wheels report `skid` times the true turn.
+    """
 
     def __init__(
         self,
@@ -39,7 +42,7 @@ class Bench:
         sign: float = 1.0,
         first: int = 0,
     ) -> None:
-        """`first` is the number of its first noise."""
+        """`first` is the index of the first noise value."""
         self.gyro = Gyro()
         self.now_ns = 7 * NS_PER_S
         self.bias, self.noise, self.skid, self.sign = bias, noise, skid, sign
@@ -49,12 +52,12 @@ class Bench:
         self.silent = False
         self.does: list[GyroDoes] = []
         self.other = False
-        """The next sample is the first of another sender."""
+        """Whether the next sample is the first one of another sender."""
         self._sampled_ns, self._sampled = self.now_ns, 0.0
         self._samples = first
         self._way: list[GyroSample] = []
         self.held_back_ns = 0
-        """Until then no sample arrives; all that waited come then."""
+        """Time before which no sample arrives; the waiting samples then arrive together."""
 
     def run(
         self,
@@ -109,7 +112,7 @@ def stirring(t: float) -> float:
 
 
 def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
-    """No line for so long, then one that knows nothing of it."""
+    """Turn for this time without a line, then return the turn of a line that covers none of it."""
     for _ in range(round(seconds / DT)):
         bench.now_ns += LINE_NS
         bench.true += rate * DT
@@ -119,7 +122,7 @@ def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
     return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
 
 
-# used
+# a gyro in use
 
 
 @pytest.mark.parametrize("sample_ms", [2, 10, 50, 100])
@@ -219,7 +222,7 @@ def test_a_clock_that_is_set_costs_nothing() -> None:
     assert bench.told == pytest.approx(bench.true, rel=0.02)
 
 
-# silence, slip, disbelief
+# silence, slip, contradictions
 
 
 def test_a_gyro_that_falls_silent_leaves_the_wheels_alone_and_comes_back() -> None:
@@ -314,7 +317,7 @@ def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
     bench.run(REST_FIRST)
     bench.run(60.0, rate)
     assert bench.told == pytest.approx(60.0 * rate * 1.6)
-    # Wheels of unequal tyres say 0.08 rad/s on a straight, where a good gyro says nothing.
+    # Wheels with unequal tyres report 0.08 rad/s on a straight, where a good gyro reports nothing.
     assert (bench.says() == named) == (rate > (0.02 if sign else 0.05))
     bench.run(1.0)
     assert bench.told == pytest.approx(60.0 * rate * 1.6, abs=1e-6), "nor is it owed at rest"
@@ -394,12 +397,12 @@ def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
     assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
 
 
-# how certain
+# uncertainty
 
 
 @pytest.mark.slow
 def test_its_variance_is_that_of_its_errors() -> None:
-    """Heading errors after a straight drive over their claimed deviation: about normal."""
+    """Heading errors divided by their claimed deviations are about normal."""
     squares = []
     for seed in range(60):
         bench = Bench(noise=0.02, bias=0.01, first=10_000 * seed)

@@ -1,4 +1,4 @@
-"""The bias: the mean at rest, which counts for more the longer ago the last one is."""
+"""The bias is the mean at rest. A new mean gets more weight the older the last one is."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_a_bias_that_has_jumped_is_learned_anew_at_rest(jump: float, noise: floa
         if not learned.rest(said, 0.0, DT):
             off += (said - learned.value) * DT
     assert learned.value == pytest.approx(0.01 + jump, abs=0.002)
-    assert abs(off) < 1.2 * abs(jump)  # of a second and not of the minute
+    assert abs(off) < 1.2 * abs(jump)  # the error of one second, not of the whole minute
 
 
 def test_a_robot_that_is_turned_while_its_wheels_stand_has_no_other_bias() -> None:

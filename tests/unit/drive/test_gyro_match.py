@@ -1,4 +1,4 @@
-"""Gyro beside wheels: what the robot turns per turn of its wheels, the delay, the contradiction."""
+"""Tests that compare gyro and wheels: turn ratio, delay and contradiction."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from acsard.drive.gyro_match import FINE, ROUGH, Match
 
 DT = 0.01
 QUANTUM = math.tau / 3200 * 0.05 / 0.30
-"""rad of turn by one encoder count on two wheels of one side."""
+"""Turn of the robot for one encoder count on both wheels of one side, rad."""
 
 Rate = Callable[[float], float]
 
 
 def stirring(t: float) -> float:
-    """A wheel's turn rate with changes of all lengths, rad/s."""
+    """Return a turn rate of the wheels that varies on several time scales, rad/s."""
     return math.sin(1.3 * t) + 0.6 * math.sin(3.1 * t + 1.0)
 
 
@@ -126,7 +126,7 @@ def test_the_spread_is_what_the_ratio_differs_by_from_one_turn_to_the_next() -> 
 
 
 def test_a_gyro_that_comes_by_fits_and_starts_makes_the_ratio_no_less_certain() -> None:
-    """Up to 50 ms late, and never twice the same."""
+    """The samples are up to 50 ms late, with a delay that changes each time."""
     match, told, true = Match(), 0.0, 0.0
     for n in range(6000):
         late = (n * 7 % 11) * 0.005

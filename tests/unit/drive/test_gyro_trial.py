@@ -1,4 +1,4 @@
-"""The first turn proves a gyro, or says what is wrong with it."""
+"""The first turn proves that a gyro works, or shows which fault it has."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ DT = 0.01
 
 
 def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: float = 0.0) -> Verdict:
-    """The verdict after a turn at `rate` rad/s by the wheels, of which a gyro says this share."""
+    """Return the verdict after a turn.
+
+    The wheels report `rate` in rad/s, and the gyro reports `share` of that.
+    """
     for line in range(round(seconds / DT)):
         told = rate * share if line * DT >= late_s else 0.0
         trial.add(rate * DT, told * DT, DT)
@@ -73,7 +76,10 @@ def test_slow_turns_and_the_end_of_the_one_before_tell_nothing() -> None:
     [(0.08, 0.6, "good"), (0.08, -0.6, "reversed"), (0.12, 0.0, "dead"), (0.08, 0.0, "none yet")],
 )
 def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verdict) -> None:
-    """But of unequal tyres the wheels say so much on a straight, where a good gyro says nothing."""
+    """A silent gyro at 0.08 rad/s gives no verdict.
+
+    Wheels with unequal tyres report that rate on a straight, where a good gyro reports nothing.
+    """
     assert turned(Trial(), rate, share, 6.0) == verdict
 
 
@@ -102,7 +108,7 @@ def test_a_straight_between_two_turns_begins_anew() -> None:
 
 
 def test_to_stand_is_no_turning() -> None:
-    """A late one has told nothing yet, however long it stood before."""
+    """A late gyro has reported nothing yet, no matter how long the robot stood before."""
     trial = Trial()
     turned(trial, 1.0, 0.0, 0.05)
     turned(trial, 0.0, 0.0, 0.4)

@@ -1,4 +1,7 @@
-"""Odometry and a gyro together: each rad that the wheels tell is compared and put right once."""
+"""Tests of odometry with a gyro.
+
+Each part of the wheels' turn is compared and corrected exactly once.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ PERIOD_NS = NS_PER_S // 100
 
 
 class Listening:
-    """Hears what the wheels tell of the turn, and leaves it to them."""
+    """A gyro that records the wheels' turn and never corrects it."""
 
     owes = False
 
@@ -41,7 +44,7 @@ class Listening:
 
 
 class One(Struct):
-    """A line: how fast, what it lacks, and whether it is passed over."""
+    """One feedback line: its speeds, its missing time, and whether it is skipped."""
 
     left: float
     right: float
@@ -61,7 +64,7 @@ def said(one: One, dt: float = 0.01) -> Feedback:
     return Feedback(Instant(0, 0), speeds, dt + one.bridged, bridged=one.bridged)
 
 
-WHEEL = st.floats(1.0, 20.0)  # never at rest: there counts are held
+WHEEL = st.floats(1.0, 20.0)  # never at rest, because counts are held back there
 
 LINES = st.lists(
     st.builds(
@@ -105,10 +108,10 @@ def test_over_a_way_that_is_unknown_there_is_nothing_to_compare() -> None:
 
 
 class Turning:
-    """A robot with a true gyro: it stands for a second, then does as told."""
+    """A robot with an accurate gyro that rests for a second and then moves as commanded."""
 
     def __init__(self, scale: float = 1.0) -> None:
-        """Its gyro says `scale` times as much."""
+        """The gyro reports `scale` times the true turn."""
         self.scale = scale
         self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
         self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
@@ -116,7 +119,11 @@ class Turning:
         self.run(1.0, Twist())
 
     def run(self, seconds: float, twist: Twist, dead: bool = False, gap: bool = False) -> None:
-        """Its front left wheel is `dead`; over a `gap` it reaches its twist and tells the end."""
+        """Move at this twist; `dead` stops the front left wheel.
+
+        With `gap` no line arrives until the robot has reached the twist, and the last line reports
+        it.
+        """
         told = KINEMATICS.wheel_speeds(twist)
         speeds = told if not dead else WheelSpeeds(told.front_right, 0.0, *told.as_tuple()[2:])
         lines = round(100 * seconds)
@@ -139,7 +146,7 @@ class Turning:
 
     @property
     def off(self) -> float:
-        """rad by which the heading is wrong."""
+        """Return the error of the heading, rad."""
         return math.remainder(self.robot.pose.yaw - self.true, math.tau)
 
 
@@ -159,7 +166,7 @@ def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> Non
     bench.run(0.1, Twist(0.0, 0.9), gap=True)
     bench.run(2.0, Twist(0.0, 0.9))
     assert bench.gyro.status.does == "used"
-    assert bench.off == pytest.approx(0.0, abs=0.006)  # its samples are taken as steps
+    assert bench.off == pytest.approx(0.0, abs=0.006)  # the robot treats its samples as steps
 
 
 @settings(max_examples=30, deadline=None)
@@ -167,7 +174,7 @@ def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> Non
 def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
     before: float, turning: float, ahead: float
 ) -> None:
-    # A dead wheel that should hardly turn does not contradict the others.
+    # If the dead wheel should hardly turn, it does not contradict the others.
     assume(abs(KINEMATICS.wheel_speeds(Twist(ahead, turning)).front_left) > 1.0)
     bench = Turning()
     bench.run(1.0, Twist(ahead, 0.0))
@@ -180,7 +187,7 @@ def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
 
 
 def proved(scale: float) -> Turning:
-    """One that tells the turns from now on."""
+    """Return a robot whose gyro is proven and supplies the turns from now on."""
     bench = Turning(scale)
     bench.run(0.5, Twist(0.0, 1.0))
     bench.run(1.0, Twist())

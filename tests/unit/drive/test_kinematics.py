@@ -1,4 +1,7 @@
-"""Twist <-> wheel speeds: equations (1) to (3), and saturation that keeps the curvature."""
+"""Tests of the conversion between twist and wheel speeds.
+
+They cover equations (1) to (3), and saturation that keeps the curvature.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +62,9 @@ def test_rest_is_exactly_still_and_still_is_exactly_rest() -> None:
 def test_there_and_back_is_where_it_began(robot: DriveConfig, twist: Twist) -> None:
     kinematics = Kinematics(robot)
     back = kinematics.twist(kinematics.wheel_speeds(twist))
-    # v and w are found as sum and difference of the two sides, so each carries the other's error.
+    # v and w are the sum and the difference of the two sides, so each contains the other's error.
     track = robot.wheel_separation * robot.wheel_separation_multiplier
-    # Below 1e-300 a float has not all its digits.
+    # A float below 1e-300 has fewer digits.
     size = abs(twist.linear) + abs(twist.angular) * track + 1e-288
     assert back.linear == pytest.approx(twist.linear, abs=1e-12 * size)
     assert back.angular == pytest.approx(twist.angular, abs=1e-12 * size / track)
@@ -75,12 +78,12 @@ def test_the_two_wheels_of_a_side_turn_alike(robot: DriveConfig, twist: Twist) -
 
 
 def test_a_twist_within_the_wheel_speed_is_left_as_it_is() -> None:
-    twist = Twist(0.3, 1.0)  # 3 and 9 rad/s
+    twist = Twist(0.3, 1.0)  # wheels at 3 and 9 rad/s
     assert Kinematics(DriveConfig()).saturate(twist, 9.1) is twist
 
 
 def test_a_twist_beyond_the_wheel_speed_is_scaled_as_a_whole() -> None:
-    # 3 and 9 rad/s; a limit of 6 leaves two thirds of everything
+    # The wheels turn at 3 and 9 rad/s; a limit of 6 leaves two thirds of everything.
     got = Kinematics(DriveConfig()).saturate(Twist(0.3, 1.0), 6.0)
     assert (got.linear, got.angular) == pytest.approx((0.2, 2 / 3))
 

@@ -1,4 +1,7 @@
-"""Which effective track is used: the configured one until another is known, and within bounds."""
+"""Tests of the effective track in use.
+
+It is the configured one until another is learned, and it stays within bounds.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,10 @@ def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share
 
 @pytest.mark.parametrize(("bound", "inwards"), [(BOUNDS[0], 1.0), (BOUNDS[1], -1.0)])
 def test_at_a_bound_it_is_used_or_not_and_not_in_turns(bound: float, inwards: float) -> None:
-    """What is in use is used up to the bounds; what is not has to come a bit further in."""
+    """A learned track in use stays in use up to the bounds.
+
+    One not in use must come a little further inside first.
+    """
     within, beyond = (Track(bound * (1.0 + inwards * off), SURE) for off in (0.001, -0.001))
     track = LearnedTrack(1.0)
     track.look(Track(1.0, SURE))

@@ -1,4 +1,4 @@
-"""Latches and mode: single stories, and a model check of every reachable state."""
+"""Tests of latches and mode: single sequences, and a model check of every reachable state."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def number(life: Lifecycle) -> int:
 
 
 def mode(life: Lifecycle) -> Mode:
-    """Return the mode; a type checker would take two asserts of the attribute for one."""
+    """Return the mode; a type checker would merge two asserts on the attribute."""
     return life.mode
 
 
@@ -147,7 +147,7 @@ def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_that_does_not() -> No
     assert number(life) == first + 1
     early = ready()
     early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
-    assert number(early) == 1  # 0 stands for none
+    assert number(early) == 1  # 0 means that there is no stop
     kept = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
     kept.stop("ann", ns(1.0), Instant(ns(1.0), 0))
     assert number(kept) == OFF.number + 1
@@ -243,7 +243,7 @@ def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
 def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     kept: bool, wall_s: float
 ) -> None:
-    """The clock of a computer that boots may be years away from the time of the stop."""
+    """The clock of a booting computer may be years away from the time of the stop."""
     stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", kept)
     life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
     for step_s in (10.0, 10.01, 11.5):
@@ -331,7 +331,7 @@ def test_a_fault_keeps_the_stop_and_each_is_cleared_by_itself() -> None:
     assert clear(life, 5.0) == "fault cleared; still stopped by ann: call srv/clear again"
     assert mode(life) is Mode.STOPPED
     with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
-        clear(life, 6.9)  # the same clear, which the network delivered twice
+        clear(life, 6.9)  # the same clear request, delivered twice by the network
     assert clear(life, 7.1) == "cleared; each sender must send a zero before it drives"
     assert mode(life) is Mode.READY
 
@@ -511,7 +511,7 @@ def test_a_robot_that_starts_switched_off_can_be_switched_off_by_a_client_too() 
     assert (life.mode, life.latches) == (Mode.READY, Latches())
 
 
-# going down
+# shutdown
 
 
 def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start() -> None:
@@ -540,7 +540,7 @@ def test_the_limits_are_kept_beside_the_latches() -> None:
 
 
 class State(NamedTuple):
-    """Everything that decides the mode."""
+    """All facts that decide the mode."""
 
     leaving: bool
     fault: bool
@@ -593,7 +593,7 @@ REQUESTS: dict[str, Do] = {
 
 TRIGGERS = FACTS | REQUESTS
 PAUSES = (0.5, LOOK_FIRST_S + 1.0)
-"""Seconds before a trigger: within the time in which a plain clear is refused, and after it."""
+"""Seconds before a trigger: one while a plain clear is still refused, and one after that."""
 
 
 def state_of(life: Lifecycle) -> State:
@@ -626,7 +626,8 @@ def explore() -> list[Edge]:
     queue = deque((Lifecycle(active), 10.0) for active in (True, False))
     while queue:
         life, now = queue.popleft()
-        # A latch older than two seconds is a state of its own: a plain request differs there.
+        # A latch older than two seconds is a separate state, because a plain clear is accepted
+        # there.
         stopped = now - life._stopped_ns / NS_PER_S < LOOK_FIRST_S
         switched_off = now - life._off_ns / NS_PER_S < LOOK_FIRST_S
         if (state_of(life), stopped, switched_off) in seen:

@@ -1,4 +1,7 @@
-"""Wished twist -> safe twist: speed, acceleration, deceleration, jerk, coasting and the cut."""
+"""Tests of the limits that turn a requested twist into a safe one.
+
+They are speed, acceleration, deceleration, jerk, coasting and the cut.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ EPS = 1e-9
 KINEMATICS = Kinematics(DriveConfig())
 
 FREE = LimitsConfig(wheel_speed=99.99)
-"""Every default, and wheels that never saturate: (1 + 4 x 0.15) / 0.05 = 32 rad/s."""
+"""Default limits with wheels that never saturate: (1 + 4 x 0.15) / 0.05 = 32 rad/s."""
 
 JERKY = LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=99.99)
 
@@ -52,7 +55,7 @@ def limiter(limits: LimitsConfig = FREE) -> Limiter:
 
 
 def moving(linear: float, angular: float = 0.0, limits: LimitsConfig = FREE) -> Limiter:
-    """A limiter that has come to this twist with all the time in the world, and holds it."""
+    """Return a limiter that has reached this twist with plenty of time and holds it."""
     found = limiter(limits)
     followed(found, Twist(linear, angular), 2, dt=1000.0)
     assert found.twist == Twist(linear, angular)
@@ -81,13 +84,13 @@ def test_a_new_limiter_is_at_rest() -> None:
 @pytest.mark.parametrize(
     ("wish", "end"),
     [
-        # limits 1 m/s and 4 rad/s
+        # The limits are 1 m/s and 4 rad/s.
         ((0.7, 0.0), (0.7, 0.0)),
         ((2.0, 0.0), (1.0, 0.0)),
         ((-2.0, 0.0), (-1.0, 0.0)),
         ((0.0, 8.0), (0.0, 4.0)),
         ((0.0, -8.0), (0.0, -4.0)),
-        # both scaled by the one that exceeds most: 1 / 2, 4 / 16
+        # Both axes are scaled by the one that exceeds its limit most: 1 / 2 and 4 / 16.
         ((2.0, 2.0), (1.0, 1.0)),
         ((2.0, -2.0), (1.0, -1.0)),
         ((0.5, 16.0), (0.125, 4.0)),
@@ -131,13 +134,15 @@ def test_an_axis_with_a_limit_of_zero_is_left_out_and_the_other_is_followed(
 
 
 def test_a_wheel_that_would_be_too_fast_slows_the_whole_twist() -> None:
-    # 1 m/s and 4 rad/s: wheels at (1 -+ 0.6) / 0.05 = 8 and 32 rad/s; 16 rad/s are half of it
+    # 1 m/s and 4 rad/s put the wheels at (1 -+ 0.6) / 0.05 = 8 and 32 rad/s; 16 rad/s is half of
+    # that.
     slow = limiter(LimitsConfig(wheel_speed=16.0))
     assert pair(slow.follow(Twist(1.0, 4.0), 1000.0)) == approx(0.5, 2.0)
 
 
 def test_between_two_twists_the_wheels_can_follow_no_wheel_is_too_fast_either() -> None:
-    # 0.8 m/s: all wheels at 16 rad/s; 4 rad/s: 12 rad/s. It turns before it has slowed down.
+    # At 0.8 m/s all wheels have 16 rad/s; 4 rad/s take 12 rad/s. The robot turns before it has
+    # slowed down.
     found = moving(0.8, 0.0, LimitsConfig(wheel_speed=16.0, linear_deceleration=0.1))
     for twist in followed(found, Twist(0.0, 4.0), 800):
         assert max(map(abs, KINEMATICS.wheel_speeds(twist).as_tuple())) <= 16.0 + EPS
@@ -145,7 +150,7 @@ def test_between_two_twists_the_wheels_can_follow_no_wheel_is_too_fast_either() 
 
 
 def test_a_wheel_limit_keeps_the_curvature_once_the_ramps_are_over() -> None:
-    # 1 m/s and 1 rad/s: the right wheels at 1.15 / 0.05 = 23 rad/s; 16 / 23 of both are left
+    # 1 m/s and 1 rad/s put the right wheels at 1.15 / 0.05 = 23 rad/s; 16 / 23 of both remain.
     path = followed(limiter(LimitsConfig(wheel_speed=16.0)), Twist(1.0, 1.0), 200)
     assert pair(path[-1]) == approx(16 / 23, 16 / 23)
 
@@ -154,7 +159,7 @@ def test_a_wheel_limit_keeps_the_curvature_once_the_ramps_are_over() -> None:
 def test_no_wheel_is_ever_faster_than_its_limit(
     wishes: list[tuple[Twist, float]], most: float
 ) -> None:
-    # Braking much more slowly than it turns, it would come to corners no goal asks for.
+    # If it brakes much more slowly than it turns, it reaches corners that no goal asks for.
     slow = limiter(LimitsConfig(wheel_speed=most, linear_deceleration=0.1))
     for wish, dt in wishes:
         speeds = KINEMATICS.wheel_speeds(slow.follow(wish, dt))
@@ -165,19 +170,19 @@ def test_no_wheel_is_ever_faster_than_its_limit(
 
 
 def test_speed_grows_by_the_acceleration_and_lands_on_the_goal() -> None:
-    # 1 m/s2 x 10 ms
+    # Each step adds 1 m/s2 x 10 ms.
     got = followed(limiter(), Twist(0.035, 0.0), 5)
     assert [t.linear for t in got] == pytest.approx([0.01, 0.02, 0.03, 0.035, 0.035])
     assert got[-1].linear == 0.035
 
 
 def test_the_two_axes_have_their_own_accelerations() -> None:
-    # 0.5 m/s2 and 1 rad/s2 x 0.1 s
+    # The step is 0.1 s at 0.5 m/s2 and 1 rad/s2.
     assert pair(limiter(UNEVEN).follow(Twist(2.0, 4.0), 0.1)) == approx(0.05, 0.1)
 
 
 def test_the_two_axes_have_their_own_decelerations() -> None:
-    # 2 m/s2 and 6 rad/s2 x 0.1 s
+    # The step is 0.1 s at 2 m/s2 and 6 rad/s2.
     assert pair(moving(2.0, 4.0, UNEVEN).follow(REST, 0.1)) == approx(1.8, 3.4)
 
 
@@ -234,7 +239,8 @@ def test_a_change_of_direction_passes_through_zero(limits: LimitsConfig, sign: f
 
 
 def test_a_change_of_direction_brakes_first_and_accelerates_after() -> None:
-    # 2 m/s2 down: 0.05 -> 0.03 -> 0.01 -> 0; then 0.5 m/s2 up: -0.005, -0.01
+    # It brakes at 2 m/s2, 0.05 -> 0.03 -> 0.01 -> 0, and then accelerates at 0.5 m/s2, -0.005,
+    # -0.01.
     path = followed(moving(0.05, 0.0, UNEVEN), Twist(-0.05, 0.0), 5)
     assert [t.linear for t in path] == pytest.approx([0.03, 0.01, 0.0, -0.005, -0.01])
 
@@ -243,7 +249,7 @@ def test_a_change_of_direction_brakes_first_and_accelerates_after() -> None:
 
 
 def test_jerk_lets_the_slope_grow_step_by_step() -> None:
-    # 5 m/s3 x 10 ms: the slope is 0.05, 0.1, 0.15 m/s2; each moves 10 ms
+    # At 5 m/s3 x 10 ms the slope is 0.05, 0.1, 0.15 m/s2. Each slope applies for 10 ms.
     path = followed(limiter(JERKY), Twist(1.0, 0.0), 3)
     assert [t.linear for t in path] == pytest.approx([0.0005, 0.0015, 0.003])
 
@@ -252,10 +258,11 @@ def test_jerk_lets_the_slope_grow_step_by_step() -> None:
 @pytest.mark.parametrize(
     ("goal", "path"),
     [
-        # in steps of 0.05 m/s2 and 10 ms: slopes of 1, 2, 2, 1 and of 1, 2, 3, 2, 1 steps
+        # Steps are 0.05 m/s2 and 10 ms; the slopes are 1, 2, 2, 1 and 1, 2, 3, 2, 1 steps.
         (0.0030, [0.0005, 0.0015, 0.0025, 0.0030, 0.0030]),
         (0.0045, [0.0005, 0.0015, 0.0030, 0.0040, 0.0045]),
-        # 5.97 such steps: after 1 and 2 the rest of 2.97 is 1.985 and 0.985, each one less
+        # These are 5.97 steps. After 1 and 2, the remaining 2.97 are 1.985 and 0.985, each one
+        # less.
         (0.002985, [0.0005, 0.0015, 0.0024925, 0.002985, 0.002985]),
     ],
 )
@@ -270,14 +277,14 @@ def test_jerk_lets_the_slope_fall_as_late_as_it_may(
 def test_the_slope_falls_no_faster_than_jerk_unless_the_goal_would_be_passed(sign: float) -> None:
     found = limiter(JERKY)
     assert followed(found, Twist(sign, 0.0), 10)[-1].linear == pytest.approx(sign * 0.0275)
-    # From a slope of 10 steps to one of 9; then the goal is one step away.
+    # The slope falls from 10 steps to 9; then the goal is one step away.
     got = followed(found, Twist(sign * 0.0325, 0.0), 2)
     assert [sign * twist.linear for twist in got] == pytest.approx([0.032, 0.0325])
 
 
 def test_a_long_way_with_jerk_takes_the_time_worked_by_hand() -> None:
-    # Up to 1 m/s2 in 20 steps of 0.05 m/s2, which are 0.105 m/s; as much again to fall from it
-    # in 19, 0.095 m/s; the 0.3 m/s between take 30 steps of 10 ms.
+    # The slope rises to 1 m/s2 in 20 steps of 0.05 m/s2, which covers 0.105 m/s. It falls in 19
+    # steps, which covers 0.095 m/s. The 0.3 m/s in between take 30 steps of 10 ms.
     path = followed(limiter(JERKY), Twist(0.5, 0.0), 69)
     assert path[-2].linear < 0.5
     assert path[-1].linear == 0.5
@@ -288,7 +295,7 @@ def slopes(speeds: list[float]) -> list[float]:
 
 
 def rising(speeds: list[float]) -> list[tuple[float, float]]:
-    """The slope of each step that speeds up, with the slope before it."""
+    """Return the slope of each accelerating step and the change to its next slope."""
     found = []
     for (a, b), (_, c) in pairwise(pairwise([speeds[0], *speeds])):
         if abs(c) > abs(b):
@@ -300,7 +307,7 @@ def rising(speeds: list[float]) -> list[tuple[float, float]]:
 def test_jerk_bounds_the_change_of_slope_on_the_way_to_a_goal(
     start: float, goal: float, way: float
 ) -> None:
-    # 5 m/s3 x 10 ms
+    # The slope may change by 5 m/s3 x 10 ms in a step.
     start, goal = (way * speed for speed in sorted((abs(start), abs(goal))))
     found = moving(start, 0.0, JERKY)
     path = [start, *(twist.linear for twist in followed(found, Twist(goal, 0.0), 400))]
@@ -404,16 +411,16 @@ def test_jerk_is_no_limit_when_it_is_zero() -> None:
 
 
 def test_coasting_falls_by_the_deceleration() -> None:
-    # 1 m/s2 x 10 ms
+    # Each step removes 1 m/s2 x 10 ms.
     found = moving(0.035)
     assert [found.coast(DT).linear for _ in range(5)] == pytest.approx([0.025, 0.015, 0.005, 0, 0])
     assert found.twist == REST
 
 
 def test_coasting_brings_both_axes_down_together_by_the_slower_of_them() -> None:
-    # 0.5 m/s need 0.5 s, 4 rad/s need 1 s: after 0.25 s three quarters of both are left
+    # 0.5 m/s need 0.5 s and 4 rad/s need 1 s, so after 0.25 s three quarters of both remain.
     assert pair(moving(0.5, 4.0).coast(0.25)) == approx(0.375, 3.0)
-    # 1 m/s need 1 s, 1 rad/s needs 0.25 s: the same
+    # 1 m/s needs 1 s and 1 rad/s needs 0.25 s, so three quarters remain again.
     assert pair(moving(1.0, 1.0).coast(0.25)) == approx(0.75, 0.75)
 
 
@@ -437,7 +444,7 @@ def test_no_time_coasts_nowhere() -> None:
 
 
 def test_a_stop_falls_by_its_own_higher_deceleration() -> None:
-    # 3 m/s2 x 10 ms; 12 rad/s2 x 10 ms
+    # A step removes 3 m/s2 x 10 ms, or 12 rad/s2 x 10 ms.
     assert moving(1.0).coast(DT, stop=True).linear == pytest.approx(0.97)
     assert moving(0.0, -4.0).coast(DT, stop=True).angular == pytest.approx(-3.88)
 
@@ -491,7 +498,7 @@ def test_jerk_never_delays_coasting() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_after_coasting_jerk_begins_from_a_level_slope(sign: float) -> None:
-    # 5 m/s3 and 20 rad/s3 x 10 ms x 10 ms
+    # The first step adds 5 m/s3 x 10 ms x 10 ms and 20 rad/s3 x 10 ms x 10 ms.
     found, wish = limiter(JERKY), Twist(sign * 0.5, sign * 2.0)
     followed(found, wish, 20)
     left = found.coast(DT)

@@ -1,4 +1,4 @@
-"""The ordered list of modes, and the requests that a mode refuses."""
+"""Tests of the ordered list of modes, and of the requests that a mode refuses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DRAWN = """
     000011  driving
     000010  ready
 """
-"""The whole list once more, drawn by hand: a dot matches both, in the order of `FACTS`."""
+"""The whole list of modes drawn by hand. A dot matches both values, in the order of `FACTS`."""
 
 
 def drawn(facts: dict[str, bool]) -> list[str]:

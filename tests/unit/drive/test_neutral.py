@@ -1,4 +1,4 @@
-"""The neutral-first rule: a zero arms a sender, and nothing else does."""
+"""Tests of the neutral-first rule: a zero arms a sender, and nothing else does."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_message_that_may_have_been_a_speed_ends_the_wait_of_a_shared_zero() -
     one.notice(500 * MS)
     assert not one.armed(HOUR_NS)
     one.take(sent(REST, 600, shared=True), 0)
-    one.notice(1600 * MS)  # the zero has armed by then
+    one.notice(1600 * MS)  # the zero has armed the sender by then
     assert one.armed(1600 * MS)
 
 
@@ -313,7 +313,7 @@ def test_a_zero_that_did_not_count_yet_never_does_once_its_delay_proved_wrong() 
     bench = Bench(HIGH, armed=False).known(HIGH)
     bench.arbiter.require_neutral(bench.now_ns + 1)
     bench.wait(50).stamped(HIGH)
-    bench.wait(300_000)  # so long that its clock is new
+    bench.wait(300_000)  # long enough that its clock counts as new
     for age in range(3000, -1, -50):
         bench.wait(10).stamped(HIGH, age, twist=REST if age == 3000 else GO)
     for _ in range(20):
@@ -321,7 +321,7 @@ def test_a_zero_that_did_not_count_yet_never_does_once_its_delay_proved_wrong() 
     assert bench.choice().wait.what == "neutral"
 
 
-# what is no silence
+# events that are not a silence
 
 
 def test_what_a_network_held_back_and_then_lets_in_arms_nobody() -> None:
@@ -379,10 +379,10 @@ def test_a_twist_that_cancels_out_is_followed_of_one_who_may_drive() -> None:
     assert bench.choice().twist == REST
 
 
-# the law of it
+# the rule as a model
 
 TWISTS = {"a": Twist(0.1, 0.0), "b": Twist(0.2, 0.0), "shared": Twist(0.3, 0.0)}
-"""The twist that is followed tells which sender is."""
+"""One twist per sender; the followed twist shows which sender drives."""
 
 KINDS = ("go", "zero", "cancelled", "nan", "unreadable", "stamped", "neutral")
 

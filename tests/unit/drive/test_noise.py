@@ -1,4 +1,4 @@
-"""The noise of a step, and what parameters bend it by."""
+"""Tests of the noise of a step, and of the sensitivity to parameters."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_no_setting_makes_a_variance_negative(
 
 
 def step(drive: DriveConfig, left: float, right: float) -> tuple[float, float]:
-    """d and dyaw of wheel angles, equations (4) to (7)."""
+    """Return d and dyaw for wheel angles by equations (4) to (7)."""
     dl = drive.wheel_radius * drive.left_wheel_radius_multiplier * left
     dr = drive.wheel_radius * drive.right_wheel_radius_multiplier * right
     track = drive.wheel_separation * drive.wheel_separation_multiplier

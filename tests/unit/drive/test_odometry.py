@@ -1,4 +1,4 @@
-"""Wheel speeds over time -> pose, wheel angles and how certain they are."""
+"""Tests that integrate wheel speeds into pose, wheel angles and their uncertainty."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
 
 wheel_speed = st.floats(-40.0, 40.0)
 moves = st.tuples(wheel_speed, wheel_speed, st.floats(0.0, 0.1))
-"""left, right (rad/s), dt (s)."""
+"""One move as left and right (rad/s) and dt (s)."""
 
 
 def odometry(settings: OdometryConfig | None = None) -> Odometry:
@@ -49,7 +49,7 @@ def feedback(left: float, right: float, dt: float, gap: float = 0.0) -> Feedback
 
 
 def same_pose(got: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
-    """Equal within `tolerance`, angles a whole turn apart being equal."""
+    """Return whether poses are equal within `tolerance`, ignoring whole turns of yaw."""
     turn = math.remainder(got.yaw - expected[2], math.tau)
     return (got.x, got.y, turn) == pytest.approx((*expected[:2], 0.0), abs=tolerance)
 
@@ -101,7 +101,8 @@ def test_the_arc_is_the_limit_of_many_small_steps_of_the_seed_equations(
         x += distance / steps * math.cos(heading)
         y += distance / steps * math.sin(heading)
         heading += turn / steps
-    error = abs(distance * turn) / steps + 1e-9  # of the small steps; of second order per step
+    # the error of small steps is of second order per step
+    error = abs(distance * turn) / steps + 1e-9
     assert same_pose(arc(Pose(0.0, 0.0, yaw), distance, turn), (x, y, heading), error)
 
 
@@ -143,7 +144,7 @@ def test_there_and_back_the_same_way_ends_where_it_began(
 
 @pytest.mark.parametrize("turns", [0, 1, 10, 1000, -1, -10, -1000])
 def test_yaw_is_wrapped_however_many_turns_one_step_makes(turns: int) -> None:
-    # in place: 3 rad/s are 1 rad/s of yaw
+    # Turning in place at 3 rad/s gives a yaw rate of 1 rad/s.
     wheel = 3.0 * (1.0 + turns * math.tau)
     estimate = odometry().fold(feedback(-wheel, wheel, 1.0))
     assert estimate.pose.yaw == pytest.approx(1.0, abs=1e-9)
@@ -232,7 +233,7 @@ def test_setting_the_pose_makes_it_as_certain_as_at_the_start() -> None:
 
 
 def approx(p: PoseCovariance) -> object:
-    # to first order; of second order these variances have some millionths more
+    # The equations hold to first order; second order adds some millionths to these variances.
     return pytest.approx(matrix(p), rel=1e-4, abs=1e-15)
 
 
@@ -243,16 +244,16 @@ def test_at_the_start_the_pose_is_as_certain_as_configured() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_straight_metre_adds_the_variance_worked_by_hand(sign: float) -> None:
-    # F shears y by d x yaw: yy += d2 x 1e-6, yyaw = d x 1e-6. Noise: 1e-4 per metre along x and
-    # 1e-4 per metre of yaw.
+    # F shears y by d x yaw: yy += d2 x 1e-6, yyaw = d x 1e-6. The noise is 1e-4 per metre along x
+    # and 1e-4 per metre of yaw.
     covariance = odometry().fold(feedback(sign * 10.0, sign * 10.0, 2.0)).covariance
     expected = PoseCovariance(1.01e-4, 0.0, 0.0, 2e-6, sign * 1e-6, 1.01e-4)
     assert matrix(covariance) == approx(expected)
 
 
 def test_two_straight_metres_shear_y_by_the_yaw_noise_of_the_first() -> None:
-    # After 1 m: yy 2e-6, yyaw 1e-6, yawyaw 1.01e-4. The second adds
-    # yy += 2 x 1e-6 + 1.01e-4 = 1.05e-4, yyaw += 1.01e-4, yawyaw += 1e-4, xx += 1e-4.
+    # After 1 m: yy 2e-6, yyaw 1e-6, yawyaw 1.01e-4. The second metre adds yy += 2 x 1e-6 + 1.01e-4
+    # = 1.03e-4, which makes 1.05e-4, and yyaw += 1.01e-4, yawyaw += 1e-4, xx += 1e-4.
     robot = odometry()
     robot.fold(feedback(10.0, 10.0, 2.0))
     covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
@@ -261,7 +262,7 @@ def test_two_straight_metres_shear_y_by_the_yaw_noise_of_the_first() -> None:
 
 
 def test_facing_left_the_roles_of_x_and_y_change() -> None:
-    # cos = 0, sin = 1: the noise along the way is y's, the shear is -d x yaw on x.
+    # With cos = 0 and sin = 1, the noise along the path affects y, and the shear is -d x yaw on x.
     robot = odometry()
     robot.set_pose(Pose(0.0, 0.0, math.pi / 2))
     covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
@@ -271,10 +272,10 @@ def test_facing_left_the_roles_of_x_and_y_change() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
-    # 1 rad x 1e-2 per radian, less the play of a 400th of a turn: 2 pi / 400 x 0.05 / 0.3 rad.
-    # Each side rolls 0.15 m; of its noise, k = 1e-4 x 0.3 x 0.3 / 2 = 4.5e-6, is all of the yaw's
-    # variance per metre: 4.5e-6 x 0.3 / 0.09 = 1.5e-5 of yaw, and 4.5e-6 x 0.3 / 4 = 3.375e-7 of
-    # place, a thousandth of the yaw's.
+    # 1 rad x 1e-2 per radian, less the play of a 400th of a turn: 2 pi / 400 x 0.05 / 0.3 rad. Each
+    # side rolls 0.15 m. The side noise k = 1e-4 x 0.3 x 0.3 / 2 = 4.5e-6 makes up all of the yaw's
+    # variance per metre. It gives 4.5e-6 x 0.3 / 0.09 = 1.5e-5 of yaw, and 4.5e-6 x 0.3 / 4 =
+    # 3.375e-7 of position, a thousandth of the yaw's.
     robot = odometry(OdometryConfig(yaw_variance_per_metre=0.0))
     covariance = robot.fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
     yaw = 1e-6 + 1e-2 * (1 - math.pi / 1200)
@@ -293,7 +294,7 @@ def test_an_arc_noises_along_its_chord() -> None:
     robot.set_pose(Pose(0.0, 0.0, -math.pi / 4))
     covariance = robot.fold(feedback(4.5, 7.5, math.pi)).covariance
     expected = PoseCovariance(0.952478e-4, 0.0, 3.53429e-6, 1.72e-6, 0.848528e-6, 0.0157770)
-    # to first order, see `approx`; heading errors of 0.13 rad make 3e-4 of it
+    # This holds to first order, see `approx`; heading errors of 0.13 rad change it by 3e-4.
     assert matrix(covariance) == pytest.approx(matrix(expected), rel=3e-3, abs=1e-9)
 
 
@@ -305,7 +306,10 @@ def test_standing_adds_no_uncertainty() -> None:
 
 
 def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
-    """After a gap that began at 0.3 m/s and 0.5 rad/s and ended at this."""
+    """Return the covariance after a gap that ended at this twist.
+
+    The gap began at 0.3 m/s and 0.5 rad/s.
+    """
     robot = odometry()
     robot.fold(feedback(4.5, 7.5, 0.0))
     left, right = (linear - 0.15 * angular) / 0.05, (linear + 0.15 * angular) / 0.05
@@ -314,7 +318,8 @@ def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
 
 @pytest.mark.parametrize("gap", [0.15, 0.5])
 def test_a_gap_adds_the_way_between_the_speeds_before_and_after(gap: float) -> None:
-    # 0.3 to 0.1 m/s and 0.5 rad/s throughout: 0.2 m/s and 0.5 rad/s of mean, and one to spare
+    # The speed goes from 0.3 to 0.1 m/s at a constant 0.5 rad/s. The mean is 0.2 m/s and 0.5 rad/s,
+    # and the bound is twice that.
     grown = matrix(gone(gap, 0.1, 0.5)) - matrix(START)
     assert (0.2 * gap) ** 2 <= grown[0, 0] <= 2 * (0.3 * gap) ** 2
     assert (0.5 * gap) ** 2 <= grown[2, 2] <= 2 * (0.5 * gap) ** 2
@@ -329,7 +334,7 @@ def test_the_longer_a_gap_the_less_is_known_of_it() -> None:
 
 
 def test_gaps_all_err_to_the_same_side() -> None:
-    # ten gaps of 0.1 s at 0.5 m/s: 0.5 m that the pose lacks, not 0.05 m x sqrt(10)
+    # Ten gaps of 0.1 s at 0.5 m/s miss 0.5 m of the path, not 0.05 m x sqrt(10).
     robot = odometry()
     for _ in range(10):
         robot.fold(feedback(10.0, 10.0, 0.01))
@@ -356,7 +361,8 @@ def bridged(seconds: float, pieces: int) -> float:
 
 def test_what_was_bridged_is_less_certain_the_longer_it_was() -> None:
     short, longer = bridged(0.2, 1), bridged(0.4, 1)
-    # s_a = 0.125 m/s2: (0.125 x 0.2 x 0.2 / 2)^2 = 6.25e-6; by the fifth power of the time
+    # With s_a = 0.125 m/s2, (0.125 x 0.2 x 0.2 / 2)^2 = 6.25e-6, and it grows by the fifth power of
+    # time.
     assert short == pytest.approx(6.25e-6, rel=1e-3)
     assert longer == pytest.approx(32 * short, rel=1e-3)
 
@@ -374,7 +380,7 @@ def test_what_counts_bridge_is_certain() -> None:
 
 
 def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Estimate]:
-    """Each (left, right, dt); a dt above 0.09 s is a gap ten times as long."""
+    """Fold each (left, right, dt); a dt above 0.09 s is a gap ten times as long."""
     return [
         robot.fold(
             feedback(left, right, 0.0, gap=dt * 10) if dt > 0.09 else feedback(left, right, dt)
@@ -394,7 +400,8 @@ def test_the_covariance_is_always_positive(path: list[tuple[float, float, float]
 def test_moving_never_makes_the_pose_more_certain(
     path: list[tuple[float, float, float]],
 ) -> None:
-    # Without gaps: what was lost on the way there may be what is lost on the way back.
+    # The path has no gaps, because motion lost on the way out may cancel motion lost on the way
+    # back.
     yaw, volume = START.yawyaw, float(np.linalg.det(matrix(START)))
     for estimate in fold_all(odometry(), [(le, r, min(dt, 0.09)) for le, r, dt in path]):
         grown = float(np.linalg.det(matrix(estimate.covariance)))
@@ -460,7 +467,7 @@ def test_the_covariance_stays_finite_for_years(gap: float) -> None:
 
 
 def counted(*turned: float, dt: float = 0.01, gap: float = 0.0, speed: float = 0.0) -> Feedback:
-    """A line whose wheels turned by so much, in rad; one figure is for all of them."""
+    """Return a line whose wheels turned by these angles, rad; one number applies to all wheels."""
     a, b, c, d = turned if len(turned) == 4 else turned * 4
     return Feedback(AT, WheelSpeeds(*(speed,) * 4), dt, gap, (a, b, c, d))
 
@@ -532,7 +539,7 @@ def test_what_no_line_reported_is_linear_from_one_report_to_the_next() -> None:
 
 
 class Says:
-    """Always the same turn."""
+    """A gyro that always reports the same turn."""
 
     owes = False
 
@@ -564,7 +571,7 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
     assert by_gyro.positions == by_wheels.positions
     assert gyro.travelled == pytest.approx(wheels.travelled)
     more = by_gyro.covariance.yawyaw - OdometryConfig().pose_covariance_diagonal[5]
-    assert more == pytest.approx(1e-4, rel=1e-3)  # and of its scale 0.2 mrad
+    assert more == pytest.approx(1e-4, rel=1e-3)  # the gyro's scale adds 0.2 mrad
 
 
 def test_over_a_gap_the_gyro_knows_the_turn() -> None:
@@ -632,7 +639,7 @@ def test_counts_that_only_the_steps_of_the_speeds_show_make_a_twist_doubtful(
     zeros = replace(feedback(0.0, 0.0, 0.01), steps=steps)
     for _ in range(1 + round(seconds / 0.01)):
         variances = robot.fold(zeros).twist_variances
-    # one count of 20 in 10 ms, or in all of the rest: a side is the mean of two wheels
+    # One count of 20 within 10 ms, or within the whole rest. Each side is the mean of two wheels.
     count = 0.05 * 31.4 * 0.01 / max(0.01, seconds)
     assert variances.linear == pytest.approx(count**2 / 48, rel=0.1)
 
@@ -658,7 +665,8 @@ def test_a_robot_that_creeps_too_slowly_for_two_decimals_moves() -> None:
 def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
     coarse = Odometry(OdometryConfig(), Kinematics(DriveConfig()), 20)
     covariance = coarse.fold(feedback(0.0, 0.0, 0.01)).covariance
-    # a count is 15.7 mm, a wheel anywhere in it at the start and now; a side is two wheels' mean
+    # A count is 15.7 mm, and a wheel may be anywhere in it at the start and now. Each side is the
+    # mean of two wheels.
     count = 0.05 * math.tau / 20
     assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
     assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
@@ -675,7 +683,7 @@ def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
     assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}
 
 
-# whole counts of this line alone
+# whole counts of a single line
 
 
 def snapped(turned: float, dt: float = 0.01, speed: float = 9.99, bridged: float = 0.0) -> Feedback:
@@ -759,7 +767,7 @@ def test_a_learned_track_that_is_asked_for_and_not_known_changes_no_bit() -> Non
 
 
 def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
-    """A front left wheel is dead, and the track becomes another one before that is seen."""
+    """The front left wheel is dead, and the learned track changes before that is found."""
     asked = OdometryConfig(learned_track=True)
     liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
     told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
@@ -777,7 +785,10 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
 
 @pytest.mark.parametrize("share", [0.5, 1.6])
 def test_by_a_learned_track_it_is_as_uncertain_as_if_that_were_configured(share: float) -> None:
-    """Not only by its own error: noise, counts and their play are of the wheels, too."""
+    """A learned track affects more than its own error.
+
+    Wheel noise, counts and their play depend on it as well.
+    """
     asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
     asked.turn_by(Track(share, 0.02))
     asked.use(OdometryConfig(learned_track=True))

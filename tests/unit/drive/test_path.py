@@ -1,4 +1,4 @@
-"""A chain of arcs ends where exact arithmetic says."""
+"""The end of a chain of arcs agrees with exact arithmetic."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def test_a_sum_and_what_it_leaves_out_are_the_whole(a: float, b: float) -> None:
 
 
 def long_double_end(distances: list[float], turns: list[float]) -> tuple[float, float, float]:
-    """In 64 bits of mantissa, and 2 pi to as many; yaw within half a turn."""
+    """Return the end of the path with 64 bits of mantissa, and 2 pi to as many.
+
+    The yaw is within half a turn.
+    """
     two = np.longdouble
     tau = two(math.tau) + two("2.44929359829470635445e-16")
     turn, d = np.array(turns, dtype=two), np.array(distances, dtype=two)

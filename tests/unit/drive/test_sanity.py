@@ -1,4 +1,4 @@
-"""Impossible feedback is named, and a wheel that contradicts its command is a fault in time."""
+"""Impossible feedback is named, and a wheel that contradicts its command soon becomes a fault."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def only(wheel: int, speed: float, others: float = 0.0) -> WheelSpeeds:
 def watched(
     sent: WheelSpeeds, seen: WheelSpeeds, seconds: float = 3.0, jitter: float = 0.0
 ) -> tuple[float, str]:
-    """When the fault came, and its words; (inf, "") when none did."""
+    """Return the time and text of the fault, or (inf, "") if there is none."""
     sanity = Sanity(FeedbackConfig())
     for step in range(round(seconds / DT)):
         noisy = WheelSpeeds(*(s + jitter * (step % 2) for s in seen.as_tuple()))
@@ -41,7 +41,7 @@ def watched(
 
 
 def watched_after_driving(wheel: int, sent: float, seen: float, jitter: float = 0.0) -> str:
-    """The fault that comes within two seconds of this, after three of doing as told."""
+    """Return the fault within two seconds, after three seconds of correct driving."""
     sanity = Sanity(FeedbackConfig())
     told = only(wheel, sent)
     assert not any(sanity.watch(told, only(wheel, sent + step % 2 / 10), DT) for step in range(300))
@@ -50,12 +50,12 @@ def watched_after_driving(wheel: int, sent: float, seen: float, jitter: float = 
 
 
 def noisy(speeds: WheelSpeeds, step: int) -> WheelSpeeds:
-    """As encoders see it: never twice the same."""
+    """Return encoder speeds that differ from line to line, as real encoders do."""
     return WheelSpeeds(*(speed + 0.1 * (step % 2) for speed in speeds.as_tuple()))
 
 
 def driven(speed: float, settings: FeedbackConfig | None = None) -> Sanity:
-    """What has watched a robot do as it was told for three seconds."""
+    """Return a check that has watched a robot follow its commands for three seconds."""
     sanity, told = Sanity(settings or FeedbackConfig()), WheelSpeeds(speed, speed, speed, speed)
     assert not any(sanity.watch(told, noisy(told, step), DT) for step in range(300))
     return sanity
@@ -80,7 +80,7 @@ def test_a_change_no_wheel_makes_is_impossible_and_names_the_wheel(wheel: int) -
 
 
 def test_the_most_a_wheel_can_do_is_possible() -> None:
-    # 100 rad/s2 x 10 ms and 2 rad/s of slack
+    # The limit is 100 rad/s2 x 10 ms and 2 rad/s of slack.
     sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
     assert sanity.impossible(line(STILL)) == ""
     assert sanity.impossible(line(only(0, 3.0))) == ""
@@ -153,7 +153,7 @@ def stepping(speeds: WheelSpeeds, step: float, proven: bool = False) -> Feedback
 
 
 def test_a_count_more_or_less_at_each_end_is_no_change_of_speed() -> None:
-    # 100 rad/s2 x 10 ms, 2 rad/s of slack and twice 31.4 rad/s
+    # The limit is 100 rad/s2 x 10 ms, 2 rad/s of slack and twice 31.4 rad/s.
     sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
     assert sanity.impossible(stepping(STILL, 31.4)) == ""
     assert sanity.impossible(stepping(only(0, 65.7), 31.4)) == ""
@@ -213,13 +213,13 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
 @pytest.mark.parametrize(
     ("sent", "seen", "word"),
     [
-        # a tenth of 10 rad/s is not turning
+        # A tenth of 10 rad/s does not count as turning.
         (10.0, 0.9, "does not turn"),
         (10.0, 1.05, ""),
-        # three tenths of 10 rad/s backwards are a reversal
+        # Three tenths of 10 rad/s backward count as a reversal.
         (10.0, -3.1, "against its command"),
         (10.0, -2.9, ""),
-        # one and a half times 10 rad/s and 2 rad/s more are a runaway
+        # One and a half times 10 rad/s plus 2 rad/s counts as a runaway.
         (10.0, 17.1, "faster than commanded"),
         (10.0, 16.9, ""),
     ],
@@ -227,7 +227,7 @@ def test_a_contradiction_is_a_fault_within_a_second_and_names_the_wheel(
 def test_what_is_too_far_from_the_command_is_worked_by_hand(
     sent: float, seen: float, word: str, sign: float
 ) -> None:
-    # 0.04 rad/s of jitter, as nothing that changes is stuck
+    # A jitter of 0.04 rad/s keeps the wheel from looking stuck.
     fault = watched_after_driving(1, sign * sent, sign * seen, jitter=0.04)
     assert word in fault if word else fault == ""
 
@@ -239,7 +239,7 @@ def test_what_is_too_far_from_the_command_is_worked_by_hand(
 def test_a_constant_speed_more_than_two_and_three_tenths_away_is_stuck(
     seen: float, stuck: bool, sign: float
 ) -> None:
-    # 10 rad/s -+ (2 + 0.3 x 10) rad/s
+    # The band is 10 rad/s -+ (2 + 0.3 x 10) rad/s.
     fault = watched_after_driving(2, sign * 10.0, sign * seen)
     assert ("one and the same speed" in fault) is stuck
 
@@ -286,11 +286,11 @@ def test_a_robot_pushed_gently_by_hand_is_no_fault() -> None:
     assert watched(STILL, WheelSpeeds(1.9, 1.9, 1.9, 1.9))[1] == ""
 
 
-# hands
+# a person pushes the robot
 
 
 def pushed(sanity: Sanity, speed: float, seconds: float) -> tuple[list[str], list[float]]:
-    """The faults that hands make of it, and when they were told, s."""
+    """Return the faults while a person pushes the robot, and the times of reported pushes, s."""
     seen = WheelSpeeds(speed, speed, speed, speed)
     faults, told = [], []
     for step in range(round(seconds / DT)):
@@ -354,7 +354,8 @@ def test_a_push_while_a_commander_holds_almost_zero_is_none_either() -> None:
 def test_a_wheel_that_slows_down_slowly_is_no_fault_and_one_that_has_stopped_slowing_is(
     sign: float,
 ) -> None:
-    # by 5 rad/s2: 2 rad/s in less than half a second, as a robot that coasts
+    # At 5 rad/s2 the speed falls by 2 rad/s in less than half a second, like that of a coasting
+    # robot.
     sanity, speed, faults = driven(sign * 20.0), sign * 20.0, []
     while abs(speed) > 8.0:
         speed -= sign * 5.0 * DT
@@ -450,15 +451,15 @@ def test_a_wheel_that_is_sooner_than_it_was_said_to_be_is_no_fault(sign: float) 
 
 
 def test_a_healthy_wheel_is_expected_to_follow_by_its_response_time() -> None:
-    # A sixth of the way each step: after the second 10 (1 - (5/6)^2) = 3.06 rad/s, over 2 rad/s.
-    # Then eight more steps of 1/16 s are over half a second.
+    # Each step covers a sixth of the way. After the second step the model has 10 (1 - (5/6)^2) =
+    # 3.06 rad/s, over 2 rad/s. Eight more steps of 1/16 s then exceed half a second.
     sanity = Sanity(FeedbackConfig(response_time=0.3125, fault_time=0.5))
     found = [bool(sanity.watch(TEN, STILL, 0.0625)) for _ in range(10)]
     assert found == [False] * 9 + [True]
 
 
 def test_a_model_that_has_just_reached_the_slack_is_not_yet_moving() -> None:
-    # A quarter of the way to 8 rad/s is 2 rad/s: step 2 is the first of nine that count.
+    # A quarter of the way to 8 rad/s is 2 rad/s, so step 2 is the first of nine that count.
     sanity = Sanity(FeedbackConfig(response_time=0.1875, fault_time=0.5))
     eight = WheelSpeeds(8.0, 8.0, 8.0, 8.0)
     found = [bool(sanity.watch(eight, STILL, 0.0625)) for _ in range(10)]

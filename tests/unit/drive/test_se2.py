@@ -1,4 +1,4 @@
-"""Errors as motions in SE(2): compared with 3x3 matrices."""
+"""Tests of errors as motions in SE(2), compared with 3x3 matrices."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def covariance(root: list[float]) -> PoseCovariance:
 
 
 def ad(v: Vector) -> Array:
-    """The matrix of [v, .]."""
+    """Return the matrix of the Lie bracket with v, [v, .]."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [0.0, 0.0, 0.0]])
 
 
@@ -90,7 +90,7 @@ def test_brackets_correlate_with_what_they_are_of(
 def test_the_covariance_of_a_bracket_is_that_of_all_its_directions(
     p_root: list[float], q_root: list[float]
 ) -> None:
-    # errors along the columns of the roots, each +-1 deviation: all their pairs
+    # The errors lie along the columns of the roots, each at +-1 deviation, in all pairs.
     p, q = np.array(p_root).reshape(3, 3), np.array(q_root).reshape(3, 3)
     every = [ad(tuple(a)) @ b for a in p.T for b in q.T]
     expected = np.sum([np.outer(one, one) for one in every], axis=0)

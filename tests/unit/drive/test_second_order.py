@@ -1,4 +1,4 @@
-"""What is of second order, against errors that are composed one by one."""
+"""Tests of the second-order terms, against errors that are composed one by one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ def heading(variance: float) -> PoseCovariance:
 
 
 def straight(metres: int, yaw: float, column: float) -> tuple[SecondOrder, PoseCovariance]:
-    """Stretches of 0.1 m, each with so much variance of yaw, and a column's bend in it."""
+    """Return the covariance after stretches of 0.1 m.
+
+    Each stretch has this yaw variance and parameter column.
+    """
     second, p = SecondOrder(1), NONE
     j = (0.0, 0.0, 0.0)
     for _ in range(10 * metres):
@@ -31,7 +34,7 @@ def straight(metres: int, yaw: float, column: float) -> tuple[SecondOrder, PoseC
 
 
 def sampled(metres: int, yaw: float, column: float) -> float:
-    """The mean square along the way of the bracket terms of 20 000 such ways."""
+    """Return the mean square of the bracket terms along the path over 20,000 such paths."""
     rng = np.random.default_rng(1)
     n = 20_000
     p = rng.standard_normal(n)

@@ -1,4 +1,4 @@
-"""Lines a second, whatever happens: the first at once, the rest counted."""
+"""The log gets a bounded number of lines per second: the first at once, the rest as a count."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def mode(change: str = "ready -> driving") -> Event:
 
 
 def told(events: list[Event], seconds: float, every_ms: int = 10) -> list[Event]:
-    """What a tally says that is given these every so often for so long."""
+    """Return the lines after these events every `every_ms` for this many seconds."""
     tally = Tally()
     lines: list[Event] = []
     for step in range(round(seconds * 1000 / every_ms)):

@@ -1,4 +1,4 @@
-"""Modes, commanders and refused commands as the log has them."""
+"""Tests of the log lines about modes, commanders and refused commands."""
 
 from __future__ import annotations
 

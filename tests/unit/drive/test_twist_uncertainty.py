@@ -1,4 +1,4 @@
-"""The variances of one report's twist."""
+"""Tests of the variances of one report's twist."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ def uncertainty(config: OdometryConfig = EXACT, counts: int = 0) -> TwistUncerta
 
 
 def test_two_decimals_are_the_turnings_least_doubt() -> None:
-    # four wheels of 0.01^2 / 12 rad2/s2 each, a quarter of their sum and the sides' difference
+    # Four wheels have 0.01^2 / 12 rad2/s2 each. The twist uses a quarter of their sum, and the
+    # difference of the sides.
     variances = uncertainty().of(Twist(0.5, 0.0), 0.01)
     assert variances.angular == pytest.approx(0.05**2 * 1e-4 / 12 / 0.3**2)
     assert variances.linear == LEAST > 0.05**2 * 1e-4 / 48
 
 
 def test_counts_are_coarser_than_decimals() -> None:
-    # 400 counts: one in 10 ms is 1.570796 rad/s
+    # With 400 counts, one count in 10 ms is 1.570796 rad/s.
     variances = uncertainty(counts=400).of(Twist(0.5, 0.0), 0.01)
     assert variances.linear == pytest.approx(0.05**2 * 1.570796**2 / 48)
     assert variances.angular == pytest.approx(0.05**2 * 1.570796**2 / 12 / 0.09)
@@ -41,7 +42,7 @@ def test_counts_that_the_lines_show_are_as_coarse_as_those_that_are_configured()
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_noise_is_that_of_a_period_over_its_square(sign: float) -> None:
-    # 1e-4 m2/m x 0.5 m/s / 0.01 s, and 1e-4 rad2/m x 0.5 m/s / 0.01 s
+    # The noise is 1e-4 m2/m x 0.5 m/s / 0.01 s and 1e-4 rad2/m x 0.5 m/s / 0.01 s.
     variances = uncertainty(OdometryConfig()).of(Twist(0.5 * sign, 0.0), 0.01)
     assert variances.linear == pytest.approx(5e-3, rel=1e-3)
     assert variances.angular == pytest.approx(5e-3, rel=1e-3)
@@ -56,7 +57,8 @@ def test_parameters_scale_the_speed() -> None:
         right_wheel_radius_multiplier_std=0.02,
         wheel_separation_multiplier_std=0.03,
     )
-    # 0.02 of each side's half of 1 m/s; and of 2 rad/s 0.03, beside the radii's in 0.3 m
+    # The radii add 0.02 of each side's half of 1 m/s. The turn of 2 rad/s adds 0.03, and the radii
+    # over 0.3 m.
     variances = uncertainty(both).of(Twist(1.0, 0.0), 0.01)
     assert variances.linear == pytest.approx(2 * (0.02 * 0.5) ** 2, rel=1e-3)
     assert variances.angular == pytest.approx(2 * (0.02 / 0.3) ** 2, rel=1e-3)

@@ -1,7 +1,7 @@
-"""The published covariance against robots whose wheels err as declared: NEES over many runs.
+"""NEES of the published covariance over many robots whose wheels err as declared.
 
-The mean of 1000 runs is within 2.85 to 3.15 nineteen times in twenty if it is 3; here the seeds are
-fixed. `-m soak -s` prints the figures of all.
+If the true mean is 3, the mean of 1000 runs is within 2.85 to 3.15 nineteen times in twenty. Here
+the seeds are fixed. `-m soak -s` prints all figures.
 """
 
 from __future__ import annotations
@@ -52,8 +52,10 @@ MODELS = {
 }
 
 FAR = {"straight", "there and back"}
-"""Where the place along the way errs by the square of the heading alone: no Gaussian has both its
-variance and its tails. The variance is right."""
+"""Scenarios in which the error along the path depends only on the square of the heading error.
+
+No Gaussian has both its variance and its tails. The published variance is right.
+"""
 
 
 def check(values: Array, name: str, low: float = 0.93, spare: float = 0.0) -> None:
@@ -70,7 +72,8 @@ def test_the_covariance_tells_the_truth(scenario: str, model: str) -> None:
     drives = 50 if scenario == "random" else 1
     chosen = MODELS[model]
     if scenario == "straight" and chosen.radius_std:
-        # 0.2 % of each radius are 0.57 rad at the end of 60 m; of fourth order that is NEES 3.2
+        # An error of 0.2 % in each radius gives 0.57 rad at the end of 60 m. To fourth order that
+        # is NEES 3.2.
         chosen = replace(chosen, radius_std=0.001)
     values = study(SCENARIOS[scenario], chosen, runs=4000, drives=drives)
     check(values, f"{scenario}, {model}", 0.905 if scenario in FAR else 0.93)
@@ -95,7 +98,10 @@ def test_the_covariance_of_a_short_drive_tells_the_truth(legs: Scenario, model: 
 
 
 def bursts(a_minute: float) -> Heard:
-    """Loses 0.1 to 0.5 s of lines so often; the lines' neighbours stand in for them."""
+    """Return a function that loses 0.1 to 0.5 s of lines this many times a minute.
+
+    Values between the neighbouring lines replace the lost ones.
+    """
 
     def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
         lost, at = np.zeros(len(drive), dtype=bool), 0
@@ -124,7 +130,7 @@ def test_bridged_bursts_get_the_covariance_they_deserve(model: str) -> None:
 
 @pytest.mark.slow
 def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
-    """50 gaps of 150 ms that the pose stands through."""
+    """The drive has 50 gaps of 150 ms in which the pose does not move."""
     rng = np.random.default_rng(5)
     drive = reports([(0.5, 0.02, 60.0)])
     lines, at = [], 0
@@ -147,7 +153,10 @@ def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
 
 
 def counting(counts: int) -> Heard:
-    """Lines with what the wheels' counters say, each wheel having started anywhere in a count."""
+    """Return a function that makes lines from wheel counters.
+
+    Each counter starts anywhere within a count.
+    """
 
     def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
         wheels = drive[:, [1, 0, 0, 1]] * PERIOD / math.tau * counts
@@ -193,7 +202,8 @@ def uncertainty(model: Model = DEFAULT, **changes: float) -> PoseUncertainty:
 
 
 def test_what_is_known_by_calibration_makes_the_pose_less_certain_by_its_deviation() -> None:
-    # 10 m straight; the right wheels' radius is 0.2 % off: 0.01 m short and 20 mm / 0.3 m of yaw
+    # After 10 m straight with the right wheels' radius off by 0.2 %, 0.01 m of length and 20 mm /
+    # 0.3 m of yaw are wrong.
     one = PoseUncertainty(
         OdometryConfig(
             distance_variance_per_metre=0.0,
@@ -210,7 +220,8 @@ def test_what_is_known_by_calibration_makes_the_pose_less_certain_by_its_deviati
     p = one.covariance
     assert math.sqrt(p.yawyaw) == pytest.approx(0.02 / 0.3)
     assert math.sqrt(p.yy) == pytest.approx(0.02 / 0.3 * 10.0 / 2, rel=1e-3)
-    # 0.01 m of length; a circle of 1/15 rad is chord and 10 m x yaw2 / 12 off it: sqrt(3) x 3.7 mm
+    # The length is off by 0.01 m. A circle of 1/15 rad differs from its chord by 10 m x yaw2 / 12:
+    # sqrt(3) x 3.7 mm.
     bent = 10.0 * (0.02 / 0.3) ** 2 / 12
     assert math.sqrt(p.xx) == pytest.approx(math.hypot(0.01, math.sqrt(3) * bent), rel=1e-2)
 
@@ -226,7 +237,8 @@ def test_the_error_of_a_radius_is_driven_back_with_the_way() -> None:
 
 
 def test_a_heading_error_that_comes_and_goes_shortens_a_straight() -> None:
-    # 60 m at k = 1e-5: q = 2 k / L2 of yaw a metre; the area between way and chord has q2 s4 / 48
+    # 60 m at k = 1e-5 gives q = 2 k / L2 of yaw per metre. The area between path and chord has the
+    # variance q2 s4 / 48.
     drive = reports([(1.0, 0.0, 60.5), (0.0, 0.0, 1.0)])
     length = float(drive.mean(axis=1).sum()) * 0.05 * PERIOD
     q = WHEELS.yaw
@@ -241,7 +253,7 @@ def test_turning_to_and_fro_counts_both_ways(turns: float) -> None:
     one = uncertainty()
     for turn in [0.01 * turns] * 100 + [-0.01 * turns] * 100:
         one.advance(0.0, turn, 0.0, 0.0, 0.0)
-    # 2 rad, less the play at the start and twice that at the turn
+    # The robot turns by 2 rad, less the play at the start and twice that at the reversal.
     assert one.covariance.yawyaw == pytest.approx(2e-2, rel=0.01)
 
 
@@ -251,7 +263,7 @@ def test_trembling_within_a_count_is_no_turning() -> None:
     for _ in range(10_000):
         one.advance(0.0, 0.001, 0.0, 0.0, 0.0)
         one.advance(0.0, -0.001, 0.0, 0.0, 0.0)
-    # 2 x 1000 m of wheels are counted as such: 1.5e-5 a radian
+    # The wheels' path of 2 x 1000 m counts as such: 1.5e-5 per radian.
     assert one.covariance.yawyaw - start < 1e-1 * 20.0 * 1e-2
 
 
@@ -283,7 +295,7 @@ def test_what_is_configured_counts_before_what_the_lines_show() -> None:
 def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_they_make_it(
     counts: int,
 ) -> None:
-    """From its bytes, with nothing configured."""
+    """The session finds the counts in the bytes; nothing is configured."""
     session, odometry = (
         McuSession(McuConfig(), 100.0),
         Odometry(OdometryConfig(), Kinematics(DriveConfig())),

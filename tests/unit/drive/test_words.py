@@ -1,4 +1,4 @@
-"""The sentences that `state` and `diagnostics` say of the arbiter's decisions."""
+"""Tests of the sentences about the arbiter's decisions in `state` and `diagnostics`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Random drives, the lines made of them, and how far odometry by those lines is off the truth.
+"""Random drives, the lines made from them, and the error of odometry that uses those lines.
 
-The path is the truth. Lines are made from it with one cause of error switched on, and added up as
-odometry does, in numpy: it shares no code with the budget that it judges.
+The path is the truth. Lines are made from it with one cause of error switched on, and summed as
+odometry does, in numpy. This module shares no code with the budget that it judges.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ Array = npt.NDArray[np.floating[Any]]
 GRID, PERIOD = 0.001, 0.01
 RADIUS, TRACK = 0.05, 0.30
 RIPPLE = 0.03
-"""rad/s by which each side's speed varies from report to report: no wheel turns more evenly."""
+"""Variation of each side's speed from report to report, rad/s.
+
+Real wheels do not turn more evenly.
+"""
 
 
 class Told(Struct, frozen=True):
-    """The lines of a drive, and where it truly ended beside where they say."""
+    """The lines of a drive and the distance between its true end and the end they give."""
 
     lines: list[Line]
     metres: float
     off: float
-    """m, of the place at the end."""
+    """Error of the final position, m."""
 
 
 class Drive:
@@ -56,7 +59,10 @@ class Drive:
         dt: Array,
         kept: npt.NDArray[np.bool_] | None = None,
     ) -> Told:
-        """Odometry adds up speeds x dt of lines with these stamps; `kept` are those that came."""
+        """Sum speeds x dt of the lines with these stamps, as odometry does.
+
+        `kept` marks the lines that arrive.
+        """
         x, y, _ = _path(np.diff(self.left), np.diff(self.right))
         moved = left * dt, right * dt
         ex, ey, eyaw = _path(*moved)
@@ -72,12 +78,15 @@ class Drive:
         return Told(lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])))
 
     def speeds(self) -> tuple[Array, Array]:
-        """rad/s, the mean of each period."""
+        """Return the mean speeds of each period, rad/s."""
         return np.diff(self.left) / PERIOD, np.diff(self.right) / PERIOD
 
 
 def late(seed: int, seconds: float, how: str) -> Told:
-    """Stamps are when lines were read: through an adapter that holds them, or a busy host."""
+    """Return a drive whose stamps are the times at which the host read the lines.
+
+    The lines pass a batching adapter, or the host is busy.
+    """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
     true, rng = drive.t[1:], drive.rng
@@ -97,7 +106,10 @@ def late(seed: int, seconds: float, how: str) -> Told:
 
 
 def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
-    """Two decimals; of a firmware that counts edges in a period, so many of them a turn."""
+    """Return a drive with speeds in two decimals.
+
+    With `counts`, the firmware counts this many edges per turn in each period.
+    """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
     if counts:
@@ -112,8 +124,10 @@ def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
 
 
 def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = False) -> Told:
-    """So many of the lines do not come, up to `longest` in a row; across a loss the next line's
-    speed counts for all of it, or the pose `stands`."""
+    """Return a drive that loses this share of its lines, up to `longest` in a row.
+
+    After a loss the next line's speed covers all of the missing time, or the pose `stands`.
+    """
     drive = Drive(seed, seconds)
     left, right = drive.speeds()
     kept = np.ones(len(left), dtype=bool)
@@ -136,7 +150,10 @@ def _path(left: Array, right: Array) -> tuple[Array, Array, Array]:
 
 
 def _ramped(rng: np.random.Generator, count: int, lowest: float, most: float, rate: float) -> Array:
-    """A speed that goes at `rate` to one random target after the other, a sixth of them zero."""
+    """Return a speed that moves at `rate` between random targets.
+
+    A sixth of the targets are zero.
+    """
     targets: list[float] = []
     while len(targets) < count:
         target = 0.0 if rng.random() < 1 / 6 else float(rng.uniform(lowest, most))

@@ -1,4 +1,4 @@
-"""The error budget against drives in which one cause alone makes odometry wrong."""
+"""Tests of the error budget against drives with exactly one cause of error."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def share(found: Budget, cause: Cause) -> Share:
 
 
 def as_predicted(case: str, seconds: float, seeds: int) -> float:
-    """The rms, over drives, of the error at the end as a share of what the budget says."""
+    """Return the rms over drives of the final error divided by the error in the budget."""
     cause, make = CASES[case]
     ratios = []
     for seed in range(seeds):
@@ -71,7 +71,7 @@ def test_the_share_of_a_cause_is_within_half_of_the_error_it_makes_in_450_m(case
     assert 1 / 1.5 < ratio < 1.5
 
 
-# what is not driven, not measured, or a gyro's
+# robots that do not drive, causes that are not measured, and a gyro
 
 
 def driven() -> Told:
@@ -134,8 +134,11 @@ def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
 
 
 def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
-    """Of a gyro whose noise is 1e-6 rad2 in each line that moves, and whose scale errs by all that
-    was turned since the pose was set, `before` turns of it before these lines."""
+    """Return the gyro's share of the budget.
+
+    The gyro's noise is 1e-6 rad2 in each line that moves. Its scale error grows with all turns
+    since the pose was set; `before` of them precede these lines.
+    """
     heading, noise, made = before * math.tau, 0.0, list[Line]()
     for last, line in pairwise([lines[0], *lines]):
         heading += math.remainder(line.yaw - last.yaw, math.tau)
@@ -183,7 +186,7 @@ def test_of_lines_that_did_not_all_come_here_nothing_is_told_of_time() -> None:
 
 
 def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
-    """The front right wheel reports nothing: its side's mean is half of what it was."""
+    """The front right wheel reports nothing, so the mean of its side is half of the true value."""
     lines = [
         replace(line, positions=(0.0, *line.positions[1:]), speeds=(0.0, *line.speeds[1:]))
         for line in driven().lines

@@ -1,4 +1,4 @@
-"""What a robot did and what of it erred, from its lines."""
+"""Tests that derive the motion of a robot and its errors from its lines."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from acsard.error_budget.drive_log import Line, motion
 
 KINEMATICS = Kinematics(DriveConfig())
 SPEED, PERIOD = 10.0, 0.01
-"""rad/s of all wheels: 0.5 m/s."""
+"""Speed of all wheels, rad/s; this is 0.5 m/s."""
 NONE = np.zeros(0)
 
 
 def ahead(at: list[float], moved: list[float] | None = None) -> list[Line]:
-    """Straight on; `moved` is by how much odometry moved with each line, rad."""
+    """Return lines of a straight drive; `moved` is the motion of odometry in each line, rad."""
     speeds = (SPEED,) * 4
     steps = [SPEED * PERIOD] * len(at) if moved is None else moved
     turned = np.cumsum(steps).tolist()

@@ -1,4 +1,4 @@
-"""Messages of a daemon become lines with what was made of them."""
+"""Tests that turn the daemon's messages into lines with their odometry."""
 
 from __future__ import annotations
 

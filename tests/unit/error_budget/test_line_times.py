@@ -1,4 +1,4 @@
-"""Where lines belong, and which are missing, by their stamps."""
+"""Tests that find each line's slot and the missing lines from their stamps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_the_period_need_not_be_known(period: float) -> None:
 
 def test_a_line_that_is_read_late_is_late_and_not_missing() -> None:
     late = EVEN.copy()
-    late[300:308] = late[308]  # a stall of the host: all are read at its end
+    late[300:308] = late[308]  # a stall of the host delays all reads to its end
     found = places(late, NONE)
     assert not found.missing.any()
     assert found.late[300] == pytest.approx(0.08, abs=0.002)
@@ -37,7 +37,7 @@ def test_a_line_that_is_read_late_is_late_and_not_missing() -> None:
 def test_an_adapter_that_holds_lines_loses_none() -> None:
     found = places(np.ceil(EVEN / 0.016) * 0.016, NONE)
     assert not found.missing.any()
-    assert 0.003 < float(np.std(found.late)) < 0.006  # 16 ms even: 4.6
+    assert 0.003 < float(np.std(found.late)) < 0.006  # a uniform delay over 16 ms has 4.6
 
 
 @pytest.mark.parametrize("gone", [1, 2, 5, 20])

@@ -1,4 +1,4 @@
-"""What two decimals leave unsaid, against sums of what they did."""
+"""Tests of the error of two decimals, against sums of actual rounding errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ def four(*columns: Floats) -> Floats:
 @pytest.mark.slow
 @pytest.mark.parametrize("ripple", [0.0, 0.03])
 def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
-    """A steady wheel errs the same way all the time, one that trembles ever anew."""
+    """A steady wheel has the same rounding error all the time.
+
+    A wheel that trembles has a new one in each line.
+    """
     rng = np.random.default_rng(1)
     errors, told = [], []
     for _ in range(60):
@@ -31,7 +34,7 @@ def test_the_variance_is_that_of_the_rounding_errors_sum(ripple: float) -> None:
 
 
 def test_a_wheel_that_passes_through_its_speeds_hardly_errs() -> None:
-    true = np.linspace(0.0, 10.0, 20_000)  # twenty lines at each hundredth
+    true = np.linspace(0.0, 10.0, 20_000)  # twenty lines for each hundredth
     said = np.round(true, 2)
     found = rounding(four(said, said, said, said), PERIOD)
     assert math.sqrt(found.variance[:, 0].sum()) < 20 * 0.01 * PERIOD

@@ -1,4 +1,4 @@
-"""Driving as steps: nothing of the way is lost, and each cause is in its step."""
+"""Driving is cut into steps: no part of the path is lost, and each cause stays in its step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The error budget in words."""
+"""Tests of the error budget as text."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DRIVEN = Budget(
 
 
 def of(*shares: tuple[Cause, float | None, Basis], **fields: Any) -> Budget:
-    """Shares by cause, mm and where they are from."""
+    """Return a budget with these shares by cause, error in mm and basis."""
     made = tuple(Share(cause, mm, mm, basis) for cause, mm, basis in shares)
     return replace(DRIVEN, shares=made, **fields)
 

@@ -1,4 +1,4 @@
-"""Viewers come from this machine only."""
+"""Viewers may connect only from this machine."""
 
 from __future__ import annotations
 

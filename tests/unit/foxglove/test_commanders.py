@@ -1,4 +1,4 @@
-"""A command that is seen live is the message that an export has of it, whatever way it came."""
+"""A command shown live equals the message in an export, whichever way it arrived."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_source_commands_on_its_native_keys_and_those_of_ros() -> None:
     assert {way.via for way in nav.values()} == {"native", "bridge", "rmw"}
     native = {way.native for way in nav.values()}
     assert native == {"cmd/nav", "wheel_cmd/nav", "cmd/nav/*", "wheel_cmd/nav/*"}
-    assert len(nav) == 4 + 1 + 2  # over rmw a topic of two types has two keys
+    assert len(nav) == 4 + 1 + 2  # over rmw, a topic with two types has two keys
 
 
 def test_all_keys_of_ros_that_command_are_somebody_s() -> None:

@@ -1,4 +1,4 @@
-"""What of a viewer's commands reaches the bus, with which stamp, and when the bus makes trouble."""
+"""Tests of the viewer's commands that reach the bus, of their stamps, and of a bus that fails."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ HOLD_S = 5.0
 
 
 class Session:
-    """Takes what is put, as the daemon would hear it, or does to it what a bus in trouble does."""
+    """A session that records puts as the daemon would receive them.
+
+    It can also block or fail like a broken bus.
+    """
 
     def __init__(self) -> None:
         self.heard: list[Command] = []
@@ -56,7 +59,7 @@ class Session:
 
 
 class Viewers:
-    """Each with a session of its own."""
+    """Viewers with one session each."""
 
     def __init__(self) -> None:
         self.sessions: dict[int, Session] = {1: Session(), 2: Session()}
@@ -76,7 +79,7 @@ class Viewers:
         self.drives.came(viewer, channel, encode(message, "cdr"))
 
     def heard(self, viewer: int, count: int) -> list[Command]:
-        """At least so many."""
+        """Wait until this viewer has sent at least `count` commands, and return them."""
         heard = self.sessions[viewer].heard
         until(lambda: len(heard) >= count, HOLD_S, f"{count} commands of {viewer}, not {heard}")
         return heard
@@ -121,7 +124,8 @@ def test_what_waited_behind_another_s_bus_that_is_locked_is_too_old_to_go(
         viewers.heard(viewer, 2)
     first, second = viewers.sessions.values()
     first.locked = True
-    with viewers.drives._news:  # its thread waits for it: both fall due in one round
+    # the sender thread waits for this lock, so both commands fall due in one round
+    with viewers.drives._news:
         for viewer in viewers.sessions:
             viewers.publish(viewer, AHEAD)
         given_ns = clock.mono_ns()

@@ -1,4 +1,4 @@
-"""What a viewer is offered follows from what is known of the robot."""
+"""The topics offered to a viewer follow from the known facts about the robot."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SOURCES = ("teleop", "app")
 
 
 def topics(config: Config) -> dict[str, str]:
-    """The key on the bus of each topic."""
+    """Return the bus key of each topic."""
     rows = Facts(config, None, SOURCES, "").rows()
     return {row.topic(config.ros.namespace, name): key_of(row, name) for row, name in rows}
 

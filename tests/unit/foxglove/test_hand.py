@@ -1,4 +1,4 @@
-"""What of a viewer's messages goes to the robot, and when."""
+"""Tests of the viewer's messages that are sent to the robot, and of their times."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ MS = NS_PER_S // 1000
 
 
 class Panel:
-    """A hand, a clock, and what has gone."""
+    """A commander with a clock and a record of the twists it sent."""
 
     def __init__(self) -> None:
         self.hand, self.now = Hand(), 10 * NS_PER_S
         self.gone: list[Twist] = []
 
     def wait(self, span_ns: int) -> None:
-        """Time passes, and all that falls due in it goes."""
+        """Let time pass and send everything that falls due."""
         end = self.now + span_ns
         while (due := self.hand.due_ns()) is not None and due <= end:
             self.now = max(self.now, due)

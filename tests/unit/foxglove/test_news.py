@@ -1,4 +1,4 @@
-"""The daemon's events are lines of the log, each once."""
+"""Each of the daemon's events becomes exactly one line of the log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KEPT = 20
 
 
 def events(total: int, of: str = "first") -> Events:
-    """What a daemon says when so many have happened."""
+    """Return the daemon's events after this many of them."""
     kept = range(max(0, total - KEPT), total)
     told = [Happening(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
     return Events(Time(total), total, told)

@@ -1,4 +1,4 @@
-"""Who drives in vain is told why, once."""
+"""A viewer whose commands have no effect gets the reason once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live settings are a viewer's parameters, all of them and no others."""
+"""A viewer's parameters are exactly the live settings."""
 
 from __future__ import annotations
 

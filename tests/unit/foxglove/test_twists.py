@@ -1,4 +1,4 @@
-"""A viewer's message is taken whole or refused with the reason."""
+"""A viewer's message is accepted whole or refused with the reason."""
 
 from __future__ import annotations
 

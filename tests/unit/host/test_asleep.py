@@ -1,4 +1,4 @@
-"""A computer that was suspended is told once."""
+"""A suspend of the computer is reported once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Both clocks are of one moment, also where the machine takes the core between them."""
+"""Both clocks are read for the same moment, even if the process loses its core in between."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ WALL_NS = 1_800_000_000_000_000_000
 
 
 class Machine:
-    """Takes the core for 0.2 s right before the wall clock is read, as often as told."""
+    """A machine that takes the core away for 0.2 s, `takes` times.
+
+    It does so right before the wall clock is read.
+    """
 
     def __init__(self, takes: int) -> None:
         self.takes, self.ns = takes, 5_000_000_000

@@ -1,4 +1,4 @@
-"""When what is written may be coloured."""
+"""Tests of the conditions under which output has colours."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from acsard.values import Event
 
 @pytest.fixture(name="terminal")
 def _terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, TextIO]]:
-    """Both ends of a terminal that knows colours."""
+    """Yield both ends of a terminal that supports colours."""
     monkeypatch.delenv("NO_COLOR", raising=False)
     monkeypatch.setenv("TERM", "xterm-256color")
     ours, theirs = os.openpty()

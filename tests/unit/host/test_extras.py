@@ -1,4 +1,4 @@
-"""What an error tells to type for a library that is missing."""
+"""Tests of the install command that an error gives for a missing library."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.system.harness import ROOT
 
 
 def installed(where: Path, **direct: object) -> Distribution:
-    """A distribution with two extras, installed from `direct`."""
+    """Return a distribution with two extras that was installed from `direct`."""
     info = where / "acsard-1.dist-info"
     info.mkdir()
     lines = ["Name: acsard", "Requires-Dist: zenoh", "Requires-Dist: one<2,>=1; extra == 'lan'"]
@@ -50,7 +50,8 @@ def test_from_nobody_knows_where_it_is_the_libraries_alone(tmp_path: Path) -> No
 @pytest.mark.parametrize("extra", get_args(Extra))
 def test_what_is_told_is_for_the_venv_at_hand(extra: Extra) -> None:
     words = shlex.split(install(extra))
-    if not os.access(sys.prefix, os.W_OK):  # who tests need not be who installed
+    # the user who runs the tests may not be the one who installed
+    if not os.access(sys.prefix, os.W_OK):
         assert words.pop(0) == "sudo"
     assert words[:4] == [sys.executable, "-m", "pip", "install"]
     assert words[-1] == f"{ROOT}[{extra}]"

@@ -1,4 +1,4 @@
-"""Changing an acsard.toml: comments stay, and so does the file when it cannot be changed."""
+"""Edits to an acsard.toml keep its comments, and a failed edit leaves the file unchanged."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KEYS: dict[str, object] = {
 
 
 def changed(file: Path) -> list[tuple[str, str]]:
-    """The lines that differ from the reference's."""
+    """Return the lines that differ from those of the reference file."""
     pairs = zip(REFERENCE.read_text().splitlines(), file.read_text().splitlines(), strict=True)
     return [(before, after) for before, after in pairs if before != after]
 

@@ -1,4 +1,4 @@
-"""The journal's own protocol on a real datagram socket: fields that can be asked for."""
+"""The journal's own protocol on a real datagram socket gives fields that a query can select."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Journal:
         self._socket.settimeout(5.0)
 
     def entry(self) -> dict[str, str]:
-        """The next entry's fields."""
+        """Return the fields of the next entry."""
         return fields(self._socket.recv(65536).decode())
 
     def close(self) -> None:
@@ -37,12 +37,15 @@ class Journal:
 
 
 def fields(text: str) -> dict[str, str]:
-    """A datagram, where each line must be NAME=value with a name the journal takes."""
+    """Parse a datagram in which each line must be NAME=value.
+
+    The journal must accept the name.
+    """
     found: dict[str, str] = {}
     for line in text.removesuffix("\n").split("\n"):
         name, equals, value = line.partition("=")
         assert equals, f"{line!r} is no assignment"
-        # Others are dropped by the journal in silence.
+        # The journal drops other names without a message.
         assert name.replace("_", "").isalnum(), name
         assert name.isascii(), name
         assert name == name.upper(), name
@@ -64,7 +67,7 @@ def rendered(**line: Any) -> dict[str, str]:
     return fields(render(None, "info", line))
 
 
-# what a line becomes
+# fields of a log line
 
 
 def test_an_event_is_its_message_and_its_fields() -> None:

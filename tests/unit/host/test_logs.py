@@ -1,4 +1,4 @@
-"""A line of the log: its fields, and that no value of it can be more than a value."""
+"""Tests of a log line: its fields, and that no value can break out of its field."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from acsard.values import Event
 def written(
     path: Path, *events: Event, form: Literal["json", "console", "logfmt"] = "json"
 ) -> list[str]:
-    """The lines that a log of this form has after these events."""
+    """Return the lines of a log in this format after these events."""
     with (path / "log").open("w+") as stream:
         log = Log(LogConfig(format=form), stream)
         for event in events:

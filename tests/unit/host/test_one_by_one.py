@@ -1,4 +1,4 @@
-"""The terminal of who drives by keys."""
+"""Tests of the terminal that reads single keys for keyboard driving."""
 
 from __future__ import annotations
 

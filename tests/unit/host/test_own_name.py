@@ -1,4 +1,4 @@
-"""What a process calls itself, whoever runs it."""
+"""Tests of the name that a process gives itself, for any user."""
 
 from __future__ import annotations
 

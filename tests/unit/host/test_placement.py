@@ -1,4 +1,4 @@
-"""Where a service cannot run from: homes, and venvs that borrow a Python from one."""
+"""A service cannot run from a home directory or from a venv that uses a Python in one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from acsard.host.placement import misplaced
 
 PROGRAM = "/usr/bin/env"
-"""Everybody may run it."""
+"""A program that every user may run."""
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The usual boards, in code and in the rules that are copied to a machine."""
+"""The list of usual boards in the code agrees with the udev rules that are installed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who has a device open: on ptys of our own."""
+"""Tests that find the processes that have a device open, on ptys of this process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ sys.stdin.read()
 
 @contextmanager
 def another(path: str, *words: str) -> Iterator[int]:
-    """A process that has the device open, locked with a word more; its pid."""
+    """Yield the pid of a process that has the device open.
+
+    A further word makes it lock the device.
+    """
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, path, *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
@@ -40,7 +43,7 @@ def another(path: str, *words: str) -> Iterator[int]:
 
 @pytest.fixture
 def device() -> Iterator[str]:
-    """A pty whose ends we both have open."""
+    """Yield a pty of which this process has both ends open."""
     ends = pty.openpty()
     yield os.ttyname(ends[1])
     for end in ends:
@@ -110,4 +113,4 @@ def test_who_has_to_wait_for_a_processor_is_seen_to() -> None:
         for one in two:
             one.kill()
             one.wait()
-    assert waited_ns(two[0].pid) == 0  # it has ended
+    assert waited_ns(two[0].pid) == 0  # the process has ended

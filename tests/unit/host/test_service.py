@@ -1,4 +1,4 @@
-"""The service's files and commands: which steps, when."""
+"""Tests of the service's files and commands: the steps and their conditions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ALL = [UNIT_FILE, DOOR_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
 
 
 def there(**other: bytes | None) -> Found:
-    """All files as installed, but for these."""
+    """Return a machine with all files installed, except for these."""
     names = {
         "unit": UNIT_FILE,
         "door": DOOR_FILE,
@@ -87,7 +87,7 @@ def test_all_that_is_as_installed_is_removed() -> None:
 
 
 def test_a_unit_that_is_not_there_is_not_disabled() -> None:
-    """As after an upgrade from a version without a door or a page."""
+    """The machine was upgraded from a version without TLS gateway and page."""
     leaving, *_ = uninstalling(ALL, there(door=None, page=None), force=False)
     assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 
@@ -151,7 +151,7 @@ def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
     cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
     assert kept == (set() if purge else {where for where, _ in STATES.values()})
     assert cleans & {*steps} == (cleans if purge else set())
-    if purge:  # while systemd still knows the units, which do not run any more
+    if purge:  # the units have stopped, but systemd still knows them
         assert {*steps[1:3]} == cleans
 
 

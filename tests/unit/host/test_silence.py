@@ -1,4 +1,4 @@
-"""How long somebody has been silent, for one who was there to hear it."""
+"""Tests of the duration of a silence, measured only while the listener itself was running."""
 
 from __future__ import annotations
 

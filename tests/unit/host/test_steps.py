@@ -1,4 +1,4 @@
-"""What is done to a machine: files and directories are made and removed, commands run."""
+"""Tests of the steps on a machine: files and directories are made and removed, commands run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the service manager hears, on a real datagram socket: right, seldom, never waited for."""
+"""Messages to the service manager on a real datagram socket are correct, rare and never block."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HALF = Twist(0.5, 0.0)
 
 
 class Manager:
-    """A service manager's end of the socket."""
+    """The service manager's end of the socket."""
 
     def __init__(self, address: str) -> None:
         self.address = address
@@ -32,7 +32,7 @@ class Manager:
         self._socket.setblocking(False)
 
     def heard(self) -> list[dict[str, str]]:
-        """The datagrams since the last look, each as its assignments."""
+        """Return the datagrams since the last call, each as its assignments."""
         datagrams: list[dict[str, str]] = []
         while True:
             try:
@@ -86,7 +86,7 @@ def statuses(manager: Manager) -> list[str]:
     return [datagram["STATUS"] for datagram in manager.heard() if "STATUS" in datagram]
 
 
-# who listens
+# the receiving socket
 
 
 def test_without_a_manager_nothing_happens() -> None:
@@ -124,14 +124,14 @@ def test_the_socket_is_not_handed_to_children(manager: Manager) -> None:
 
 
 def sockets() -> set[int]:
-    """The sockets this process has open."""
+    """Return the open sockets of this process."""
     found = set()
     for fd in map(int, os.listdir("/proc/self/fd")):
         try:
             if stat.S_ISSOCK(os.fstat(fd).st_mode):
                 found.add(fd)
         except OSError:
-            pass  # the one the list was read with
+            pass  # the descriptor that listed the directory
     return found
 
 
@@ -169,7 +169,7 @@ def test_after_close_nothing_is_sent(manager: Manager) -> None:
 
 
 def feeds(manager: Manager, there: Systemd, period_ns: int, steps: int) -> list[int]:
-    """At which of the steps the watchdog was fed."""
+    """Return the times of the steps that fed the watchdog."""
     fed = []
     for step in range(1, steps + 1):
         at = NS_PER_S + step * period_ns
@@ -272,11 +272,11 @@ def test_a_change_of_speed_is_sent_at_most_once_a_second(manager: Manager) -> No
     assert len(statuses(manager)) == 5
 
 
-# a manager that does not listen
+# a manager that does not read
 
 
 def fill(there: Systemd) -> int:
-    """Say more than fits; how many steps that took."""
+    """Send more messages than the socket holds and return the number of steps."""
     for step in range(1, 10_000):
         there.step(outputs(step * 100 * MS))
     return step

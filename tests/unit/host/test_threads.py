@@ -1,4 +1,4 @@
-"""Blocking calls in threads of their own."""
+"""Tests of blocking calls that run in threads of their own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from acsard.host.threads import in_thread
 
 NO_ROOM = 1 << 46
-"""Bytes of a stack that no machine has room for: a thread that wants it cannot start."""
+"""Stack size that no machine can provide, so that a thread with it cannot start."""
 
 
 def test_where_no_thread_is_to_be_had_it_is_as_late_as_one_that_hangs() -> None:

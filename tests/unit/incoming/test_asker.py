@@ -1,4 +1,4 @@
-"""Who asked, in words that nobody who is asked for his name can bend."""
+"""The name of a client that sent a request cannot forge any other part of the message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sender id belongs to the certificate that it was first seen under."""
+"""A sender id belongs to the certificate under which it was first seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sample becomes a command or is refused whole, and nothing but `DecodeError` says so."""
+"""A sample becomes a command or is refused whole, and `DecodeError` is the only error."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ARRIVED_NS = 77_000_000_000
 AXES = [("linear", "x"), ("linear", "y"), ("linear", "z"),
         ("angular", "x"), ("angular", "y"), ("angular", "z")]  # fmt: skip
 HEADER_S = "native/app, header on native/cmd/app"
-"""Whose clock the stamp in a message is, when nothing else says who sent it."""
+"""Name of the clock behind a header stamp when nothing else identifies the sender."""
 
 NOT_FINITE = [math.nan, math.inf, -math.inf]
 
@@ -42,7 +42,10 @@ def arrival(payload: bytes, key: str = "cmd/app", **changes: Any) -> Arrival:
 
 
 def written(body: dict[str, Any], form: Format) -> bytes:
-    """A body as bytes; CDR has no names, so that it takes the message and not its fields."""
+    """Return a body as bytes.
+
+    CDR carries no names, so it needs the message's type and not its fields.
+    """
     if form != "cdr":
         return encode(body, form)
     cls = TwistStamped if "twist" in body else JointState if "name" in body else TwistMessage
@@ -79,7 +82,7 @@ def joints(*velocity: float, names: list[str] | None = None) -> dict[str, Any]:
     return {"name": names or JOINTS, "velocity": list(velocity)}
 
 
-# what is a command
+# samples that are commands
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -250,7 +253,7 @@ def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
     assert refused(joints(1.0, 1.0, 1.0, 1.0), key="cmd/app") == "wrong_shape"
 
 
-# what cancels out
+# wheel speeds that cancel each other
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -259,8 +262,8 @@ def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
     [
         ((0.0, 0.0, 0.0, 0.0), False),
         ((-0.0, 0.0, -0.0, 0.0), False),
-        ((5.0, 5.0, -5.0, -5.0), True),  # front against rear
-        ((5.0, 0.0, 0.0, -5.0), True),  # the right side against itself
+        ((5.0, 5.0, -5.0, -5.0), True),  # front against rear wheels
+        ((5.0, 0.0, 0.0, -5.0), True),  # the right wheels against each other
         ((5.0, 5.0, 5.0, 5.0), False),
         ((5.0, -5.0, -5.0, 5.0), False),
     ],
@@ -286,10 +289,10 @@ def test_a_twist_of_axes_that_the_base_cannot_follow_is_no_zero_of_one_who_let_g
     assert not command(twist(0.0, 0.0), form).cancelled
 
 
-# as ROS 2 itself writes it
+# payloads as ROS 2 itself writes them
 
 ORDERS = [b"\x00\x00\x00\x00", b"\x00\x01\x00\x00"]
-"""Headers of CDR: big endian, little endian."""
+"""Headers of CDR: big endian and little endian."""
 
 
 def cdr(header: bytes, layout: str, *values: object) -> bytes:
@@ -357,7 +360,7 @@ TOLD = {
     "Twist": "application/cdr;geometry_msgs/msg/Twist",
     "TwistStamped": "application/cdr;geometry_msgs/msg/TwistStamped",
 }
-"""What an rmw key says that it carries."""
+"""Encodings that an rmw key states for its payload."""
 
 
 @each("surplus", [*range(9), 16, 24, 200])
@@ -390,7 +393,7 @@ def test_a_native_stamped_twist_that_is_cut_is_never_a_stamped_twist(
 ) -> None:
     payload = native_stamped(ORDERS[1], b"base_link")[:size]
     if encoding != TOLD["TwistStamped"] and 52 <= size < 56:
-        # As long as a Twist, and nothing else tells them apart.
+        # This size is also that of a Twist, and nothing else distinguishes them.
         assert RECEIVER.command(arrival(payload, encoding=encoding)).stamp_ns is None
     else:
         between = encoding != TOLD["TwistStamped"] and 56 <= size < 68
@@ -442,7 +445,7 @@ def test_a_native_payload_that_is_not_the_message_is_malformed(key: str, payload
 
 
 def empty_names(size: int) -> bytes:
-    """A JointState of `size` bytes that is names without a letter, as many as fit."""
+    """Return a JointState of `size` bytes with as many empty names as fit."""
     count = (size - 24) // 4
     return cdr(ORDERS[1], "iIIB3xI", 0, 0, 1, 0, count) + bytes(4 * count)
 
@@ -450,7 +453,8 @@ def empty_names(size: int) -> bytes:
 def test_more_names_than_any_robot_has_are_refused_for_their_number_alone() -> None:
     payload = empty_names(MAX_COMMAND_BYTES)
     assert len(payload) == MAX_COMMAND_BYTES
-    for more in (payload, payload[:24] + b"\xff" * len(payload[24:])):  # no item was looked at
+    # the decoder looked at no item
+    for more in (payload, payload[:24] + b"\xff" * len(payload[24:])):
         with pytest.raises(DecodeError, match=r"1018 items where 64 may be"):
             RECEIVER.command(arrival(more, key="wheel_cmd/app"))
 
@@ -468,7 +472,7 @@ def test_a_native_command_has_the_same_limit_as_any_other() -> None:
     assert refusal(arrival(largest + b"\0")) == "too_big"
 
 
-# how it came
+# the transport of a sample
 
 
 @pytest.mark.parametrize(
@@ -497,7 +501,7 @@ def test_no_reason_outweighs_another_refusal() -> None:
     assert refusal(arrival(b"", key="cmd/*", put=False)) == "wildcard"
 
 
-# whose clock
+# the clock of a stamp
 
 
 @pytest.mark.parametrize("stamp_ns", [None, 5])
@@ -620,7 +624,10 @@ NASTY = [
 
 
 def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
-    """A valid payload flipped, cut, doubled, spliced or given another number once or twice."""
+    """Return a valid payload with one or two random changes.
+
+    They are bit flips, cuts, copies, splices and other numbers.
+    """
     for _ in range(rnd.randint(1, 2)):
         a = rnd.randrange(len(payload) + 1)
         b = min(len(payload), a + rnd.randint(0, 12))
@@ -639,7 +646,7 @@ def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
             case 4:
                 payload = payload[:a] + other[rnd.randrange(len(other) + 1) :]
             case 5:
-                # A number of the right length but none: JSON cannot write one.
+                # The length is right but the value is not a number, which JSON cannot write.
                 number = rnd.choice([math.nan, math.inf, -math.inf, 1e308, -5e-324])
                 i = payload.find(b"\xcb", a)
                 if payload[:1] == b"\0":
@@ -663,7 +670,7 @@ def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> N
             got = RECEIVER.command(arrival(data, key, encoding=rnd.choice(encodings)))
         except DecodeError as error:
             reasons[error.reason] = reasons.get(error.reason, 0) + 1
-            msgspec.json.encode(str(error))  # its words are published
+            msgspec.json.encode(str(error))  # its text is published
         else:
             assert math.isfinite(got.twist.linear)
             assert math.isfinite(got.twist.angular)
@@ -694,7 +701,7 @@ def test_a_header_beside_a_bare_twist_is_neither_a_twist_nor_a_stamped_one() -> 
         RECEIVER.command(arrival(b'{"header":{"stamp":{"sec":5}},"linear":{"x":1},"angular":{}}'))
 
 
-# what came on a ROS key
+# samples on a ROS key
 
 GID = bytes(range(16))
 SENT_NS = 1_700_000_000_000_000_000
@@ -770,7 +777,7 @@ def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_no_command(via: str) -> None
 
 
 def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_senders() -> None:
-    """A router stamps for all behind it; a header says what the sender's own clock is."""
+    """A router stamps for every sender behind it. A header shows the sender's own clock."""
     arbiter = Arbiter(CommandsConfig())
     reasons = []
     for step in range(20):
@@ -786,7 +793,7 @@ def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_sen
     assert set(reasons[12:]) == {""}
 
 
-# who speaks
+# the sender
 
 
 def test_the_sender_over_rmw_is_the_publisher() -> None:
@@ -824,7 +831,7 @@ def test_half_a_gid_passes_for_no_other_sender() -> None:
     assert sender(by_ros("rmw", twist(), attachment=bytes.fromhex(nameless))) == ""
 
 
-# our own attachment
+# the project's own attachment
 
 
 JOYSTICK = public_name("joystick/s3cret")
@@ -864,7 +871,7 @@ def test_many_may_look_like_one_by_a_bridge_or_by_their_key_alone() -> None:
     assert command(twist()).shared
     assert command(stamped(12)).shared
     assert not command(twist(), sender="z2", stamp_ns=5).shared
-    assert command(twist(), stamp_ns=5).shared  # a router's stamp
+    assert command(twist(), stamp_ns=5).shared  # the stamp of a router
     assert not command(twist(), attachment=signed()).shared
 
 

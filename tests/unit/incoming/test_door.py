@@ -1,4 +1,7 @@
-"""What `state` counts of the door, whatever the door or somebody in its place says."""
+"""Counters of the TLS gateway in `state` are right for any input.
+
+The gateway, or an impostor, may publish anything.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ def arrival(payload: bytes, encoding: str = "") -> Arrival:
 
 
 class Daemon:
-    """What is left of what it hears."""
+    """The daemon's record of the gateway's reports."""
 
     def __init__(self) -> None:
         self.told, self.counters = DoorTold(), Counter[str]()

@@ -1,4 +1,4 @@
-"""What a gyro says on the bus: read in every encoding, or refused whole with the reason."""
+"""A gyro's sample on the bus is read in every encoding, or refused whole with the reason."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def arrival(
 
 
 def said(at_ns: int = 7, who: str = "imu", **fields: Any) -> Arrival:
-    """A person's JSON."""
+    """Return a sample in hand-written JSON."""
     return arrival(json.dumps(fields).encode(), at_ns=at_ns, who=who)
 
 

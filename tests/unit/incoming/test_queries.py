@@ -1,4 +1,4 @@
-"""Every row of the table answers as the design says; a service runs by its exact key alone."""
+"""Every row of the table answers as designed, and a service runs only under its exact key."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.each import each
 from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
 
 NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
-"""The published keys whose types are ROS messages, and so have a CDR form."""
+"""Published keys whose types are ROS messages and therefore have a CDR form."""
 
 CONFIG = Config(robot=RobotConfig("r7"))
 WALL_NS = 1_700_000_000_000_000_000
@@ -36,7 +36,10 @@ NO = rcl.SetParametersResult(False, "needs the header of plain CDR, has 00")
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
-"""How a client may ask for more than one key; the prefix is cut off only where it was written."""
+"""Key expressions with which a client may query more than one key.
+
+The prefix is removed only from those that contain it.
+"""
 
 
 def queries(config: Config = CONFIG) -> Queries:
@@ -70,7 +73,7 @@ def answer(asked: Query, outputs: Outputs | None = OUTPUTS) -> Reply:
     return reply
 
 
-# what can be read
+# readable keys
 
 
 @pytest.mark.parametrize("topic", [t for t in PUBLISHED if not t.simulated], ids=lambda t: t.key)

@@ -1,4 +1,4 @@
-"""What the log and the counters are told of the routers that come and go."""
+"""Tests of the log lines and counters about routers that connect and disconnect."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ A, B = "tcp/127.0.0.1:7447", "tcp/robot.local:7447"
 
 
 class Daemon:
-    """What is left of what it hears."""
+    """The daemon's record of its routers."""
 
     def __init__(self) -> None:
         self.told, self.counters = RoutersTold(), Counter[str]()
@@ -49,7 +49,7 @@ def test_of_two_routers_only_the_one_that_went_is_told() -> None:
 def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
     told, counters = RoutersTold(), Counter[str]()
     events: list[Event] = []
-    told.hear(RoutersStatus((A,)), counters, events)  # what is there is not known yet
+    told.hear(RoutersStatus((A,)), counters, events)  # the type of this peer is not known yet
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     found = [(event.name, event.level) for event in events]

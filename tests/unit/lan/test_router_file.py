@@ -1,4 +1,7 @@
-"""The router's file for any robots and people: each may in its own tree what one robot may."""
+"""Tests of the router's file for any number of robots and people.
+
+Each may do in its own tree what one robot may do.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ TEN = tuple(f"robot{n}" for n in range(1, 11))
 
 
 def read(text: str) -> Any:
-    """What Zenoh reads in it: access, and the storages."""
+    """Return the access rules and storages that Zenoh reads from the file."""
     config = zenoh.Config.from_json5(text)
     access = json.loads(config.get_json("access_control"))
     return access | {"storages": json.loads(config.get_json("plugins/storage_manager/storages"))}

@@ -1,8 +1,9 @@
-"""Drives as coarse encoders report them, and what becomes of the pose: the raw counter beside it.
+"""Drives as coarse encoders report them, with the pose from the raw counters for comparison.
 
-450 m of random driving: 600 s at 100 Hz, with stops. The truth is a chain of arcs by the wheels'
-true angles at each report; the raw counter folds the exact differences of their whole counts
-instead. Written in numpy from the equations, and shares no code with what it judges.
+A drive covers 450 m at random: 600 s at 100 Hz, with stops. The truth is a chain of arcs by the
+wheels' true angles at each report. The raw counter sums the exact differences of their whole counts
+instead. This module is written in numpy from the equations and shares no code with the modules that
+it judges.
 """
 
 from __future__ import annotations
@@ -25,11 +26,14 @@ RADIUS, TRACK, PERIOD = 0.05, 0.30, 0.01
 PERIOD_NS = 10_000_000
 WALL_NS = 1_800_000_000_000_000_000
 SIGNS = np.array([1, -1, -1, 1])
-"""Of right and left among the wheels: front right, front left, rear left, rear right."""
+"""Sign of each wheel in a turn: front right, front left, rear left, rear right."""
 
 
 def speeds(rng: np.random.Generator, seconds: float) -> Array:
-    """(periods, 2): the sides' mean speed in each period, rad/s: right, left."""
+    """Return the mean speeds of both sides in each period, rad/s, shape (periods, 2).
+
+    The right side comes first.
+    """
     v = w = 0.0
     rows, goal, left = [], (0.0, 0.0), 100
     for _ in range(round(seconds / PERIOD)):
@@ -45,20 +49,23 @@ def speeds(rng: np.random.Generator, seconds: float) -> Array:
 
 
 def angles(rng: np.random.Generator, seconds: float) -> Array:
-    """(periods + 1, 4): the wheels' true angles, rad, each from a phase of its own."""
+    """Return the wheels' true angles, rad, shape (periods + 1, 4), each with its own phase."""
     sides = speeds(rng, seconds) * PERIOD
     wheels = np.vstack([np.zeros(4), np.cumsum(sides[:, [0, 1, 1, 0]], axis=0)])
     return wheels + rng.uniform(0, math.tau, 4)
 
 
 def counted(wheels: Array, counts: int | NDArray[np.int_]) -> Array:
-    """(periods, 4): whole counts of each wheel in each period, of so many a turn."""
+    """Return the whole counts of each wheel in each period, shape (periods, 4).
+
+    `counts` is the number of counts per turn.
+    """
     told: Array = np.diff(np.floor(wheels / math.tau * counts), axis=0)
     return told
 
 
 def end(turned: Array) -> tuple[float, float]:
-    """x, y after these wheel angles, by exact arcs."""
+    """Return x and y after these wheel angles, by exact arcs."""
     right, left = (turned[:, 0] + turned[:, 3]) / 2, (turned[:, 1] + turned[:, 2]) / 2
     distance, turn = (right + left) / 2 * RADIUS, (right - left) * RADIUS / TRACK
     heading = np.cumsum(turn) - turn / 2
@@ -67,7 +74,7 @@ def end(turned: Array) -> tuple[float, float]:
 
 
 def text(row: Array) -> bytes:
-    """A line as firmware writes it."""
+    """Return a line as firmware writes it."""
     return (
         ",".join(
             f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
@@ -78,7 +85,7 @@ def text(row: Array) -> bytes:
 
 
 class Host:
-    """What is done with the lines: session, slew check and odometry, as in `robot.py`."""
+    """The host's processing of lines: session, slew check and odometry, as in `robot.py`."""
 
     def __init__(self, feedback: FeedbackConfig | None = None) -> None:
         self.session = McuSession(McuConfig(), 100.0)
@@ -103,6 +110,6 @@ class Host:
 
 
 def lines(wheels: Array, counts: int) -> Iterator[bytes]:
-    """What a firmware sends that divides counts by what its period should be."""
+    """Yield the lines of firmware that divides counts by the nominal period."""
     for row in counted(wheels, counts) * (math.tau / counts / PERIOD):
         yield text(row)

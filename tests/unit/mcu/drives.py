@@ -1,7 +1,7 @@
-"""Random drives, the lines that an MCU makes of them, and when a host gets to read those.
+"""Random drives, the lines that an MCU makes from them, and the times at which a host reads those.
 
-The path is the truth; what the session under test makes of the reads is compared with it and with
-the floor: every line with its true time. All randomness comes from the seed.
+The path is the truth. The result of the session under test is compared with it, and with the floor:
+every line with its true time. All randomness comes from the seed.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from acsard.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
 
 RATE = 100.0
 PERIOD, DRIFT = 0.01, 2e-4
-"""s, and how far an MCU's clock may be off."""
+"""Report period, s, and largest relative drift of an MCU's clock."""
 
 BYTE = 10 / 115200
-"""s of a byte on the wire."""
+"""Time of one byte on the wire, s."""
 
 LATENCY, SCHEDULER = 0.016, 0.0003
-"""s that an FTDI adapter holds bytes back, and a process waits for its turn in the mean."""
+"""Time for which an FTDI adapter holds bytes back, and mean wait of a process for its core, s."""
 
 PIECE = 1024
 """Bytes that one read takes."""
@@ -39,14 +39,16 @@ PIECE = 1024
 ROLLING = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 GRID = 0.001
-"""s between the points at which a path is known."""
+"""Time between the points of a path, s."""
 
 RIPPLE = 0.03
-"""rad/s by which each side's speed varies from report to report."""
+"""Variation of each side's speed from report to report, rad/s."""
 
 AT_REST = 1500
-"""Points of a path before which nothing moves: a robot stands while its link comes up. At the end
-it stands too: what is on its way then says nothing."""
+"""Points of a path before which nothing moves, because a robot stands while its link starts.
+
+The robot also stands at the end, so that lines still on their way do not matter.
+"""
 
 WALL_NS = 1_800_000_000 * NS_PER_S
 
@@ -71,7 +73,7 @@ class Path:
         self.right = np.concatenate([[0.0], np.cumsum(right) * GRID])
 
     def angles(self, at: float) -> tuple[float, float]:
-        """rad that the left and the right wheels have turned by `at` s."""
+        """Return the angles of the left and right wheels at time `at` in s, rad."""
         place = at / GRID
         i = int(place)
         share = place - i
@@ -85,7 +87,10 @@ class Path:
 def _ramped(
     rng: np.random.Generator, count: int, most: float, rate: float, lowest: float | None = None
 ) -> np.ndarray:
-    """A speed that goes at `rate` to one random target after the other, a sixth of them zero."""
+    """Return a speed that moves at `rate` between random targets.
+
+    A sixth of the targets are zero.
+    """
     lowest = -most if lowest is None else lowest
     targets = np.empty(0)
     while len(targets) < count:
@@ -99,22 +104,25 @@ def _ramped(
 
 
 class Case(Struct, frozen=True):
-    """What is between the MCU and us, s and shares."""
+    """Properties of the connection between MCU and host, in s and shares."""
 
     adapter: Adapter = "acm"
     prompted: bool = False
-    """It answers our lines, of the time since the last one; else it reports by its own clock."""
+    """Whether the MCU answers the host's lines.
+
+    Each answer covers the time since the last one. Otherwise the MCU reports by its own clock.
+    """
     thinking: float = 0.0002
-    """By how much it may take longer over one answer than over another."""
+    """Largest difference between the times of two answers, s."""
     stall: float = 0.0
     stall_every: float = 5.0
     lost: float = 0.0
     burst_every: float = 0.0
-    """A burst of lost lines, 0.1 to 0.5 s; 0 is none."""
+    """Mean time between bursts of 0.1 to 0.5 s of lost lines, s; 0 means that there are none."""
 
 
 class Line(Struct):
-    """One report: made at `at` s, of the time since `before`."""
+    """One report, made at time `at` in s, for the time since `before`."""
 
     at: float
     before: float
@@ -123,7 +131,7 @@ class Line(Struct):
 
 
 class Host:
-    """The session under test, and what others would make of the same lines."""
+    """The session under test, and two other poses from the same lines."""
 
     def __init__(self, case: Case, seed: int, seconds: float) -> None:
         self.case, self.seconds = case, seconds
@@ -132,12 +140,14 @@ class Host:
         self.session = McuSession(McuConfig(), RATE)
         self.found = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
         self.floor, self.by_arrival = Arcs(), Arcs()
-        """The session's; with each line's true time; with the time between their arrivals, each
-        line's speed since the last."""
+        """Poses from each line's true time, and from arrival times; `found` is the session's.
+
+        By arrival times, each line's speed applies since the line before it.
+        """
         self.lines: list[Line] = []
         self.heard: list[Feedback] = []
         self.now = 0.0
-        """When the last step was."""
+        """Time of the last step, s."""
         self._heard_ns = 0
         self._reported = 0.0
         self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
@@ -150,7 +160,7 @@ class Host:
     # the microcontroller
 
     def report(self, at: float, nominal: float | None) -> Line:
-        """The line that it makes at `at` of what the wheels did since the last one."""
+        """Return the line about the wheels' motion since the last one, made at time `at`."""
         now, then = self.path.angles(at), self.path.angles(self._reported)
         dt = at - self._reported if nominal is None else nominal
         left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
@@ -161,15 +171,15 @@ class Host:
         self.floor.roll(left * dt, right * dt)
         return line
 
-    # the way to the host
+    # the path to the host
 
     def lost(self, line: Line) -> bool:
-        """Nothing of it arrives."""
+        """Return whether nothing of this line arrives."""
         gone = any(begin <= line.at < end for begin, end in self._bursts)
         return gone or self.rng.random() < self.case.lost
 
     def delivered(self, line: Line) -> float:
-        """When its bytes are in the kernel."""
+        """Return the time at which the kernel has the line's bytes."""
         at = line.at + len(line.data) * BYTE
         if self.case.adapter == "ftdi":
             return float(np.ceil((at - self._phase) / LATENCY) * LATENCY + self._phase)
@@ -178,7 +188,7 @@ class Host:
     # the host
 
     def awake(self, at: float) -> float:
-        """When a process that wants to run at `at` does."""
+        """Return the time at which a process that is due at `at` really runs."""
         at += self.rng.exponential(SCHEDULER)
         i = bisect.bisect_right(self._starts, at) - 1
         if i >= 0 and at < self._stalls[i][1]:
@@ -186,21 +196,21 @@ class Host:
         return at
 
     def ticks(self) -> Iterator[float]:
-        """When the control periods' steps come; those that are missed are left out."""
+        """Yield the times of the control steps; missed steps are left out."""
         at = 0.0
         while True:
             at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
             yield at
 
     def tick(self, at: float) -> bool:
-        """A period's step; whether a line leaves with it."""
+        """Run one control step and return whether a line leaves with it."""
         self.now = at
         now = _instant(at)
         self._update(now, ())
         return self.session.line(now.mono_ns, ROLLING) is not None
 
     def read(self, at: float, data: bytes) -> None:
-        """What lies in the kernel is read, a piece at a time."""
+        """Read the bytes that the kernel holds, one piece at a time."""
         for start in range(0, len(data), PIECE):
             now = _instant(at + start / PIECE * 0.0002)
             self._update(now, (Received(now, data[start : start + PIECE]),))
@@ -214,10 +224,10 @@ class Host:
             speeds = feedback.speeds
             self.by_arrival.roll(speeds.front_left * since, speeds.front_right * since)
 
-    # the end
+    # the end of the drive
 
     def errors(self) -> np.ndarray:
-        """m and deg from the truth: of the session, of the floor, of arrival times."""
+        """Return the errors in m and deg of the session, of the floor and of arrival times."""
         truth = self._truth()
         rows = []
         for odometry in (self.found, self.floor, self.by_arrival):
@@ -236,7 +246,7 @@ class Host:
 
 
 class Arcs:
-    """Where a robot of the default size gets by the angles its sides roll, rad."""
+    """The path of a robot of default size by the angles that its sides roll, rad."""
 
     def __init__(self) -> None:
         self._path = way.Path()
@@ -257,7 +267,7 @@ def _instant(at: float) -> Instant:
 def _times(
     rng: np.random.Generator, seconds: float, every: float, length: float
 ) -> list[tuple[float, float]]:
-    """Begins and ends of what happens every so often, at no fixed phase."""
+    """Return the starts and ends of a repeated disturbance that has no fixed phase."""
     starts = np.arange(every * 0.7, seconds - 1.0, every) + rng.uniform(0, every * 0.2)
     starts += rng.uniform(0, every * 0.1, len(starts))
     return [(start, start + length) for start in starts.tolist()]
@@ -272,7 +282,7 @@ def _encode(speeds: WheelSpeeds) -> bytes:
 
 
 def drive(case: Case, seed: int, seconds: float) -> Host:
-    """All of a drive, read to its end."""
+    """Simulate a whole drive and return its host."""
     host = Host(case, seed, seconds)
     if case.prompted:
         _prompted(host)
@@ -282,7 +292,10 @@ def drive(case: Case, seed: int, seconds: float) -> Host:
 
 
 def reporting(host: Host) -> None:
-    """The MCU makes a line every period of its own clock, and divides by the nominal one."""
+    """Simulate an MCU that makes a line in every period of its own clock.
+
+    It divides by the nominal period.
+    """
     arrivals: deque[tuple[float, bytes]] = deque()
     period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))
     for k in range(1, int(host.seconds / period)):
@@ -297,7 +310,7 @@ def reporting(host: Host) -> None:
 
 
 def _prompted(host: Host) -> None:
-    """The MCU answers each line, 1 ms after it has come or later, and divides by the true time."""
+    """Simulate an MCU that answers each line after 1 ms or more and divides by the true time."""
     arrivals: deque[tuple[float, bytes]] = deque()
     free = last = 0.0
     for tick in host.ticks():
@@ -317,7 +330,7 @@ def _prompted(host: Host) -> None:
 
 
 def _read_until(host: Host, arrivals: deque[tuple[float, bytes]], tick: float) -> None:
-    """What the host gets to read before its next step."""
+    """Read everything that the host can read before its next step."""
     while arrivals and arrivals[0][0] < tick:
         at = max(host.awake(arrivals[0][0]), host.now)
         if at >= tick:

@@ -1,8 +1,8 @@
-"""Rows of a table, as they are found: what was driven, the goal, and what came of it."""
+"""Prints rows of a result table: the drive, the goal and the result."""
 
 from __future__ import annotations
 
 
 def print_row(name: str, goal: str, found: str) -> None:
-    """Print one, on a line of its own."""
+    """Print one row on its own line."""
     print(f"\n{name:46} goal {goal:38} found {found}", end="")

@@ -1,9 +1,7 @@
-"""Bursts of 0.1 to 0.5 s of lost plain lines through the session: the covariance knows them.
+"""The covariance covers bursts of 0.1 to 0.5 s of lost plain lines.
 
-pytest -s -m soak tests/unit/mcu/test_bursts.py
-
-How far the pose is off after 450 m is in `test_line_time.py`; with counts in
-`scenarios/test_bursts.py`.
+Run it with `pytest -s -m soak mcu/test_bursts.py`. The pose error after 450 m is in
+`test_line_time.py`; the case with counts is in `scenarios/test_bursts.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ BURSTS = Case(burst_every=30.0)
 
 
 def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
-    """NEES of robots that all drove the same commands, over ground that made each err otherwise."""
+    """Return the NEES of robots with equal commands on ground that makes each err differently."""
     host = Host(BURSTS, seed, seconds)
     host.found = Odometry(model.config(), Kinematics(DriveConfig()))
     reporting(host)
@@ -44,7 +42,10 @@ def drive(seed: int, seconds: float, model: Model, robots: int) -> Array:
     ("model", "least"), [(WHEELS, 2.7), (DEFAULT, 2.85)], ids=["wheels", "default"]
 )
 def test_after_bursts_the_covariance_tells_the_truth(model: Model, least: float) -> None:
-    """Of wheels that err by 3 mm in a metre the bursts are most of it, and a little overrated."""
+    """The bursts cause most of the error and are overrated a little.
+
+    This is for wheels that err by 3 mm per metre.
+    """
     values = np.concatenate([drive(seed, 90.0, model, 10) for seed in range(100)])
     inside = float((values < REGION).mean())
     print(f"\nbursts, {len(values)} runs: NEES {values.mean():.2f}, region holds {inside:.1%}")

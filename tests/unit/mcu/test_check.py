@@ -1,4 +1,4 @@
-"""The suffix: built to the byte, and taken only when all of it is right."""
+"""The suffix is built exactly, and accepted only if all of it is right."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SAMPLE = b"ap12.50,bn08.75,cp15.00,dn10.25#07@0FA00001FFFF80007FFF*0000"
 
 
 def crc(data: bytes) -> int:
-    """CRC-16/XMODEM as its definition says it: bit by bit, x16 + x12 + x5 + 1, from 0."""
+    """Return CRC-16/XMODEM by its definition: bit by bit, x16 + x12 + x5 + 1, from 0."""
     register = 0
     for byte in data:
         register ^= byte << 8
@@ -27,7 +27,7 @@ def crc(data: bytes) -> int:
 
 
 def closed(body: bytes) -> bytes:
-    """The body with the check it needs, whatever else is wrong with it."""
+    """Return the body with its correct check, even if the body is wrong."""
     return b"%b*%04X" % (body, crc(body))
 
 
@@ -88,11 +88,11 @@ def test_a_line_without_suffix_is_unchecked(line: bytes) -> None:
     [
         SEED_LINE + b"#0",
         SEED_LINE + b"#",
-        SEED_LINE,  # a check without a sequence
+        SEED_LINE,  # a line with neither check nor sequence
         SEED_LINE + b"#7A7",
         SEED_LINE + b"#0a",
         SEED_LINE + b"#0x",
-        SEED_LINE + b"#07S",  # an echo of our own question
+        SEED_LINE + b"#07S",  # an echo of the host's own question
         SEED_LINE + b"# 7",
         SEED_LINE + b"#07@",
         SEED_LINE + b"#07@0FA00001FFFF80007FF",
@@ -101,7 +101,7 @@ def test_a_line_without_suffix_is_unchecked(line: bytes) -> None:
         SEED_LINE + b"#07#08",
         SEED_LINE + b"*#07",
         SEED_LINE + b"#07*0000",
-        b"\x00\x00" + SEED_LINE + b"#07",  # which the check alone does not see
+        b"\x00\x00" + SEED_LINE + b"#07",  # the check alone does not detect this
     ],
 )
 def test_a_suffix_of_another_form_is_wrong_even_under_a_right_check(body: bytes) -> None:

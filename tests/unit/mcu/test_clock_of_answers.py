@@ -1,4 +1,4 @@
-"""Which line of ours a reply answers, told by order and delay."""
+"""Tests that match each reply to the line it answers by order and delay."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DELAY_MS = 9.0
 
 
 class Bench:
-    """Lines that leave, and replies that are read."""
+    """A sequence of sent lines and received replies."""
 
     def __init__(self) -> None:
         self.prompts = Prompts(soonest_ns=6 * MS)
@@ -25,7 +25,7 @@ class Bench:
         self.prompts.left(int(ms * MS))
 
     def reply(self, ms: float, lines: int = 1, asked_ms: float | None = None) -> list[float]:
-        """A read of so many replies; each one's dt, and what of it is bridged, in ms."""
+        """Read this many replies; return the dt and the filled gap of each, in ms."""
         self.prompts.read(int(ms * MS), lines)
         said = []
         for _ in range(lines):
@@ -36,7 +36,7 @@ class Bench:
         return said
 
     def talk(self, count: int = 20) -> Bench:
-        """A line every 10 ms, each answered; the last left at (count - 1) x 10."""
+        """Send a line every 10 ms and answer each; the last one leaves at (count - 1) x 10."""
         for number in range(count):
             self.leave(number * 10)
             self.reply(number * 10 + DELAY_MS)
@@ -88,11 +88,11 @@ def test_a_damaged_reply_leaves_its_line_without_one() -> None:
 def test_a_line_given_up_too_early_gets_its_reply_back() -> None:
     bench = Bench()
     bench.leave(-10.0)
-    bench.reply(-10.0 + DELAY_MS - 1.5)  # so soon one may come
+    bench.reply(-10.0 + DELAY_MS - 1.5)  # the earliest time at which an answer may arrive
     bench.talk()
     bench.leave(200.0)
     bench.leave(210.0)
-    early, bridged = bench.reply(210.0 + DELAY_MS - 1)  # the first one's, read late
+    early, bridged = bench.reply(210.0 + DELAY_MS - 1)  # the answer to the first line, read late
     assert (early, bridged) == pytest.approx((20.0, 10.0), abs=1.0)
     own, nothing = bench.reply(210.0 + DELAY_MS)
     assert (early + own, nothing) == pytest.approx((20.0, 0.0), abs=1.0)
@@ -109,7 +109,7 @@ def test_a_late_answer_is_none_that_comes_sooner_than_any() -> None:
 
 
 def test_of_two_lines_that_leave_at_once_behind_a_stall_none_is_lost() -> None:
-    """Nothing is bridged: the first one's answer, read late, tells of all of the stall."""
+    """No gap is filled, because the answer to the first line, read late, covers the whole stall."""
     bench = Bench().talk()
     bench.leave(400.0)
     bench.leave(403.0)
@@ -118,7 +118,7 @@ def test_of_two_lines_that_leave_at_once_behind_a_stall_none_is_lost() -> None:
 
 
 def test_a_silence_that_begins_with_two_close_lines_leaves_all_of_its_lines_without() -> None:
-    """Nobody's answer is so late that the second line's own ought to be read by then."""
+    """No earlier line's answer can be so late that the second line's own answer would be due."""
     bench = Bench().talk()
     for ms in (200.0, 203.9, 220.0, 320.0, 420.0, 520.0, 620.0):
         bench.leave(ms)
@@ -176,15 +176,19 @@ def test_a_new_session_begins_without_a_past() -> None:
     assert bench.reply(500.0 + DELAY_MS) == [0.0, 0.0]
 
 
-# an adapter that holds answers back
+# an adapter that delivers answers in batches
 
 
 def batched(
     bench: Bench, seed: int, lines: int, lost: tuple[int, ...] = (), offs: list[int] | None = None
 ) -> float:
-    """Lines every 10 ms, answers handed over every 16 ms; ms from the first to the last of them
-    after a second. To `offs` goes how many lines after its own each is told to be of, but for a
-    number that is the same for all."""
+    """Return the time that batched answers cover after the first second, ms.
+
+    Lines are sent every 10 ms, and their answers arrive every 16 ms.
+
+    `offs` collects the distance from each reply's own line to the line it was matched to, up to a
+    constant.
+    """
     chance, told = random.Random(seed), 0.0
     answers, leaves = [i for i in range(lines) if i not in lost], list(range(lines))
     for batch in range(1, lines * 10 // 16 + 3):

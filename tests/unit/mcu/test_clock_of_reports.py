@@ -1,4 +1,7 @@
-"""The clock of an MCU found from reads: no slot too many, none too few, and given up in time."""
+"""The MCU's clock is found from the times of reads.
+
+It counts neither too many nor too few slots, and it is given up in time.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,10 @@ PERIOD = 0.01
 
 
 class Bench:
-    """Lines at a period, each read when it is there or later; what the clock makes of it."""
+    """Lines at a fixed period, and the slots that the clock counts for them.
+
+    Each line is read at once or late.
+    """
 
     def __init__(self, period: float = PERIOD, known: tuple[float, ...] = (PERIOD,)) -> None:
         self.slots = Slots(known)
@@ -31,7 +37,7 @@ class Bench:
         return int(5e12 + self.made * self.period_ns)
 
     def line(self, late_ms: float = 0.0, lost: bool = False, held: bool = False) -> None:
-        """The MCU makes its next line; it is lost, or lies there, or is read with what lies."""
+        """Make the MCU's next line: it is lost, or held back, or read with all lines held back."""
         self.made += 1
         self.waiting += not lost
         if held or not self.waiting:
@@ -44,7 +50,7 @@ class Bench:
         self.waiting = 0
 
     def found(self) -> Bench:
-        """A clock that is known."""
+        """Send lines until the clock is known."""
         while self.slots.period is None:
             self.line()
             assert self.made < 200
@@ -57,7 +63,7 @@ class Bench:
 
     @property
     def error(self) -> float:
-        """Slots counted beyond those that there were."""
+        """Return the number of slots counted beyond those that existed."""
         return self.counted - (self.made - self.began)
 
 
@@ -72,10 +78,10 @@ def test_no_clock_is_known_before_half_a_second() -> None:
 @pytest.mark.parametrize(
     ("real", "period"),
     [
-        (0.0100001, 0.01),  # configured
-        (0.01004, 0.01),  # so is a ceramic resonator's
+        (0.0100001, 0.01),  # the configured period
+        (0.01004, 0.01),  # a ceramic resonator matches the configured period as well
         (0.020003, 0.02),  # whole milliseconds
-        (0.0333333, 0.0333333),  # as measured
+        (0.0333333, 0.0333333),  # the measured period
     ],
 )
 def test_the_period_is_the_one_that_the_firmware_means(real: float, period: float) -> None:
@@ -135,8 +141,11 @@ def test_a_batched_link_without_loss_counts_each_line_once(seed: int, held: int)
 
 
 def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
-    """Time, ns, and lines of each read through an adapter that hands on 62 bytes as soon as it has
-    them and fewer each 16 ms, of lines of so many bytes each 10 ms at 115200."""
+    """Return the times in ns and line counts of reads through an adapter at 115200 baud.
+
+    The adapter passes 62 bytes on at once, and fewer bytes every 16 ms. Lines of `size` bytes come
+    every 10 ms.
+    """
     fed = [(round((k * 10 + phase) * MS + (i + 1) * MS / 11.52), i == size - 1)
            for k in range(1, lines + 1) for i in range(size)]  # fmt: skip
     reads: list[tuple[int, int]] = []
@@ -172,14 +181,17 @@ OUT_OF_TURN = [
     0.0, 0.49, 1.1, 0.68, 1.31, 0.87, 0.53, 1.11, 0.69, 1.29, 0.91, 0.48, 1.09, 0.68, 1.29, 0.97,
     0.51, 1.08, 0.75, 1.32, 1.0, 0.49, 1.09, 0.68, 1.31, 0.91, 1.49, 1.09, 0.68, 1.28, 0.88, 0.52,
 ]  # fmt: skip
-"""Slots by which the reads of half a second of batches are late, as seen: the first one's line was
-early, as the first answer of a port is, since our lines follow each other only after it."""
+"""Observed lateness of reads during half a second of batches, in slots.
+
+The first line was early, like the first answer after a port opens, because the host's lines follow
+each other only after it.
+"""
 
 
 def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
     slots, slot, before = Slots((PERIOD,)), 0, 0.0
     for late in [*OUT_OF_TURN, *OUT_OF_TURN[5:]]:
-        lines = round(1.6 - late + before)  # 16 ms of them
+        lines = round(1.6 - late + before)  # the lines of 16 ms
         slot, before = slot + lines, late
         slots.read(10**12 + int((slot + late) * 10 * MS), lines, True)
         if slots.period is not None:
@@ -232,7 +244,7 @@ def test_what_a_backlog_is_short_of_is_counted_with_it() -> None:
 
 
 def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
-    """Whether the clock is given up on the way."""
+    """Return whether the clock is given up during these lines."""
     for line in lines:
         line()
         if bench.slots.period is None:

@@ -1,6 +1,6 @@
-"""Coarse encoders from bytes to pose: no true line dropped, and the error is the raw counter's.
+"""Coarse encoders from bytes to pose: no true line is dropped, and the error is the raw counter's.
 
-pytest -m slow -s tests/unit/mcu/test_coarse.py
+Run it with `pytest -m slow -s mcu/test_coarse.py`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ FINER = (1000, 2000, 4000)
 
 
 class Driven(Struct, frozen=True):
-    """How far from the truth a drive ended, m: by counts, by reports as they stand, by us."""
+    """Distance from the truth at the end of a drive, m.
+
+    `raw` uses counts, `plain` the reports as they are, and `ours` the session under test.
+    """
 
     raw: float
     plain: float
@@ -84,7 +87,7 @@ def test_450_m_end_as_far_off_as_the_raw_counter_does(counts: int) -> None:
     assert ours < 0.2 * plain or counts not in FINER
 
 
-# what else there may be to coarse encoders: nobody's counts are found, and no line is dropped
+# other effects with coarse encoders: no counts are found for others, and no line is dropped
 
 
 def heard(rows: Array, feedback: FeedbackConfig | None = None) -> Host:
@@ -122,7 +125,10 @@ def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float
 
 
 def wild(wheels: int, seed: int) -> Host:
-    """A drive that is joined on its way, of which so many wheels say anything, until its fault."""
+    """Return the host of a drive in which `wheels` wheels report random speeds until the fault.
+
+    The host joins after the drive has begun.
+    """
     host, dice = Host(), np.random.default_rng(seed)
     for right, left in speeds(np.random.default_rng(seed), 9.0)[150:]:
         row = np.array([right, left, left, right])
@@ -139,5 +145,5 @@ def test_a_wheel_that_jumps_at_random_is_found_out_by_the_steps_of_the_others() 
 
 
 def test_two_wheels_that_jump_at_random_are_believed_as_the_reference_says() -> None:
-    """They may as well be two coarse encoders among fine ones."""
+    """They could equally be two coarse encoders among fine ones."""
     assert not wild(2, 1).sanity.doubtful

@@ -1,4 +1,7 @@
-"""Lines <-> wheel speeds: exact when written, strict in meaning and lenient in form when read."""
+"""Tests of the conversion between lines and wheel speeds.
+
+Writing is exact. Reading is strict in meaning and lenient in form.
+"""
 
 from __future__ import annotations
 
@@ -90,7 +93,7 @@ def test_each_wheel_has_its_motor(codec: Codec, name: str, line: bytes) -> None:
 
 
 def test_a_left_turn_drives_a_and_d_forward_and_b_and_c_backward(codec: Codec) -> None:
-    # 2 rad/s x 0.15 m / 0.05 m = 6 rad/s
+    # 2 rad/s x 0.15 m / 0.05 m gives 6 rad/s.
     left_turn = Kinematics(DriveConfig()).wheel_speeds(Twist(0.0, 2.0))
     assert codec.encode(left_turn) == b"ap06.00,bn06.00,cn06.00,dp06.00\r\n"
 
@@ -216,7 +219,10 @@ def test_what_was_read_back_is_written_as_it_was(wheels: WheelSpeeds, wiring: Wh
 
 
 def independent(line: bytes) -> Motors | None:
-    """What a line says, by code that shares nothing with the product; None if it is no frame."""
+    """Parse a line by code that shares nothing with the product.
+
+    Return None if the line is not a frame.
+    """
     tokens = line.split(b",")
     if len(tokens) == 5 and not tokens[4].strip(b" "):
         tokens.pop()
@@ -252,7 +258,7 @@ def test_the_independent_reader_refuses_what_is_refused(line: bytes) -> None:
 
 
 def valid(rng: random.Random) -> bytes:
-    """A well-formed line in one of the forms in use."""
+    """Return a well-formed line in one of the forms in use."""
     letters = "abcd" if rng.random() < 0.9 else "".join(rng.sample("abcd", 4))
     form = rng.choice(("%05.2f", "%05.2f", "%05.2f", "%.2f", "%.3f"))
     comma = rng.choice((",", ",", ", "))
@@ -265,22 +271,22 @@ def valid(rng: random.Random) -> bytes:
 
 
 def damaged(rng: random.Random, line: bytes, other: bytes) -> bytes:
-    """`line` as a bad wire might hand it over."""
+    """Return `line` as a bad wire might deliver it."""
     kind, place = rng.randrange(8), rng.randrange(len(line))
     match kind:
-        case 0:  # the beginning or the end is missing
+        case 0:  # the start or the end is missing
             return line[place:] if rng.random() < 0.5 else line[:place]
-        case 1:  # a hole
+        case 1:  # some bytes are missing inside
             return line[:place] + line[place + rng.randint(1, 9) :]
-        case 2:  # run together with the next one, whole or in part
+        case 2:  # the line runs into the next one, whole or in part
             return line + rng.choice((b"", b",", b"\r", other)) + other[rng.randrange(30) :]
-        case 3:  # the rest of another line
+        case 3:  # the rest is another line's
             return line[:place] + other[place:]
-        case 4:  # the rest of another line, out of step
+        case 4:  # the rest is another line's, shifted
             return line[:place] + other[rng.randrange(len(other)) :]
-        case 5:  # a byte too many
+        case 5:  # one additional byte
             return line[:place] + bytes([rng.randrange(256)]) + line[place:]
-        case 6:  # a wrong byte, of those that hurt most
+        case 6:  # a wrong byte of the most harmful kind
             return (
                 line[:place]
                 + bytes([rng.choice(b"abcdpn0123456789.,- \r\x00")])
@@ -294,7 +300,7 @@ def damaged(rng: random.Random, line: bytes, other: bytes) -> bytes:
 
 
 def wire(rng: random.Random, count: int) -> Iterator[bytes]:
-    """`count` lines, one in five whole, in pieces that are cut anywhere."""
+    """Yield `count` lines, one in five undamaged, in pieces that are cut anywhere."""
     other, held = valid(rng), b""
     for _ in range(count):
         line = valid(rng)

@@ -1,9 +1,8 @@
-"""What damage on the wire gets past the plain line's parser, and what of it past the slew check.
+"""Measures the wire damage that the plain line's parser and the slew check accept.
 
-Beside `test_codec.py`, which proves that the parser accepts exactly the well-formed lines: here
-the damage is counted that makes one well-formed line of another.
-
-    pytest -m soak -s tests/unit/mcu/test_damage.py
+`test_codec.py` proves that the parser accepts exactly the well-formed lines. This module counts the
+damage that turns one well-formed line into another. Run it with `pytest -m soak -s
+mcu/test_damage.py`.
 """
 
 from __future__ import annotations
@@ -24,16 +23,19 @@ from acsard.values import STILL, Instant, WheelSpeeds
 
 KINDS = ("bit flipped", "byte lost", "byte doubled", "lines merged", "noise")
 PLACES = (31, 33, 33, 33, 33)
-"""Where the accident may begin: in the line, in the line and its end."""
+"""Number of possible start positions of each accident.
+
+It starts within the line, or within the line and its end.
+"""
 
 WRONG_BIT_SHARE = (0.17, 0.25)
-"""MCU section 4 measured 20.8 % of single-bit errors accepted with a wrong value."""
+"""MCU section 4 measured that 20.8 % of single-bit errors are accepted with a wrong value."""
 
 AT = Instant(0, 0)
 
 
 def drive(rng: random.Random, count: int) -> list[bytes]:
-    """The replies of a robot that drives about: each wheel near its last speed, as at 100 Hz."""
+    """Return the replies of a driving robot, with each wheel near its last speed, as at 100 Hz."""
     speeds, goals, lines = [0.0] * 4, [0.0] * 4, []
     for i in range(count):
         if i % 100 == 0:
@@ -49,7 +51,7 @@ def drive(rng: random.Random, count: int) -> list[bytes]:
 
 
 def hurt(kind: int, line: bytes, after: bytes, chance: float, place: int) -> bytes:
-    """The bytes of `line`, its end with them, after one accident at `place`."""
+    """Return the bytes of `line` and its line end after one accident at `place`."""
     match kind:
         case 0:
             flipped = line[place] ^ (1 << int(chance * 8))
@@ -58,7 +60,7 @@ def hurt(kind: int, line: bytes, after: bytes, chance: float, place: int) -> byt
             return line[:place] + line[place + 1 :]
         case 2:
             return line[: place + 1] + line[place:]
-        case 3:  # what lies between `place` and somewhere in the next line is lost
+        case 3:  # everything from `place` to a point in the next line is lost
             return line[:place] + after[int(chance * 33) :]
         case _:
             few = int(chance * 1e9).to_bytes(4, "big")
@@ -82,7 +84,7 @@ def test_damage_raises_nothing_and_is_accepted_as_rarely_as_a_plain_line_allows(
         after = lines[at + 1] if at < last else line
         sent = hurt(kind, line, after, chance(), int(chance() * PLACES[kind]))
         tried[kind] += 1
-        # An end of line more, so that no accident reaches the next one.
+        # A further line end keeps an accident from reaching the next line.
         for got, _ in feed(sent + b"\n"):
             try:
                 speeds = decode(got)
@@ -103,7 +105,10 @@ def test_damage_raises_nothing_and_is_accepted_as_rarely_as_a_plain_line_allows(
 def plausible(
     sanity: Sanity, before: WheelSpeeds, speeds: WheelSpeeds, steps: Motors = (0.0,) * 4
 ) -> bool:
-    """The slew check lets these speeds pass one period after those; `steps` are the encoders'."""
+    """Return whether the slew check accepts these speeds one period after those.
+
+    `steps` are the quantization steps of the encoders.
+    """
     sanity.forget()
     sanity.impossible(Feedback(AT, before, 0.01))
     return not sanity.impossible(Feedback(AT, speeds, 0.01, steps=steps))
@@ -116,8 +121,10 @@ def test_the_slew_check_itself_tells_a_leap_from_a_step() -> None:
 
 
 def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
-    """One bit of one in so many lines is flipped, and the steps are learned from all that come: how
-    many say something wrong, how many of these pass, and how many would had nothing been learned.
+    """Count the wrong readings when one bit in one of `every` lines is flipped.
+
+    The quantization steps are learned from all lines. Return the number of wrong readings, of those
+    accepted, and of those that would be accepted without the learned steps.
     """
     rng, codec, snapping = random.Random(5), Codec(WheelMap()), Snapping()
     sanity, wrong, believed, before = Sanity(FeedbackConfig()), 0, [0, 0], STILL

@@ -1,4 +1,4 @@
-"""Reports that equal the lines sent while the speeds change are an echo, no board."""
+"""Reports that equal the sent lines while the speeds change come from an echo."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ CODEC = Codec(WheelMap())
 
 
 class Bench:
-    """A detector, and a far end whose report comes some lines later."""
+    """A detector, and a far end whose report arrives some lines later."""
 
     def __init__(self) -> None:
         self.detector = EchoDetector()
         self.waiting: deque[float] = deque()
 
     def exchange(self, sent: float, back: float | None = None, lag: int = 0) -> bool:
-        """Send a line and take the report that is due; by default one of the lines sent before."""
+        """Send a line and process the report that is due.
+
+        By default the report repeats an earlier line.
+        """
         self.send(sent)
         self.waiting.append(sent if back is None else back)
         return len(self.waiting) > lag and self.report(self.waiting.popleft())
@@ -65,7 +68,7 @@ def test_small_changes_count_by_their_sum() -> None:
     assert found.index(True) == REPORTS - 1
     bench = Bench()
     found = [bench.exchange(5.0 + step % 2 * 0.05) for step in range(80)]
-    assert found.index(True) in (40, 41)  # 40 changes of 0.05 rad/s, as floats add up
+    assert found.index(True) in (40, 41)  # 40 changes of 0.05 rad/s, with float rounding
 
 
 def test_one_report_that_differs_begins_the_run_anew() -> None:

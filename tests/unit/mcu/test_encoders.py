@@ -1,4 +1,4 @@
-"""Counts and the MCU's clock, both modulo 65536 -> angles, or why they do not tell."""
+"""Counts and the MCU's clock, both modulo 65536, become angles or the reason why they cannot."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from acsard.mcu.encoders import (
 MS = 1_000_000
 COUNTS = 3200
 FASTEST = 80.0
-"""rad/s: 40744 counts a second, half a wrap in 0.8 s."""
+"""Fastest wheel speed, rad/s: 40744 counts a second, half a wrap in 0.8 s."""
 
 WRAP_MS = 32768 / (FASTEST / math.tau * COUNTS) * 1000
 
 
 class Bench:
-    """An MCU's readings and the host's time of each."""
+    """The readings of an MCU with the host's time of each."""
 
     def __init__(self, counts: int = COUNTS) -> None:
         self.encoders = Encoders(counts, FASTEST, 100 * MS)
@@ -34,7 +34,7 @@ class Bench:
     def read(
         self, mcu_ms: float = 10, counts: tuple[int, ...] = (), host_ms: float | None = None
     ) -> Turned | Unknown:
-        """So much later by each clock, having counted so much."""
+        """Advance both clocks and the counts by these amounts and return the result."""
         self.mcu_ms += mcu_ms
         self.at_ms += mcu_ms if host_ms is None else host_ms
         self.counts = [c + m for c, m in zip(self.counts, counts or (0,) * 4, strict=True)]
@@ -69,7 +69,7 @@ def test_a_whole_turn_is_2_pi_of_the_configured_counts() -> None:
 
 
 def test_counts_and_milliseconds_go_on_over_their_wrap(bench: Bench) -> None:
-    for _ in range(2000):  # 20 s: the clock wraps once, the counts eight times
+    for _ in range(2000):  # 20 s, in which the clock wraps once and the counts wrap eight times
         assert bench.read(10, (300, -300, 300, -300)) == turned(300, -300, 300, -300)
 
 
@@ -87,7 +87,7 @@ def test_what_is_told_adds_up_to_all_that_was_counted(
     late_ms = 0.0
     for ms, share, later_ms in steps:
         moved = int(share * FASTEST / math.tau * COUNTS * ms / 1000)
-        host_ms = ms + later_ms - late_ms  # each is read with a lateness of its own
+        host_ms = ms + later_ms - late_ms  # each reading has a different delay
         late_ms = later_ms
         found = bench.read(ms, (moved, -moved, moved // 2, 0), max(host_ms, 0.0))
         if host_ms < 0:
@@ -126,7 +126,8 @@ def test_a_gap_in_which_a_count_could_have_wrapped_tells_nothing(
 @pytest.mark.parametrize("motor", range(4))
 @pytest.mark.parametrize("sign", [1, -1])
 def test_further_than_a_motor_can_turn_is_a_leap(bench: Bench, motor: int, sign: int) -> None:
-    most = int(FASTEST / math.tau * COUNTS * 0.012) + 4  # two ms of rounding, four counts of play
+    # two ms of rounding and four counts of play
+    most = int(FASTEST / math.tau * COUNTS * 0.012) + 4
     moved = [0] * 4
     moved[motor] = sign * most
     assert isinstance(bench.read(10, tuple(moved)), Turned)
@@ -148,7 +149,8 @@ def test_a_clock_that_leaps_ahead_of_the_hosts_is_a_restart(bench: Bench) -> Non
 
 def test_a_reading_read_late_does_not_make_the_next_one_a_restart(bench: Bench) -> None:
     assert bench.read(10, (50, 50, 50, 50), host_ms=300) == turned(50, 50, 50, 50)
-    found = bench.read(295, (50, 50, 50, 50), host_ms=15)  # none was made while the host slept
+    # the MCU made no reading while the host slept
+    found = bench.read(295, (50, 50, 50, 50), host_ms=15)
     assert isinstance(found, Turned)
     bench.mcu_ms = 0.0
     assert bench.read(3, host_ms=10.0) == "restarted"
@@ -175,7 +177,7 @@ def test_of_restarts_at_any_time_hardly_one_is_missed(
     encoders = Encoders(COUNTS, FASTEST, 100 * MS)
     encoders.turned(Reading(old_ms, (9, 9, 9, 9)), 0)
     found = encoders.turned(Reading(since_ms, (0, 0, 0, 0)), host_ms * MS)
-    missed = (since_ms - old_ms) % 65536 <= host_ms + 100  # up for a whole number of 65.5 s
+    missed = (since_ms - old_ms) % 65536 <= host_ms + 100  # it was up for a whole number of 65.5 s
     assert (found == "restarted") is not missed
 
 

@@ -1,4 +1,4 @@
-"""Good lines in a row: their time by the wire, and the wheels' way by the counts."""
+"""Consecutive good lines get their time from the wire and the wheels' angles from the counts."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LENGTH = 36
 WIRE_NS = 3_125_000
 COUNTS = 3600
 DEGREE = math.tau / 360
-"""Ten counts."""
+"""The angle of ten counts, rad."""
 
 
 class Bench:
-    """A timeline and the host's and the MCU's clocks."""
+    """A timeline with the clocks of the host and the MCU."""
 
     def __init__(self, wheels: WheelMap | None = None, counts: int = COUNTS) -> None:
         wheels = wheels or WheelMap()
@@ -40,7 +40,7 @@ class Bench:
         following: int = 0,
         gap: bool = False,
     ) -> Feedback:
-        """A line `ms` later on both clocks; with counts, or without any."""
+        """Return the feedback of a line `ms` later on both clocks, with or without counts."""
         self.now_ns += int(ms * MS)
         self.mcu_ms += int(ms) if mcu_ms is None else mcu_ms
         reading = None
@@ -149,11 +149,11 @@ def test_counts_nobody_configured_are_left_alone() -> None:
     assert bench.line(10, 10, 10, 10).turned is None
 
 
-# where nothing but the reads tells the time
+# boards for which only the reads give the time
 
 
 def reporting(bench: Bench, lines: int = 80) -> Bench:
-    """After so many lines one by one, every 10 ms."""
+    """Feed this many lines one by one, every 10 ms."""
     for _ in range(lines):
         bench.timeline.left(bench.now_ns)
         bench.line()
@@ -161,7 +161,10 @@ def reporting(bench: Bench, lines: int = 80) -> Bench:
 
 
 def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feedback]:
-    """A read of so many lines, `ms` after the one before; its first one ends a silence."""
+    """Read this many lines `ms` after the last read.
+
+    With `silent`, the first one ends a silence.
+    """
     bench.now_ns += int(ms * MS)
     at = Instant(bench.now_ns, bench.now_ns + 7)
     bench.timeline.read(at, LENGTH * lines, lines, 0)
@@ -247,11 +250,14 @@ def test_another_rate_than_ours_has_its_own_period(period: int) -> None:
     assert [(f.dt, f.gap) for f in found] == [(period / 1000, 0.0)] * 6
 
 
-# where each line is answered
+# boards that answer each line
 
 
 def prompted(bench: Bench, lines: int = 60) -> Bench:
-    """A line every 10 ms, each answered 8 ms later; a stall of ours has shown it."""
+    """Send a line every 10 ms and answer it 8 ms later.
+
+    One stall of the host reveals that the board answers.
+    """
     for number in range(lines):
         bench.timeline.left(bench.now_ns + 2 * MS)
         bench.line(ms=160 if number == 50 else 10)
@@ -284,7 +290,7 @@ def test_a_change_of_clocks_adds_up_to_no_time() -> None:
     began = bench.now_ns + 10 * MS
     total = 0.0
     for number in range(400):
-        late = number % 4  # ms by which its read is late
+        late = number % 4  # delay of the read, ms
         bench.timeline.left(bench.now_ns)
         total += bench.line(ms=10 + late).dt
         bench.now_ns -= late * MS
@@ -295,10 +301,10 @@ def test_a_change_of_clocks_adds_up_to_no_time() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> None:
-    """A slot is where the promptest read would be, an answer where reads are in the mean."""
+    """A slot lies at the time of the minimum delay, an answer at that of the mean delay."""
     bench, chance, total = Bench(counts=0), random.Random(seed), 0.0
     began = bench.now_ns
-    for number in (*range(200), *range(215, 230)):  # a stall, which shows that it answers
+    for number in (*range(200), *range(215, 230)):  # the stall reveals that the board answers
         left_ns = began + number * 10 * MS
         bench.timeline.left(left_ns)
         bench.now_ns = left_ns + int(chance.uniform(7.0, 8.2) * MS)

@@ -1,4 +1,4 @@
-"""The gate that never keeps a line."""
+"""Tests of the send stage, which never queues a line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GO = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
 
 
 class Wire:
-    """A gate and a kernel that takes what it is handed."""
+    """A send stage and a kernel that accepts part of each line."""
 
     def __init__(self, baud_rate: int = 115200, stop: bytes = STOP, period_ms: int = 10) -> None:
         self.gate = Gate(baud_rate, stop, period_ms * MS)
@@ -63,7 +63,7 @@ def test_a_first_line_that_did_not_go_whole_leaves_the_next_one_the_first() -> N
 
 def test_a_line_waits_until_the_one_before_has_left_the_wire() -> None:
     wire = Wire(9600)
-    wire.offer(STOP, 5)  # 35 bytes at 9600 baud: 36.458 ms
+    wire.offer(STOP, 5)  # 35 bytes at 9600 baud take 36.458 ms
     assert wire.offer(GO, 5 + 36.458) == "superseded"
     assert wire.offer(GO, 5 + 36.459) == "sent"
 
@@ -123,7 +123,7 @@ def test_only_after_a_torn_line_the_next_one_begins_with_an_end_of_line(
 
 def test_only_the_bytes_that_were_taken_occupy_the_wire_and_count_as_sent() -> None:
     wire = Wire(9600).started()
-    wire.offer(GO, 100, takes=12)  # 12 bytes at 9600 baud: 12.5 ms
+    wire.offer(GO, 100, takes=12)  # 12 bytes at 9600 baud take 12.5 ms
     assert wire.gate.sent_ns == 100 * MS
     assert wire.offer(GO, 112.4) == "superseded"
     assert wire.offer(GO, 112.5, takes=0) == "superseded"

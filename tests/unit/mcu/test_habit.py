@@ -1,4 +1,4 @@
-"""Whether an MCU speaks by itself or answers, from when the two differ."""
+"""Tests that detect whether an MCU reports on its own or answers, as soon as the two differ."""
 
 from __future__ import annotations
 

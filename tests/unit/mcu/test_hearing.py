@@ -1,4 +1,4 @@
-"""What is heard of a board that does not link up, in words a person can act on."""
+"""Tests of the sentences about a board that does not link up, each with an action."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Speeds that are whole counts lie on a lattice, and no others do."""
+"""Speeds that are whole counts are multiples of a quantization step, and other speeds are not."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PERIOD = 0.01
 
 
 def found(speeds: list[float]) -> Lattice | None:
-    """What the search ends with."""
+    """Return the result of the search."""
     return sliced(speeds)[0]
 
 
 def sliced(speeds: list[float]) -> tuple[Lattice | None, int]:
-    """What the search ends with, and in how many slices."""
+    """Return the result of the search and the number of its slices."""
     searching, slices = Search(Counter(speeds)), 1
     while not searching.go_on():
         slices += 1
@@ -29,7 +29,7 @@ def sliced(speeds: list[float]) -> tuple[Lattice | None, int]:
 
 
 def told(quantum: float, wholes: list[int]) -> list[float]:
-    """So many counts a period, in two decimals."""
+    """Return speeds of these whole counts per period, in two decimals."""
     return [round(whole * quantum, 2) for whole in wholes]
 
 

@@ -1,7 +1,7 @@
-"""Drives of 450 m through the session: what the host's delays and lost lines cost the pose.
+"""Drives of 450 m through the session show the pose error from the host's delays and lost lines.
 
 Each is compared with the floor of the same drive: every line with its true time. `pytest -m soak
--s` drives all of it and prints each row of the table, its goal beside what was found.
+-s` runs all drives and prints each row of the table with its goal and its result.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ EFFORT = pytest.mark.parametrize(("seconds", "seeds"), [SHORT, FULL])
 
 
 def errors(name: str, goal: str, case: Case, seconds: float, seeds: int) -> np.ndarray:
-    """Means of m and deg: of the session, of the floor, of arrival times."""
+    """Return the mean errors in m and deg of the session, of the floor and of arrival times."""
     found = np.mean([drive(case, seed, seconds).errors() for seed in range(seeds)], axis=0)
     (m, deg), (times, times_deg) = found[FOUND], found[FOUND] / found[FLOOR]
     by, by_deg = found[ARRIVAL]
@@ -58,11 +58,14 @@ def test_stalls_of_the_host_cost_nothing(
 
 
 SLACK = np.array([0.02, 0.05])
-"""m and deg: what one drive that happens to end where it should leaves of the ratio."""
+"""Allowance in m and deg for a single drive that ends near the truth by chance."""
 
 
 def slack(seeds: int) -> np.ndarray:
-    """The mean of twenty drives has none: their floor is 0.05 to 0.13 m and 0.065 deg."""
+    """Return the allowance for this number of drives.
+
+    The mean of twenty drives needs none, because its floor is 0.05 to 0.13 m and 0.065 deg.
+    """
     return SLACK if seeds == 1 else 0.0 * SLACK
 
 
@@ -89,7 +92,10 @@ def test_a_fifth_of_the_lines_lost_costs_little(prompted: bool, seconds: float, 
 @pytest.mark.slow
 @EFFORT
 def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, seeds: int) -> None:
-    """What the host cannot tell from its own delays is left: arrival times have that too."""
+    """The remaining error is the MCU's delay, which the host cannot separate from its own.
+
+    Arrival times have it too.
+    """
     case = Case(prompted=True, thinking=0.004, stall=0.09)
     name = "stalls of 0.09 s, answers 1 to 5 ms late"
     found = errors(name, "half of arrival times'", case, seconds, seeds)
@@ -100,7 +106,7 @@ def test_of_answers_that_take_1_to_5_ms_their_own_delay_counts(seconds: float, s
     ("prompted", "seconds", "seeds"),
     [
         pytest.param(False, 60.0, 4, marks=pytest.mark.slow, id="reporting-45 m"),
-        # What answers around a stall get lost decides a minute.
+        # In one minute, the answers lost around a stall decide the result.
         pytest.param(True, 600.0, 3, marks=pytest.mark.soak, id="prompted-450 m thrice"),
         pytest.param(False, *FULL.values, marks=FULL.marks, id="reporting-450 m"),
         pytest.param(True, *FULL.values, marks=FULL.marks, id="prompted-450 m"),
@@ -117,7 +123,10 @@ def test_losses_on_a_batched_link_cost_no_more_than_arrival_times(
 
 @pytest.mark.slow
 def test_a_lost_answer_in_a_hundred_leaves_a_batched_link_its_clock() -> None:
-    """Else a stall is spread over lines that were made before it: 0.44 m of this drive."""
+    """Without the clock, a stall is spread over earlier lines.
+
+    That costs 0.44 m in this drive.
+    """
     host = drive(Case("ftdi", prompted=True, lost=0.01, stall=0.15), 0, 60.0)
     assert host.errors()[FOUND, 0] <= 0.25
 

@@ -1,4 +1,7 @@
-"""Bytes -> lines: any cut gives the same lines, noise costs nothing, a newline heals all."""
+"""Any cut of the bytes gives the same lines.
+
+Noise costs nothing else, and a newline always recovers.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +20,13 @@ pieces = st.one_of(
     st.integers(MAX_LINE - 3, 3 * MAX_LINE).map(lambda n: b"x" * n),
     st.binary(max_size=40),
 )
-"""What a wire may carry: lines, ends, halves, runs around the longest allowed length, noise."""
+"""Anything that a wire may carry: lines, line ends, halves, runs near the maximum length, noise."""
 
 streams = st.lists(pieces, max_size=12).map(b"".join)
 
 
 def feed(reader: LineReader, *chunks: bytes) -> list[bytes]:
-    """The lines of all chunks, one after the other."""
+    """Return the lines of all chunks in order."""
     return [line for chunk in chunks for line, _ in reader.feed(chunk)]
 
 

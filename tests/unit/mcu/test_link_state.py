@@ -1,4 +1,4 @@
-"""Trust in the link: earned by good lines in a row, lost by silence, damage and restarts."""
+"""Trust in the link grows by good lines in a row and is lost by silence, damage and restarts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ QUIET_NS = 100 * MS
 
 
 class Bench:
-    """A link to an MCU that says a good line every 10 ms."""
+    """A link to an MCU that sends a good line every 10 ms."""
 
     def __init__(self) -> None:
         self.link, self.now_ns = Link(QUIET_NS), 1000 * MS
@@ -54,7 +54,7 @@ def test_it_does_not_rise_against_a_reason() -> None:
 def test_lines_further_apart_than_quiet_are_told_and_make_no_link() -> None:
     bench = Bench()
     bench.good(2, ms=101)
-    assert bench.link.sparse_s == 0.0  # a single silence tells nothing
+    assert bench.link.sparse_s == 0.0  # a single silence proves nothing
     assert bench.good(10, ms=101) == "booting"
     assert bench.link.sparse_s == pytest.approx(0.101)
     bench.good()

@@ -1,4 +1,7 @@
-"""How a link that is not up is told: what is heard, what comes too seldom, who was late."""
+"""Tests of the text about a link that is down.
+
+The reasons are the received bytes, rare lines, and delays of this computer.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +70,7 @@ def test_one_silence_is_no_clock_of_the_boards_own() -> None:
 def test_lines_that_we_were_late_to_hear_are_no_advice_about_the_board(port: str) -> None:
     bench = Bench(McuConfig(port=port)).up()
     told = set()
-    for _ in range(20):  # a step of this computer's is late, and finds what came meanwhile
+    for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
         bench.wait(200)
         told.add(bench.session.words())
         bench.wait(10, GOOD)

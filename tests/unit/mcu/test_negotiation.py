@@ -1,4 +1,4 @@
-"""Asking for the check: what leaves, what counts as an answer, and what is settled for."""
+"""Tests of the negotiation of the check: questions, accepted answers, and the mode agreed on."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ REQUIRE = McuConfig(link_check="require")
 
 
 class Bench:
-    """A negotiation and its time; a line went unless `settle(False)` says otherwise."""
+    """A negotiation with its time; a line counts as sent unless `settle(False)` says otherwise."""
 
     def __init__(self, mcu: McuConfig = AUTO) -> None:
         self.check = Negotiation(mcu, STOP)
         self.now_ns = 1000 * MS
 
     def ask(self, ms: float = 0) -> list[bytes]:
-        """The questions that leave within so many periods of 10 ms, unanswered."""
+        """Return the questions sent within this time in periods of 10 ms, all unanswered."""
         asked = []
         for _ in range(int(ms / 10) + 1):
             self.check.settle(True)
@@ -61,7 +61,7 @@ class Bench:
         return False
 
     def drive(self, count: int = 1) -> list[int]:
-        """The sequences of so many lines."""
+        """Send this many lines and return their sequence numbers."""
         sequences = []
         for _ in range(count):
             self.check.settle(True)
@@ -69,7 +69,7 @@ class Bench:
         return sequences
 
     def checked(self, reading: Reading | None = None) -> Bench:
-        """Asked and answered."""
+        """Negotiate until the board has answered."""
         (_, question) = self.ask(110)
         self.reply(sequence_of(question), reading)
         assert self.check.checked
@@ -81,7 +81,7 @@ def sequence_of(line: bytes) -> int:
 
 
 def kind(line: bytes) -> str:
-    """plain, checked or sampled."""
+    """Return plain, checked or sampled."""
     suffix = line.partition(b"#")[2]
     return ("sampled" if suffix[2:3] == b"S" else "checked") if suffix else "plain"
 
@@ -151,7 +151,7 @@ def test_a_question_that_did_not_leave_cannot_be_answered() -> None:
     bench = Bench()
     (_, question) = bench.ask(100)
     bench.check.settle(False)
-    bench.check.settle(True)  # told once: later news is of another line
+    bench.check.settle(True)  # reported once; a later report belongs to another line
     assert bench.stale(sequence_of(question))
 
 
@@ -301,7 +301,7 @@ def test_an_answer_makes_those_before_it_stale() -> None:
 
 def test_an_answer_may_be_late_but_not_from_another_time() -> None:
     bench = Bench().checked()
-    assert LATE_NS == 300 * MS  # the MCU's own watchdog
+    assert LATE_NS == 300 * MS  # the timeout of the MCU's own watchdog
     first, second = bench.drive(2)
     bench.now_ns += LATE_NS
     bench.reply(first)

@@ -1,4 +1,7 @@
-"""Lateness against the promptest so far, by two clocks that were never compared."""
+"""Tests of lateness relative to the minimum delay so far.
+
+The two clocks were never compared.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,7 @@ def test_one_that_is_prompter_is_the_promptest_from_then_on() -> None:
 
 def test_the_drift_is_forgiven_by_the_time_that_passed_and_no_further_than_prompt() -> None:
     promptest = Promptest(0.01)
-    assert promptest.add(200, 100) == 100  # drift is forgiven after it
+    assert promptest.add(200, 100) == 100  # the drift allowance comes afterwards
     assert promptest.late == 98
     promptest.add(1000, 1000)
     assert promptest.late == 88

@@ -1,4 +1,4 @@
-"""The link's states, and the time, the gap and the session each good line belongs to."""
+"""Tests of the link's states, and of the time, gap and session of each good line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
 
 
 class Bench:
-    """A session, its time, and a port that can be opened and closed."""
+    """A session with its time and a port that can be opened and closed."""
 
     def __init__(
         self, mcu: McuConfig | None = None, rate_hz: float = 100.0, longest_reply: float = 0.25
@@ -47,13 +47,13 @@ class Bench:
         return self.session.line(self.now_ns, speeds)
 
     def answer(self, line: bytes | None) -> bytes:
-        """The checked reply to a line of ours."""
+        """Return the checked reply to a line from the host."""
         assert line is not None
         assert b"#" in line
         return seal(GOOD, int(line.partition(b"#")[2][:2], 16))
 
     def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
-        """So many times: a line leaves, and what it asks for comes back `ms` later."""
+        """Let a line leave and its answer return `ms` later, `count` times."""
         heard = []
         for _ in range(count):
             line = self.line()
@@ -62,14 +62,14 @@ class Bench:
         return heard
 
     def checked(self) -> Bench:
-        """A session whose link is up and checked."""
+        """Open the port and talk until the link is up and checked."""
         self.open().wait(10)
         self.talk(count=30)
         assert (self.link(), self.session.negotiation.state) == ("up", "checked")
         return self
 
     def names(self) -> list[str]:
-        """The events of the last update."""
+        """Return the names of the last update's events."""
         return [event.name for event in self.session.events]
 
     def open(self) -> Bench:
@@ -82,13 +82,13 @@ class Bench:
         return self
 
     def wait(self, ms: float, *reads: bytes) -> list[Feedback]:
-        """Let `ms` pass, then bring the session up to date with what was read just now."""
+        """Let `ms` pass, then update the session with the bytes that were read just now."""
         self.now_ns += int(ms * MS)
         received = tuple(Received(self.now, data) for data in reads)
         return self.session.update(self.now, self.port_open, self.opened, received)
 
     def up(self) -> Bench:
-        """Open the port and hear good lines until the link is up."""
+        """Open the port and feed good lines until the link is up."""
         self.open().wait(10)
         for _ in range(GOOD_LINES):
             self.wait(10, GOOD)
@@ -216,13 +216,13 @@ def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_after() -> 
 @pytest.mark.parametrize(
     ("rate_hz", "reply_period", "quiet_ms"),
     [
-        (100.0, 0.0, 100),  # the least
-        (40.0, 0.0, 100),  # 4 x 25 ms, just as long
+        (100.0, 0.0, 100),  # the minimum
+        (40.0, 0.0, 100),  # 4 x 25 ms, which is equal
         (20.0, 0.0, 200),  # 4 x 50 ms
         (23.0, 0.0, 173.913),  # 4 / 23 s
-        (100.0, 0.1, 300),  # 3 x 100 ms, for a sketch that speaks unprompted
-        (10.0, 0.1, 400),  # 4 x 100 ms beat 3 x 100 ms
-        (10.0, 0.2, 600),  # 3 x 200 ms beat 4 x 100 ms
+        (100.0, 0.1, 300),  # 3 x 100 ms, for firmware that reports without being asked
+        (10.0, 0.1, 400),  # 4 x 100 ms exceed 3 x 100 ms
+        (10.0, 0.2, 600),  # 3 x 200 ms exceed 4 x 100 ms
     ],
 )
 def test_quiet_is_100_ms_or_4_periods_or_3_reply_periods(
@@ -256,7 +256,7 @@ def test_a_new_session_is_silent_however_much_the_old_one_said() -> None:
 
 
 def sampled(bench: Bench, age_ns: int) -> Instant:
-    """The time of a line that was complete so long ago, as long as its bytes before that."""
+    """Return the time of a line that was complete `age_ns` ago, less the wire time of its bytes."""
     made_ns = bench.now_ns - age_ns - wire_ns(len(GOOD), 115200)
     return Instant(made_ns, made_ns + WALL_NS)
 
@@ -273,7 +273,8 @@ def test_a_line_that_ends_its_read_was_complete_then_and_made_its_own_bytes_earl
 def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
     bench = Bench(McuConfig(baud_rate=9600)).open()
     first, second = bench.wait(10, GOOD + GOOD + GOOD[:12])
-    # 45 bytes at 9600 baud: 46.875 ms; 12 bytes: 12.5 ms; 33 of its own: 34.375 ms
+    # At 9600 baud 45 bytes take 46.875 ms, 12 bytes 12.5 ms, and the 33 of the line itself 34.375
+    # ms.
     assert bench.now_ns - first.at.mono_ns == 46_875_000 + 34_375_000
     assert bench.now_ns - second.at.mono_ns == 12_500_000 + 34_375_000
     assert first.at.wall_ns - first.at.mono_ns == WALL_NS
@@ -296,8 +297,9 @@ def test_lines_read_together_share_the_time_since_the_read_before() -> None:
 def test_a_line_is_never_older_than_the_one_before_it() -> None:
     bench = Bench(McuConfig(baud_rate=9600)).open()
     (first,) = bench.wait(10, GOOD)
-    (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire in 1 ms of time
-    # Nor the same: who follows the transforms takes the second of two with one stamp for an echo.
+    (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire time within 1 ms
+    # The stamps must also differ. A reader of the transforms takes the second of two with one stamp
+    # for an echo.
     assert second.at.mono_ns == first.at.mono_ns + APART_NS
     assert second.at.wall_ns == first.at.wall_ns + APART_NS
     assert second.dt == 0.0
@@ -645,7 +647,7 @@ def test_the_note_behind_a_reason_says_the_check_in_force() -> None:
 
 
 def test_the_first_stop_of_a_silence_leaves_at_once() -> None:
-    """What the MCU was told last, a period ago, was to drive."""
+    """The last line to the MCU, one period ago, commanded motion."""
     bench = Bench().up()
     while not bench.session.silent(bench.now_ns):
         assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
@@ -684,7 +686,7 @@ def test_the_link_is_seen_to_go_when_the_mcu_restarts_within_one_read() -> None:
 
 
 def counts_after(bench: Bench, counts: int) -> tuple[int, ...]:
-    """What is found of an encoder that tells one count more or less from line to line."""
+    """Return the counts found for an encoder whose lines alternate by one count."""
     speed = math.tau / counts / 0.01
     for i in range(400):
         line = ",".join(f"{motor}p{speed * (i % 2):05.2f}" for motor in "abcd")
@@ -723,18 +725,18 @@ def test_the_bad_lines_of_an_update_are_one_event_for_each_reason(reads: int) ->
     assert bench.session.rejects == {"malformed": 201 * reads, "too_long": reads}
 
 
-# an output that is blocked
+# a blocked output
 
 
 def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> None:
-    """Let time pass after a line that left or did not, then bring the session up to date."""
+    """Let time pass after a line that left or did not leave, then update the session."""
     bench.now_ns += int(ms * MS)
     received = (Received(bench.now, read),) if read else ()
     bench.session.update(bench.now, bench.port_open, bench.opened, received, unsent=not left)
 
 
 def blocked(bench: Bench, ms: float) -> Bench:
-    """The session after lines did not leave for this long, while good lines kept coming."""
+    """Return the session after no line left for this long while good lines kept arriving."""
     bench.line()
     update(bench, left=True)
     for _ in range(round(ms / 10)):

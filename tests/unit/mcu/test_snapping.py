@@ -1,4 +1,4 @@
-"""A line says how far the wheels turned by whole counts, as long as those and its time agree."""
+"""A line gives the wheels' angles in whole counts as long as its speed and time agree with them."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ Four = tuple[float, float, float, float]
 
 @cache
 def drive(seconds: float = 30.0, seed: int = 1) -> Array:
-    """(periods + 1, 4): true angles; standing for a second at first."""
+    """Return true angles, shape (periods + 1, 4); the robot stands during the first second."""
     return angles(np.random.default_rng(seed), seconds)
 
 
 def speeds(counts: int | list[int], wheels: Array | None = None, period: float = PERIOD) -> Array:
-    """What a firmware reports of them, in two decimals."""
+    """Return the speeds that firmware reports for these angles, in two decimals."""
     told: Array = np.round(whole(counts, wheels) * math.tau / np.array(counts) / period, 2)
     return told
 
 
 def whole(counts: int | list[int], wheels: Array | None = None) -> Array:
-    """(periods, 4): whole counts of four encoders."""
+    """Return the whole counts of four encoders, shape (periods, 4)."""
     wheels = drive() if wheels is None else wheels
     return counted(wheels, np.array(counts))
 
@@ -43,13 +43,13 @@ def whole(counts: int | list[int], wheels: Array | None = None) -> Array:
 def look(
     snapping: Snapping, rows: Array, dt: float = PERIOD, bridged: float = 0.0
 ) -> list[Feedback]:
-    """Each row as a line, `dt` s after the one before."""
+    """Feed each row as a line, `dt` seconds after the one before."""
     lines = (Feedback(AT, WheelSpeeds(*row), dt, bridged=bridged) for row in rows.tolist())
     return [snapping.look(line) for line in lines]
 
 
 def total(lines: list[Feedback]) -> Array:
-    """rad that odometry makes of them, by wheel."""
+    """Return the angles that odometry derives from these lines, rad, by wheel."""
     turned: Array = np.array([folded(line) for line in lines]).sum(axis=0)
     return turned
 
@@ -107,7 +107,7 @@ def test_wheels_that_turn_backwards_count_backwards() -> None:
 
 
 def filtered(counts: int, share: float, seed: int) -> Array:
-    """Speeds behind a low pass."""
+    """Return speeds behind a low-pass filter."""
     rows, out = whole(counts, drive(12.0, seed)) * math.tau / counts / PERIOD, []
     speed = np.zeros(4)
     for row in rows:
@@ -186,7 +186,7 @@ def test_another_period_is_found_out_and_learned(period: float) -> None:
     lines = look(snapping, speeds(400, wheels, period), period)
     assert snapping.counts == (400,) * 4
     turned = np.sum(whole(400, wheels), axis=0) * math.tau / 400
-    assert total(lines) == pytest.approx(turned, abs=2.0)  # an eighth of a second of driving
+    assert total(lines) == pytest.approx(turned, abs=2.0)  # the motion of an eighth of a second
 
 
 def test_another_encoder_is_found_out_and_learned() -> None:
@@ -227,7 +227,7 @@ def test_after_a_gap_a_line_says_nothing_of_how_far_it_went() -> None:
 
 
 class Work:
-    """Lines of Python executed."""
+    """Counts the executed lines of Python."""
 
     def __init__(self) -> None:
         self.lines = 0

@@ -1,4 +1,4 @@
-"""How far reports step is learned from what recurs."""
+"""The quantization step of reports is learned from values that recur."""
 
 from __future__ import annotations
 

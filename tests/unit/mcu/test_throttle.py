@@ -1,4 +1,4 @@
-"""A throttle lets one through at once and the next only after a while."""
+"""A throttle lets one event through at once and the next one only after a while."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One wheel's counts are learned from its speeds, and then count."""
+"""Each wheel's counts are learned from its speeds, and are then used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ PERIOD = 0.01
 
 
 def reports(counts: int, lines: int, seed: int = 1) -> list[tuple[int, float]]:
-    """Whole counts and the speed that a firmware makes of them, of a wheel that turns about."""
+    """Return whole counts and the speeds that firmware derives from them.
+
+    The wheel turns randomly.
+    """
     dice, quantum, rows, speed, phase = (
         random.Random(seed),
         math.tau / counts / PERIOD,
@@ -98,7 +101,7 @@ def test_what_was_owed_to_another_pose_is_not_made_good() -> None:
 
 
 def test_what_was_owed_long_ago_is_not_made_good() -> None:
-    wheel, speed = WheelCounter(), 12.57  # 12.566 in truth
+    wheel, speed = WheelCounter(), 12.57  # the exact speed is 12.566
     for _ in range(20 * OWED_FOR):
         wheel.learn(speed)
     for _, varied in reports(400, 2000):

@@ -1,4 +1,4 @@
-"""A silence is told as the board's, or as that of a computer that did not run."""
+"""A silence is reported as the board's or as that of a computer that did not run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ QUIET_NS = 100 * MS
 
 
 def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Lateness:
-    """A good line at 0, steps so far apart, the last with a good line or not."""
+    """Look after each of these steps, beginning with a good line at 0.
+
+    `good` tells whether the last step brings a good line.
+    """
     lateness = Lateness(simulated, QUIET_NS)
     now_ns = 0
     lateness.look(now_ns, good=True)

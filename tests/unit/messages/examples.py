@@ -1,4 +1,4 @@
-"""One step's outputs with every figure different, so that a mixed-up field shows."""
+"""Outputs of one step in which every number is different, so that a swapped field shows."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ SNAPSHOT = Snapshot(
 
 
 def at(instant: Instant, **changes: Any) -> Outputs:
-    """The outputs of a tick at another time, with one estimate of that time."""
+    """Return the outputs of a tick at another time, with one estimate of that time."""
     estimate = replace(ESTIMATE, at=instant)
     return replace(OUTPUTS, now=instant, **({"estimates": (estimate,)} | changes))
 
 
 def later(seconds: float) -> Instant:
-    """That long after `START` on both clocks."""
+    """Return the instant this many seconds after `START` on both clocks."""
     ns = round(seconds * 1e9)
     return Instant(START.mono_ns + ns, START.wall_ns + ns)

@@ -1,9 +1,8 @@
-"""Struct <-> CDR, law by law, and against rosbags as an oracle that shares no line with ours.
+"""Structs and CDR: each rule of the format, and comparison with rosbags as an independent oracle.
 
-Padding is arbitrary on the wire. Ours and the oracle's is zero, so that whole payloads can be
-compared; that it is not read is tested by itself.
-
-    pytest -m soak -s tests/unit/messages/test_cdr.py
+Padding is arbitrary on the wire. Both encoders write zeros, so that whole payloads can be compared.
+A separate test proves that padding is not read. Run the soak with `pytest -m soak -s
+messages/test_cdr.py`.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ ROS_NAMES: dict[type[Struct], str] = {
 
 
 def built(value: Any, name: str) -> Any:
-    """A message as the oracle's class `name`, by the oracle's own list of fields."""
+    """Return a message as the oracle's class `name`, by the oracle's own list of fields."""
     fields = STORE.fielddefs[name][1]
     return STORE.types[name](**{f: built_field(getattr(value, f), desc) for f, desc in fields})
 
@@ -103,7 +102,7 @@ def built_field(value: Any, desc: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """The oracle's message as maps and lists."""
+    """Return the oracle's message as maps and lists."""
     if hasattr(value, "__msgtype__"):
         fields = STORE.fielddefs[value.__msgtype__][1]
         return {name: plain(getattr(value, name)) for name, _ in fields}
@@ -409,7 +408,7 @@ def test_no_other_header_is_read(head: bytes) -> None:
         Cdr(Twist).decode(head + bytes(48) if len(head) == 4 else head)
 
 
-# any struct
+# structs of any shape
 
 
 class Mixed(Struct, frozen=True):
@@ -474,7 +473,7 @@ def test_sequences_arrays_and_structs_in_them_come_back() -> None:
 
 
 def test_sequences_arrays_and_structs_are_written_item_by_item_in_order() -> None:
-    """Read one by one, with nothing but the struct module."""
+    """Reads the payload value by value with only the struct module."""
     payload = encoded(OUTER)
     at = 4
 
@@ -604,7 +603,7 @@ def test_a_type_that_cdr_cannot_tell_is_a_type_error(cls: Any) -> None:
         Cdr(cls)
 
 
-# what is refused
+# refusals
 
 
 def stamp(nanosec: int, order: str = "<") -> bytes:
@@ -676,7 +675,7 @@ NO_ITEMS: list[tuple[Message, int]] = [
     *((JointState(), at) for at in (16, 20, 24, 28)),
     (DiagnosticArray(Header(), []), 16),
 ]
-"""Empty messages, and where in their body the length of a sequence stands."""
+"""Empty messages, and the positions in their bodies of each sequence length."""
 
 
 @each(("empty", "at"), NO_ITEMS)
@@ -697,7 +696,7 @@ def test_a_sequence_longer_than_what_there_is_is_refused_before_it_is_made(
 
 
 class Numbers(Struct, frozen=True):
-    """A list without a bound."""
+    """A struct with an unbounded list."""
 
     items: list[float] = []
 
@@ -705,7 +704,7 @@ class Numbers(Struct, frozen=True):
 def test_one_item_more_than_there_are_is_refused() -> None:
     message = JointState(Header(), ["a", "b"], [1.0, 2.0], [3.0], [])
     payload = encoded(message)
-    at = payload.index(struct.pack("<d", 3.0)) - 8  # four bytes of padding between
+    at = payload.index(struct.pack("<d", 3.0)) - 8  # four bytes of padding lie in between
     assert payload[at : at + 8] == struct.pack("<II", 1, 0)
     longer = payload[:at] + struct.pack("<I", 2) + payload[at + 4 :]
     with pytest.raises(CdrError):
@@ -716,7 +715,7 @@ def test_one_item_more_than_there_are_is_refused() -> None:
         Cdr(TFMessage).decode(payload[:4] + struct.pack("<I", 3) + payload[8:])
 
 
-# no more items than there may be
+# limits on the number of items
 
 
 class Node(Struct, frozen=True):
@@ -762,7 +761,7 @@ def test_too_many_items_are_refused_before_one_of_them_is_decoded(
         before = struct.pack(">iIIB3x", 0, 0, 1, 0)
     head = (b"\0\1\0\0" if order == "<" else b"\0\0\0\0") + before
     count = (4096 - len(head) - 4) // 4
-    for items in (bytes(4 * count), b"\xff" * 4 * count):  # of which the second has no item
+    for items in (bytes(4 * count), b"\xff" * 4 * count):  # the second body contains no valid item
         payload = head + struct.pack(order + "I", count) + items
         assert len(payload) == 4096
         with pytest.raises(CdrError, match=rf"^{count} items where {most} may be$"):
@@ -790,7 +789,7 @@ def test_each_list_of_a_joint_state_is_bounded(field: str) -> None:
 def test_no_memory_is_kept_for_each_length_that_a_stranger_may_send() -> None:
     codec = Cdr(Numbers)
     payloads = [
-        # Ours would prepare `codec`.
+        # This project's decoder would prepare `codec`.
         struct.pack(order, 0, flag, 0, 0, count, *[0.5] * count)
         for count in range(1, 501)
         for flag, order in ((1, f"<4BI4x{count}d"), (0, f">4BI4x{count}d"))
@@ -830,7 +829,7 @@ def samples() -> list[Message]:
 
 
 def valid() -> list[tuple[bytes, Message]]:
-    """Each message in both byte orders."""
+    """Return each message in both byte orders."""
     return [
         (oracle_bytes(message, little), message)
         for message in samples()
@@ -850,7 +849,7 @@ def test_a_payload_that_is_cut_anywhere_is_refused() -> None:
 
 
 def weight(value: object) -> int:
-    """How many items and characters a message has in what has no length of its own."""
+    """Return the number of items and characters in the parts without a fixed length."""
     if isinstance(value, str):
         return len(value)
     if isinstance(value, list):
@@ -864,7 +863,7 @@ LENGTHS = (0, 1, 2, 5, 255, 2**16, 2**31 - 1, 2**31, 2**32 - 1)
 
 
 def damaged(payload: bytes, dice: random.Random) -> bytes:
-    """A valid payload after one to three accidents."""
+    """Return a valid payload after one to three accidents."""
     for _ in range(dice.randint(1, 3)):
         at = dice.randrange(len(payload) + 1)
         end = min(len(payload), at + dice.randint(0, 9))
@@ -881,7 +880,7 @@ def damaged(payload: bytes, dice: random.Random) -> bytes:
                 payload = payload[:at] + dice.randbytes(dice.randint(1, 9)) + payload[at:]
             case 5:
                 payload = payload[:at] + dice.randbytes(end - at) + payload[end:]
-            case _:  # a length overwritten: they stand at multiples of four
+            case _:  # overwrite a length, which lies at a multiple of four
                 at -= at % 4
                 order = dice.choice("<>")
                 length = struct.pack(f"{order}I", dice.choice((*LENGTHS, dice.randrange(64))))
@@ -907,7 +906,7 @@ def test_damaged_payloads_raise_nothing_but_cdr_errors_and_yield_no_more_than_th
             words = re.split(":|, has", str(error))[0]
             seen[re.sub(r"-?\d+", "n", words)] += 1
             continue
-        assert weight(got) <= len(data) + 72  # two covariances of fixed length
+        assert weight(got) <= len(data) + 72  # the two covariances have a fixed length
         again = codec.encode(got)
         assert codec.encode(codec.decode(again)) == again
         seen["accepted"] += 1

@@ -1,4 +1,4 @@
-"""A struct type is taken apart into its leaves, in order, and put together again."""
+"""A struct type is split into its leaves, in order, and put together again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""6x6 of what is known in the plane."""
+"""Tests of 6x6 covariances from a pose in the plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each row of `diagnostics` says, and how bad that is."""
+"""Tests of the text and level of each row of `diagnostics`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def values(one: DiagnosticStatus) -> dict[str, str]:
     return {pair.key: pair.value for pair in one.values}
 
 
-# names, which rqt_robot_monitor keeps what it has seen by
+# names, by which rqt_robot_monitor identifies its rows
 
 
 def test_every_status_names_the_robot_it_is_of() -> None:
@@ -63,7 +63,10 @@ def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
 
 
 def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:
-    """That takes half a second, and the monitor would see a row come."""
+    """The row must be there before the first look at the routers.
+
+    That look takes half a second, and the monitor would otherwise see a row appear.
+    """
     config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
     one = row("router", config)
     assert (one.level, one.message) == (OK, "not connected yet")
@@ -115,7 +118,7 @@ def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> Non
     one = row("serial link", replace(CONFIG, mcu=mcu, control=control))
     assert values(one) == {
         "port": "/dev/x",
-        "wire_use": "0.43",  # 33 bytes of 10 bits, 50 times a second, of 38400
+        "wire_use": "0.43",  # 50 lines a second of 33 bytes with 10 bits each, on 38400 baud
         "check": "plain",
         "lines": "100",
         "line_malformed": "2",

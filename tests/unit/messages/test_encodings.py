@@ -1,4 +1,7 @@
-"""msgpack, JSON and CDR by name and by first bytes; whatever comes, only `DecodeError` goes up."""
+"""msgpack, JSON and CDR are recognized by name and by first bytes.
+
+Any bad input raises only `DecodeError`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The end of a certificate is told in time, and an end that nobody can read is too."""
+"""The end of a certificate is reported in time, and an unreadable end is reported as well."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What goes on and on is one row; what is news keeps a row of its own."""
+"""A repeated event stays in one row, and a new event gets its own row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The JSON Schemas, judged by a validator that is not ours."""
+"""The JSON Schemas hold in a third-party validator."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ OUTGOING = set(SCHEMAS) - INCOMING
 
 
 def parts(name: str) -> list[dict[str, Any]]:
-    """The objects with fields of their own in a schema, itself included."""
+    """Return all objects of a schema that have fields of their own, itself included."""
     schema = SCHEMAS[name]
     return [one for one in (schema, *schema["$defs"].values()) if "properties" in one]
 
 
 def refused(name: str, value: object) -> list[str]:
-    """What the validator has against a value."""
+    """Return the validator's objections to a value."""
     return [error.message for error in Draft202012Validator(SCHEMAS[name]).iter_errors(value)]
 
 
@@ -47,7 +47,7 @@ def as_json(message: Message) -> Any:
     return msgspec.json.decode(encode(message, "json"))
 
 
-# their form
+# the form of the schemas
 
 
 @pytest.mark.parametrize("name", SCHEMAS)
@@ -76,11 +76,11 @@ def test_what_comes_in_may_leave_out_what_has_a_default_and_add_nothing(name: st
 
 
 def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
-    """By name, and with `In` where the same name goes out as well."""
+    """Types appear by name, with `In` added if the same name is also published."""
     said = {topic.direction: set[str]() for topic in TOPICS}
     for topic in TOPICS:
         said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
-    out = said["out"] | said["service"] | said["query"] | {"Imu"}  # that of the simulator
+    out = said["out"] | said["service"] | said["query"] | {"Imu"}  # published by the simulator
     came = said["in"] | {"SetPose", "Release", "Settings"}
     assert {name.removesuffix("In") for name in INCOMING} == came
     assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in came & out}
@@ -112,7 +112,7 @@ def test_a_pattern_is_one_of_ecmascript() -> None:
     assert "\\\\Z" not in msgspec.json.encode(SCHEMAS["Config"]).decode()
 
 
-# what the daemon says
+# messages that the daemon publishes
 
 
 @pytest.mark.parametrize("topic", [t for t in PUBLISHED if not t.simulated], ids=lambda t: t.key)
@@ -162,7 +162,7 @@ def test_the_configuration_in_force_is_as_its_schema_says(config: Config) -> Non
     assert refused("Config", {key: one for key, one in value.items() if key != "limits"})
 
 
-# what the daemon takes
+# messages that the daemon accepts
 
 NAMES = list(JointsConfig().as_tuple())
 ZERO: dict[str, Any] = {"linear": {}, "angular": {}}
@@ -171,7 +171,7 @@ WHEELS: dict[str, Any] = {"name": NAMES, "velocity": [1.0, 1, 1, 1.0]}
 
 
 def taken(name: str, value: object) -> bool:
-    """Whether the daemon takes it where that type comes in."""
+    """Return whether the daemon accepts a value on the key of this type."""
     key = {"J": "wheel_cmd/app", "T": "cmd/app", "I": "imu"}.get(name[0], "set_pose")
     payload = msgspec.json.encode(value)
     if name == "Release":

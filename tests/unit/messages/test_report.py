@@ -1,4 +1,4 @@
-"""What is due after a step, each message with the stamp, frames and cells it must have."""
+"""Tests of the messages due after a step: their stamps, frames and covariance cells."""
 
 from __future__ import annotations
 
@@ -59,7 +59,10 @@ from acsard.values import (
 from tests.unit.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
-"""What is measured or decided; what is true of a simulated robot does not come by a report."""
+"""Keys that a report publishes.
+
+The simulator publishes the true values of a simulated robot itself.
+"""
 FRAMES = OdometryConfig(
     odom_frame="r7/odom",
     base_frame="r7/base",
@@ -80,7 +83,7 @@ def never() -> Snapshot:
 
 
 def published(outputs: Outputs = OUTPUTS, config: Config = CONFIG) -> dict[str, Any]:
-    """Everything due after these outputs as the first ones, by key."""
+    """Return all messages due after these outputs if they are the first, by key."""
     return dict(Report(config, START).due(outputs, ALL, look))
 
 
@@ -89,7 +92,7 @@ def rates(**hz: float) -> Config:
 
 
 def times_of(key: str, config: Config, steps: int = 1000, **changes: Any) -> list[int]:
-    """The numbers of those steps, at 100 Hz, after which `key` was published."""
+    """Return the numbers of the steps at 100 Hz after which `key` was published."""
     report = Report(config, START)
     return [
         step
@@ -212,7 +215,7 @@ YAWS = [
     (math.pi, Quaternion(0, 0, 1, 0)),
     (math.pi / 3, Quaternion(0, 0, 0.5, math.sqrt(0.75))),
 ]
-"""By hand: a turn by a about z is sin(a/2) k + cos(a/2)."""
+"""Worked by hand: a turn by a about z is sin(a/2) k + cos(a/2)."""
 
 RPYS = [
     ((0, 0, 0), Quaternion(0, 0, 0, 1)),
@@ -226,7 +229,10 @@ RPYS = [
     ((1, 1, 1), Quaternion(0, HALF, 0, HALF)),
     ((-1, 1, 0), Quaternion(-0.5, 0.5, 0.5, 0.5)),
 ]
-"""Quarter turns about x, y, z; by hand as qz qy qx with i j = k, j k = i, k i = j."""
+"""Quarter turns about x, y, z with their quaternions, worked by hand as qz qy qx.
+
+The rules are i j = k, j k = i, k i = j.
+"""
 
 
 def close(q: Quaternion, r: Quaternion) -> bool:
@@ -254,7 +260,7 @@ angle = st.floats(-math.pi, math.pi)
 
 
 def rotated(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """q v q*, as t = 2 u x v, v' = v + w t + u x t."""
+    """Return q v q*, computed as t = 2 u x v, v' = v + w t + u x t."""
     (a, b, c), u = v, (q.x, q.y, q.z)
     t = tuple(
         2 * component
@@ -404,7 +410,7 @@ def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
     assert "acsard: router" not in {one.name for one in published()["diagnostics"].status}
 
 
-# only what somebody listens to
+# keys without subscribers
 
 
 @pytest.mark.parametrize("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
@@ -472,7 +478,7 @@ def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
     assert "cmd_vel_out" not in published(replace(OUTPUTS, due=False))
 
 
-# how often
+# publishing rates
 
 
 @pytest.mark.parametrize("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
@@ -491,7 +497,7 @@ def test_the_average_rate_is_the_configured_one(key: str, hz: float) -> None:
 def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> None:
     report, count = Report(rates(odom=hz), START), 0
     for step in range(1000):
-        late = (step * 7 % 11 - 5) * 1e-4  # up to half a millisecond either way
+        late = (step * 7 % 11 - 5) * 1e-4  # up to half a millisecond early or late
         count += len(list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)))
     assert abs(count - hz * 10) <= 1
 
@@ -500,7 +506,7 @@ def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> No
 def test_steps_a_little_early_or_late_do_not_make_the_gaps_uneven(hz: float, steps: int) -> None:
     report, found = Report(rates(odom=hz), START), []
     for step in range(1000):
-        late = (5 - step * 7 % 11) * 1e-5  # the first is the latest of all
+        late = (5 - step * 7 % 11) * 1e-5  # the first step is the latest of all
         if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)):
             found.append(step)
     assert {b - a for a, b in pairwise(found)} == {steps}
@@ -655,7 +661,7 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
     assert with_gyro(GyroStatus("used"))[0].track == ""
 
 
-# wheels that are doubted
+# suspect wheels
 
 
 def test_what_front_and_rear_say_of_each_other_is_shown() -> None:

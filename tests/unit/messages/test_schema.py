@@ -1,4 +1,4 @@
-"""The structs on the bus: shaped and named like their ROS 2 messages."""
+"""The structs on the bus have the shape and names of their ROS 2 messages."""
 
 from __future__ import annotations
 

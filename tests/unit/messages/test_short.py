@@ -1,4 +1,4 @@
-"""A message in a line for people says the same as its JSON, and nothing that is for programs."""
+"""A message on one line says the same as its JSON, without the parts meant for programs."""
 
 from __future__ import annotations
 

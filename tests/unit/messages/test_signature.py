@@ -1,4 +1,4 @@
-"""Who sent a command is read from its attachment, or from none that is not ours."""
+"""The sender of a command is read from the project's own attachment, if there is one."""
 
 from __future__ import annotations
 

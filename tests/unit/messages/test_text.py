@@ -1,4 +1,4 @@
-"""What a stranger wrote does nothing to a terminal."""
+"""Text from an unknown sender cannot control a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table: every key the design promises, each once, and the form of a full key."""
+"""The table has every key of the design exactly once, and the form of a full key."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ PROMISED = [
     ("whoami/<role>", "query", "WhoAmI"),
     ("alive", "out", "liveliness token"),
 ]
-"""DESIGN section 3, and what the door tells the daemon."""
+"""Keys of DESIGN section 3, and the key on which the TLS gateway reports to the daemon."""
 
 
 def test_the_table_is_the_one_of_the_design() -> None:

@@ -1,7 +1,7 @@
-"""What a stranger may put into a recording in place of a robot.
+"""Hostile content for the robot state in a recording.
 
-`python -m tests.unit.record.attacks` reads each, and prints what was said of it as JSON. Whoever
-starts it bounds its time and memory: what holds it up or fills them is no refusal.
+`python -m tests.unit.record.attacks` reads each attack and prints the refusals as JSON. The caller
+must limit its time and memory, because an attack that hangs or fills them counts as a failure.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ EXTENSION = 201
 
 
 def text(words: str) -> bytes:
-    """A short one."""
+    """Return a pickled short string."""
     data = words.encode()
     return pickle.SHORT_BINUNICODE + bytes([len(data)]) + data
 
 
 def named(module: str, name: str) -> bytes:
-    """A class, or what else has that name."""
+    """Return the pickled reference to a class or any other object with that name."""
     return text(module) + text(name) + pickle.STACK_GLOBAL
 
 
 def whole(body: bytes) -> bytes:
-    """With its beginning and its end."""
+    """Return a pickle with its first and last opcodes."""
     return pickle.PROTO + bytes([PROTOCOL]) + body + pickle.STOP
 
 
 def doubled(times: int) -> bytes:
-    """A tuple that has one twice, which has one twice ..."""
+    """Return nested tuples in which each level contains the next one twice."""
     levels = [pickle.BINGET + bytes([n]) + b"\x86\x94" for n in range(times)]
     return pickle.EMPTY_TUPLE + pickle.MEMOIZE + b"".join(levels)
 
 
 def counted_again(keys: int, times: int) -> bytes:
-    """A large dict, and so many counters that are made of it."""
+    """Return a large dict and this many counters made from it."""
     pairs = b"".join(pickle.BININT + struct.pack("<i", key) + ONE for key in range(keys))
     given = pickle.EMPTY_DICT + pickle.MARK + pairs + pickle.SETITEMS + pickle.TUPLE1
     made = (pickle.BINGET + b"\x00" + pickle.BINGET + b"\x01" + pickle.REDUCE) * times
@@ -51,13 +51,16 @@ def counted_again(keys: int, times: int) -> bytes:
 
 
 def of_one_hash(keys: int) -> bytes:
-    """A dict whose keys Python cannot tell apart but by comparing all of them."""
+    """Return a dict whose keys all have one hash.
+
+    Python must compare each key with all others.
+    """
     pairs = (pickle.LONG1 + b"\x0c" + (key * HASHED).to_bytes(12, "little") for key in range(keys))
     return pickle.EMPTY_DICT + pickle.MARK + ONE.join(pairs) + ONE + pickle.SETITEMS
 
 
 def attributes(*pairs: tuple[bytes, bytes]) -> bytes:
-    """A dict of them, and the opcode that gives them to the part below."""
+    """Return a dict of attributes and the opcode that sets them on the object below."""
     inside = b"".join([key + value for key, value in pairs])
     return pickle.EMPTY_DICT + pickle.MARK + inside + pickle.SETITEMS + pickle.BUILD
 
@@ -72,7 +75,7 @@ ONE = pickle.BININT1 + b"\x01"
 NUMBER = struct.Struct("<Q")
 
 BODIES: dict[str, bytes] = {
-    # without end
+    # attacks without an end
     "tuples in tuples": NOTHING + pickle.TUPLE1 * 100_000,
     "lists in lists": pickle.EMPTY_LIST * 50_000 + pickle.APPEND * 49_999,
     "parts in parts": (BARE + pickle.EMPTY_DICT + text("a")) * 2000
@@ -99,7 +102,7 @@ BODIES: dict[str, bytes] = {
     "a billion things to remember": NOTHING + pickle.LONG_BINPUT + struct.pack("<I", 1 << 30),
     "an old text": pickle.STRING + b"x" * 100_000 + b"\n",
     "a deque without room": DEQUE + NOTHING + pickle.LONG1 + b"\x0a" + b"\x7f" * 10 + b"\x86R",
-    # what does something
+    # attacks that run code
     "a call": named("os", "system") + text("true") + pickle.TUPLE1 + pickle.REDUCE,
     "an old call": b"cos\nsystem\n" + text("true") + pickle.TUPLE1 + pickle.REDUCE,
     "an older call": b"(" + text("true") + b"ios\nsystem\n",
@@ -124,7 +127,7 @@ BODIES: dict[str, bytes] = {
     "colours": named("\x1b[31mred", "\x1b]0;title\x07"),
     "an error": named("acsard.values", "AcsardError") + NOTHING + pickle.NEWOBJ,
     "an error that is called": named("acsard.values", "AcsardError") + NOTHING + pickle.REDUCE,
-    # other parts
+    # other objects
     "a class that is changed": ROBOT + pickle.NONE
     + pickle.EMPTY_DICT + text("step") + ONE + pickle.SETITEM + pickle.TUPLE2 + pickle.BUILD,
     "a class that gets attributes": ROBOT + attributes((text("step"), ONE)),
@@ -150,7 +153,7 @@ BODIES: dict[str, bytes] = {
     "a robot as a key": pickle.EMPTY_DICT + BARE + ONE + pickle.SETITEM,
     "keys in a tuple": NOTHING + ONE + ONE + pickle.SETITEM,
     "a longer tuple": NOTHING + ONE + pickle.APPEND,
-    # no pickle
+    # bytes that are not a pickle
     "nothing on the stack": b"",
     "two on the stack": ONE + ONE,
     "a mark that stays": pickle.MARK + ONE,

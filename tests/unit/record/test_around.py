@@ -1,4 +1,4 @@
-"""What happened keeps the files around it."""
+"""An event keeps the files recorded around its time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from acsard.record.room import AROUND_NS, Kind
 
 
 def kind(around: Around[str]) -> Kind:
-    """Of the file that is being written now."""
+    """Return the kind of the file that is being written now."""
     return around.kind
 
 

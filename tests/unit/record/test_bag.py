@@ -1,4 +1,4 @@
-"""What stands beside a bag is YAML that says what was meant."""
+"""The metadata file next to a bag is YAML with the intended values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A batch of steps says exactly what came in and what went out."""
+"""A batch of steps reproduces exactly its inputs and outputs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers come back from their columns, whatever they are; other bytes do not."""
+"""All numbers survive the round trip through their columns, and invalid bytes are refused."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_more_numbers_than_there_can_be_are_refused() -> None:
 
 
 def test_a_code_of_any_length_is_none() -> None:
-    """A few bytes must not ask for numbers of thousands of bits, each added to all that follow."""
+    """A few bytes must not produce numbers of thousands of bits, each added to all that follow."""
     zeros = 100_000
     bits = "1" + "1" + "0" * zeros + "1" + "0" * zeros + "1"
     held = int(bits, 2).to_bytes((len(bits) + 7) // 8)

@@ -1,4 +1,4 @@
-"""A directory of recordings keeps its bounds, and what must be kept goes last."""
+"""A directory of recordings stays within its bounds, and protected files are deleted last."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def record(one: Ring, size: int = 10, kind: Kind = "plain", days: int = 0) -> Pa
 
 
 def later(one: Ring) -> None:
-    """Trim when the clock has gone on by itself for long enough."""
+    """Trim after the clock has run steadily for long enough."""
     for mono_ns in (0, STEADY_NS):
         now = Instant(mono_ns, NOW_NS + mono_ns)
         one.tend(now)
@@ -91,7 +91,7 @@ def test_the_service_s_directory_lets_in_whoever_gets_there_but_to_its_lock(
 ) -> None:
     where = tmp_path / "b"
     one = ring(where)
-    record(one)  # as a version did that recorded for itself alone
+    record(one)  # as an older version did, which had one directory for one robot
     cut = one.begin(about())
     cut.add("steps", NOW_NS, b"whole")
     cut.flush()
@@ -247,7 +247,7 @@ def test_where_others_have_taken_the_disk_the_oldest_go_and_what_is_kept_stays(
     one.tend(Instant(1, NOW_NS + 1))
     assert [path.exists() for path in plain] == [False] * 2 + [True] * 8
     left = []
-    for _ in range(4):  # others take all there is, again and again
+    for _ in range(4):  # other programs repeatedly use all free space
         others = total - sizes(tmp_path)
         one.tend(Instant(2, NOW_NS + 2))
         left.append((sum(path.exists() for path in plain), kept.exists()))
@@ -325,7 +325,7 @@ def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
 
 
 def test_what_only_has_a_recording_s_name_is_none_of_them(tmp_path: Path) -> None:
-    """A pipe would keep its reader for ever, and a link leads elsewhere."""
+    """A pipe would block its reader forever, and a link leads elsewhere."""
     whole = tmp_path / "000001-20260101T000000Z.mcap"
     whole.touch()
     os.mkfifo(tmp_path / "000002-20260101T000000Z.mcap")
@@ -339,7 +339,7 @@ def test_what_only_has_a_recording_s_name_is_none_of_them(tmp_path: Path) -> Non
 def test_what_was_cut_and_cannot_be_read_here_stays_and_is_told(
     tmp_path: Path, event: bytes
 ) -> None:
-    """By a later version, say; or with what no version has written."""
+    """The file comes from a later version, or contains an event that no version writes."""
     part = tmp_path / f"000007-20270115T080000Z{PART}"
     writing = Writing(part, replace(about(), format="acsard/99") if not event else about())
     writing.add("events" if event else "steps", NOW_NS, event or b"later")
@@ -364,8 +364,11 @@ def test_a_copy_that_did_not_become_whole_goes(tmp_path: Path) -> None:
 def test_a_file_that_somebody_removes_meanwhile_costs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between the list of them and the look at each: when room is made, when the clock is set, and
-    when what a crash has cut is made whole."""
+    """The file disappears between the listing and the look at it.
+
+    This is tested while space is freed, when the clock is set, and while a truncated file is
+    recovered.
+    """
 
     def found(where: Path) -> list[Path]:
         paths = listed(where)
@@ -386,7 +389,7 @@ def test_a_file_that_somebody_removes_meanwhile_costs_nothing(
     part.add("steps", NOW_NS, b"cut")
     part.flush()
     one.close()
-    monkeypatch.setattr(Ring, "trim", lambda *_: None)  # it would find the third first
+    monkeypatch.setattr(Ring, "trim", lambda *_: None)  # the trim would find the third file first
     removed = [third]
     again = ring(tmp_path)
     assert again.cut_ns is not None

@@ -1,4 +1,7 @@
-"""A recording of format 1 is read as it was by the code that wrote it, and told to be one."""
+"""A recording of format 1 is read as by the code that wrote it.
+
+Its old format is reported.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ COUNT = 2844
 
 
 def said(step: Step) -> str:
-    """What came in and what went out, as text that stays the same when fields are added."""
+    """Return a step's inputs and outputs as text that stays the same when fields are added."""
     i, o = step.inputs, step.said
     reads = [(read.at.mono_ns, read.at.wall_ns, read.data) for read in i.received]
     now = i.now.mono_ns, i.now.wall_ns, i.tick, i.missed, i.opened, i.port_trouble
@@ -29,7 +32,7 @@ def said(step: Step) -> str:
 
 
 def checksum(path: Path) -> tuple[int, int]:
-    """How many steps, and of all that they say."""
+    """Return the number of steps and a checksum of their text."""
     count = value = 0
     for step in steps(Recording(path)):
         count, value = count + 1, zlib.crc32(said(step).encode(), value)
@@ -65,7 +68,7 @@ def test_bytes_that_are_none_of_it_are_refused_and_never_more() -> None:
         except BatchError:
             pass
     with pytest.raises(BatchError):
-        decode(batches[0])  # of the format of today it is none
+        decode(batches[0])  # it is not a batch of the current format
 
 
 @pytest.mark.parametrize("data", [b"", b"\0" * 16, b"\0" * 16 + b"\x09", b"\0" * 16 + b"\x01"])

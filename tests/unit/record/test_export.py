@@ -1,4 +1,7 @@
-"""Exported files, read by programs of others, and what becomes of what stands there already."""
+"""Exported files can be read by third-party programs.
+
+The tests also cover files that are already in their place.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ KINDS: tuple[Kind, ...] = ("mcap", "csv", "rosbag2")
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A drive of two sources, recorded."""
+    """Record a drive with two sources."""
     tape = Tape()
     world = World(recorder=tape)
     world.drive(0.5, 0.3, 0.4)
@@ -79,7 +82,7 @@ def test_the_library_of_mcap_finds_it_finished_indexed_and_compressed(
 
 
 def counted(reader: Any) -> Counter[str]:
-    """The messages of each topic, every one decoded."""
+    """Return the number of messages per topic, all decoded."""
     counts: Counter[str] = Counter()
     with reader:
         for connection, _, data in reader.messages():
@@ -205,7 +208,7 @@ def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> Non
     for name in ("metadata.yaml", "bag_0.db3"):
         (bag / name).write_text("1")
     with pytest.raises(FileNotFoundError), beside(bag, force=True):
-        pass  # nothing is written that could
+        pass  # the block writes no file that could replace it
     assert {one.name for one in bag.iterdir()} == {"metadata.yaml", "bag_0.db3"}
     assert [*tmp_path.iterdir()] == [bag]
 

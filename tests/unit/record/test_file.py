@@ -1,4 +1,4 @@
-"""A recording is read whatever became of its file: all that is whole, and never a traceback."""
+"""A damaged recording gives all its whole chunks and never a traceback."""
 
 from __future__ import annotations
 
@@ -66,7 +66,10 @@ def test_the_formats_own_reader_reads_it(tape: Tape, whole: Path) -> None:
 
 
 def on_a_machine(tape: Tape) -> None:
-    """Times as a quiet machine has them: a step some ten us late, a read seen some us later."""
+    """Replace the times by those of a quiet machine.
+
+    A step is some tens of us late, and a read is noticed some us late.
+    """
     dice = random.Random(1)
     for at, taken in enumerate(tape.taken):
         late = 1000 * round(dice.expovariate(1 / 30))
@@ -152,13 +155,13 @@ def test_of_a_file_with_damaged_chunks_all_others_are_read(
         bad = bytearray(data)
         hit = dice.randrange(len(spans))
         start, end = spans[hit]
-        # Its head too: what it is, how long, when, in what it is packed.
+        # The damage includes the chunk's head: its type, length, times and compression.
         at = dice.randrange(start, dice.choice([start + 60, end]))
         bad[at] ^= 1 << dice.randrange(8)
         path.write_bytes(bad)
         recording = Recording(path)
         got = [step.number for step in steps(recording)]
-        assert recording.damaged == 1 or got == numbers(whole)  # a bit that says nothing
+        assert recording.damaged == 1 or got == numbers(whole)  # the bit has no meaning
         assert recording.whole == (recording.damaged == 0)
         hits += recording.damaged
         assert recording.ended
@@ -173,7 +176,7 @@ def test_of_a_file_with_damaged_chunks_all_others_are_read(
 def test_a_chunk_whose_head_is_damaged_costs_nothing(
     place: int, hit: int, whole: Path, tmp_path: Path
 ) -> None:
-    """Byte by byte: what it is, then how long."""
+    """Each byte of the type and the length is damaged in turn."""
     bad, path = bytearray(whole.read_bytes()), tmp_path / "head.mcap"
     bad[chunks(bad)[hit][0] + place] ^= 0x41
     path.write_bytes(bad)
@@ -183,7 +186,7 @@ def test_a_chunk_whose_head_is_damaged_costs_nothing(
 def test_where_two_chunks_beside_one_another_are_damaged_all_others_are_read(
     whole: Path, tmp_path: Path
 ) -> None:
-    """The first claims to be as long as both, and what it holds is wrong, too."""
+    """The first chunk claims the length of both, and its content is damaged as well."""
     bad, path = bytearray(whole.read_bytes()), tmp_path / "two.mcap"
     (begin, middle), (_, end) = chunks(bad)[1:3]
     bad[begin + 1 : begin + 9] = (end - begin - 9).to_bytes(8, "little")

@@ -1,4 +1,7 @@
-"""Another configuration under a robot in the midst of its life: what follows from it changes."""
+"""A robot gets another configuration in the middle of a replay.
+
+The state derived from the configuration changes.
+"""
 
 from __future__ import annotations
 

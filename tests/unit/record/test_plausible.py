@@ -1,4 +1,4 @@
-"""What no daemon has recorded is no batch of steps."""
+"""A batch of steps that no daemon can have recorded is refused."""
 
 from __future__ import annotations
 

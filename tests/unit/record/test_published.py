@@ -1,4 +1,7 @@
-"""What a robot that lives again says; that it is what it said then: `scenarios/test_export.py`."""
+"""Tests of the messages that a replayed robot publishes.
+
+`scenarios/test_export.py` proves that they equal the original messages.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recorder between a loop that never waits and a disk that may do anything."""
+"""Tests of the recorder between a loop that never waits and a disk that may fail in any way."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def config(where: Path, megabytes: float = 10.0) -> Config:
 
 
 class Bench:
-    """A world whose recorder writes when told: its thread waits for the end."""
+    """A world whose recorder writes on request, because its thread waits for the end."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class Bench:
         self.world = World(config(where, megabytes), recorder=self.recorder, latches=latches)
 
     def write(self) -> None:
-        """What the thread does each second."""
+        """Do the work that the thread does each second."""
         self.recorder._disk.round(self.recorder._taken(), False)
 
     def drive(self, seconds: float) -> None:
@@ -193,7 +193,7 @@ def happen_fault(world: World) -> None:
 def test_the_minute_before_and_after_what_happened_is_kept(
     happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    minute = 6  # s: the same in a tenth of the time
+    minute = 6  # one tenth of a minute in s, to save time
     monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
     monkeypatch.setattr(around, "AROUND_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
@@ -222,7 +222,7 @@ def test_the_minute_before_and_after_what_happened_is_kept(
 
 
 def die(bench: Bench) -> None:
-    """As a process does that is killed: what is open is closed, nothing else."""
+    """Close the open files and nothing else, as the kernel does for a killed process."""
     side = bench.recorder._disk
     assert side._writing is not None
     assert side._ring is not None
@@ -264,7 +264,7 @@ def test_the_minute_before_and_after_what_happened_is_kept_over_a_restart(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A fault and then an orderly restart, or the other way round."""
+    """A fault is followed by an orderly restart, or the other way round."""
     before = Bench(tmp_path, monkeypatch)
     before.world.drive(0.5, 0.2, seconds=1.0)
     if fault_before:
@@ -288,13 +288,13 @@ BUG = "a fault of our own"
 
 
 def ends_by(bench: Bench, error: Exception) -> list[Path]:
-    """As the daemon does that such a fault ends, out of the task of the loop."""
+    """Close the recorder as the daemon does after such an error in a task of the loop."""
     bench.recorder.close(ExceptionGroup("unhandled errors in a TaskGroup", [error]))
     return listed(bench.where)
 
 
 def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stop is beyond it."""
+    """Make the robot raise an error at the next request."""
     whole = Robot.step
 
     def step(robot: Robot, inputs: Inputs) -> Outputs:
@@ -422,7 +422,10 @@ def test_the_minute_before_a_fault_of_our_own_is_kept(
 def test_a_clock_that_is_set_costs_no_recording(
     jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A robot without a clock of its own, that was off for weeks, hears the time once it drives."""
+    """A robot without a real-time clock was off for weeks.
+
+    It gets the time only while it drives.
+    """
     monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
     monkeypatch.setattr(around, "AROUND_NS", 0)
     seen = set[str]()
@@ -459,19 +462,19 @@ def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
 
 
 def no_copies(handle: int) -> None:
-    """A disk that syncs no copy of what was cut."""
+    """Fail each sync of a recovered copy."""
     if os.readlink(f"/proc/self/fd/{handle}").endswith(".new"):
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
 
 def full(handle: int) -> None:
-    """A disk that has no room for anything, which it says at a sync."""
+    """Fail as a disk without free space, which reports that only at a sync."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @pytest.fixture
 def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """One that drives, and tries a disk that refused in the next round."""
+    """Return a bench that drives and retries a failed disk in the next round."""
     monkeypatch.setattr(disk, "RETRY_ROUNDS", 0)
     bench.world.drive(0.5, 0.2, seconds=0.5)
     rounds(bench)
@@ -479,21 +482,21 @@ def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 
 def rounds(bench: Bench, count: int = 3) -> None:
-    """Short ones: in the first a disk is tried again, in the second a file begins."""
+    """Run short rounds: the first one retries the disk, the second one starts a file."""
     for _ in range(count):
         bench.world.hold(0.5, 0.2, seconds=0.1)
         bench.write()
 
 
 def refuse(bench: Bench) -> None:
-    """The disk takes no more, is tried again, and takes what comes then."""
+    """Make the disk refuse a write, then let the retry succeed."""
     bench.recorder._disk._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
     rounds(bench)
 
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """bytes: what is beyond is not written, as on a disk that is full."""
+    """Limit the size of files in bytes; writes beyond it fail as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -532,7 +535,7 @@ def test_an_end_that_the_disk_was_too_slow_for_is_no_crash_unless_it_was_one(
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", hangs)
         eager.recorder.close(error)
-        # As it is on the disk when the process is gone.
+        # This is the state of the disk after the process has ended.
         shutil.copytree(eager.where, where := tmp_path_factory.mktemp("again") / "record")
     goes.set()
     eager.recorder._thread.join(20.0)
@@ -565,7 +568,7 @@ def test_what_a_disk_did_not_take_any_more_is_counted_to_the_step(eager: Bench) 
 def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
     over: bool, eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At a chunk's sync, and at that of a file's end."""
+    """The sync fails for a chunk, or at the end of a file."""
     (part,) = listed(eager.where)
     synced = part.stat().st_size
     if over:
@@ -573,7 +576,7 @@ def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
         rounds(eager, 1)
-    part.write_bytes(part.read_bytes()[:synced])  # what was not synced never came there
+    part.write_bytes(part.read_bytes()[:synced])  # data that was not synced never reached the disk
     rounds(eager)
     missing = eager.recorder.status.missing
     numbers = numbers_of(eager.end())
@@ -581,7 +584,7 @@ def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
 
 
 def cuts(paths: list[Path]) -> list[tuple[str, str]]:
-    """What each file is by its name, and why it was finished late."""
+    """Return the suffix of each file and the reason why it was finished late."""
     return [(p.name.partition(".")[2], last.cut) for p in paths if (last := closing(p))]
 
 
@@ -620,7 +623,7 @@ def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
         rounds(eager, 1)
     assert eager.recorder.status.trouble.endswith("No space left on device")
     (part,) = listed(eager.where)
-    part.write_bytes(part.read_bytes()[:-40])  # what was not synced never came there
+    part.write_bytes(part.read_bytes()[:-40])  # data that was not synced never reached the disk
     rounds(eager)
     assert cuts(eager.end()) == [("mcap", "disk"), ("mcap", "")]
 
@@ -676,7 +679,7 @@ def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
 def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_same(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For want of inodes, say, which others take as soon as one is there."""
+    """The disk may lack inodes, for example, and another program takes each one that is freed."""
     die(eager)
     ring = Ring(config(eager.where).record)
     before = [
@@ -722,7 +725,7 @@ def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -
 
 
 def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """While the thread hangs in a sync, a thousand steps go by."""
+    """A thousand steps pass while the thread hangs in a sync."""
     asked, goes, sync = threading.Event(), threading.Event(), os.fsync
     who = set[str]()
 

@@ -1,4 +1,4 @@
-"""What was cut becomes whole in its place, where there is no room for a copy."""
+"""A truncated file is recovered in place if there is no room for a copy."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
 def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
     data: bytes, torn: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One that gives no room back says so again and again, some of them only at a sync."""
+    """A disk without free space repeats its error, sometimes only at a sync."""
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     cut = data[: chunks(data)[-1][1]] + torn
     part.write_bytes(cut)

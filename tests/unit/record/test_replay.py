@@ -1,4 +1,4 @@
-"""What a replay counts; that it finds each kind of difference is in the scenarios."""
+"""Tests of the counters of a replay; the scenarios prove that it finds each kind of difference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Which recordings go: the oldest, what is kept last, and others have their part of the disk."""
+"""Tests of the order in which recordings are deleted.
+
+The oldest goes first and protected ones last, and other programs keep a share of the disk.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +103,7 @@ def test_a_clock_is_believed_that_was_not_set_for_a_while() -> None:
     assert not clock.believed(Instant(STEADY_NS, 0))
     assert clock.look(Instant(0, DAY_NS)) == 0
     assert not clock.believed(Instant(STEADY_NS - 1, DAY_NS))
-    assert clock.look(Instant(STEADY_NS, DAY_NS + STEADY_NS + NS_PER_S)) == 0  # it drifts
+    assert clock.look(Instant(STEADY_NS, DAY_NS + STEADY_NS + NS_PER_S)) == 0  # the clock drifts
     assert clock.believed(Instant(STEADY_NS, DAY_NS))
     assert clock.look(Instant(STEADY_NS, 3 * DAY_NS + STEADY_NS + NS_PER_S)) == 2 * DAY_NS
     assert not clock.believed(Instant(STEADY_NS + 1, 3 * DAY_NS))

@@ -1,4 +1,4 @@
-"""A robot as bytes: it comes back as it was, and a stranger's bytes do nothing."""
+"""A robot survives the round trip through bytes, and bytes from others run no code."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_it_comes_back_as_it_was() -> None:
 
 
 def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
-    """It is made in a step of the loop, whenever a file begins."""
+    """The state is saved in a step of the loop whenever a file begins, so it must stay small."""
     freshness = Freshness()
     for number in range(5000):
         stamp_ns = number * NS_PER_S // 1000
@@ -90,7 +90,7 @@ def test_whatever_bit_is_another_it_is_a_robot_or_refused() -> None:
 
 
 def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
-    """A recording that begins within a drive, with a robot that lacks what `forget` takes away."""
+    """Record a drive from its middle, with a saved robot from which `forget` removed something."""
     first, tape = 100, Tape(every=100)
     World(recorder=tape).drive(0.5, seconds=2.0)
     robot, memory = thaw(tape.states[first])
@@ -145,14 +145,14 @@ def test_a_robot_with_something_else_in_place_of_a_part_is_a_sentence(
 
 
 def replace_state(tape: Tape, state: bytes) -> Tape:
-    """The same drive, begun by another robot."""
+    """Return the same drive with another robot as its first state."""
     other = Tape()
     other.taken, other.states = tape.taken, {100: state}
     return other
 
 
 def drawn(recording: Recording) -> None:
-    """As a report looks at it."""
+    """Replay a recording as a report does."""
     looked = Onlooker(recording)
     course = Course(looked.config)
     with looked.living():

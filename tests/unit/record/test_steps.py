@@ -1,4 +1,4 @@
-"""What a recording says of estimates: rounded, and a checksum that is not."""
+"""A recording stores rounded estimates, and a checksum of the exact ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording in sentences."""
+"""Tests of a recording's timeline in sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of a recording, and that calibration reads it as it stands."""
+"""A recording becomes a table that calibration reads without changes."""
 
 from __future__ import annotations
 

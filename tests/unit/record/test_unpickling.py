@@ -1,4 +1,4 @@
-"""What pickle wrote of a robot is read back; what a stranger wrote is refused, and does nothing."""
+"""A pickled robot is read back, and pickles from others are refused without any effect."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.unit.record.attacks import ATTACKS, doubled, whole
 BYTES = 2 << 30
 
 PROCESSOR_S = 60
-"""All of them take a second; without a bound one of them takes years."""
+"""All attacks together take a second; without a limit one of them takes years."""
 
 
 def limits() -> None:
@@ -36,7 +36,7 @@ def limits() -> None:
 
 @pytest.fixture(scope="module")
 def said() -> dict[str, str]:
-    """What each attack was refused with; empty for one that was read, or did something."""
+    """Return the refusal of each attack; it is empty for one that was read or had an effect."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.unit.record.attacks"],
         capture_output=True, text=True, check=True, preexec_fn=limits,

@@ -1,4 +1,4 @@
-"""Drives of the simulator as courses, for the tests of the report."""
+"""Drives of the simulator as paths, for the tests of the report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.scenarios.world import World
 def course_of(
     drive: Callable[[World], None], begin: float | None = None, end: float | None = None
 ) -> tuple[Course, list[Step]]:
-    """What a drive shows, and its steps."""
+    """Return the path of a drive and its steps."""
     config, tape = Config(), Tape()
     world = World(config, recorder=tape)
     drive(world)
@@ -30,7 +30,7 @@ def followed(
     begin: float | None = None,
     end: float | None = None,
 ) -> Course:
-    """The course of these steps."""
+    """Return the path of these steps."""
     config = config or Config()
     course, replay = Course(config, begin, end), Replay(config)
     for step in steps:
@@ -42,7 +42,7 @@ def followed(
 
 
 def two_drivers(world: World) -> None:
-    """Nav drives, teleop takes over, somebody stops it; then a stranger and an old command."""
+    """Drive by nav, let teleop take over, stop and clear, then send from an unknown source."""
     world.drive(0.5, 0.3, seconds=2.0, source="nav", hz=10.0)
     for n in range(40):
         world.send(0.5, 0.3, "nav")
@@ -58,5 +58,5 @@ def two_drivers(world: World) -> None:
 
 @lru_cache
 def drive_of_two() -> tuple[Course, list[Step]]:
-    """That drive, which nobody changes."""
+    """Return the drive with two commanders, which no test changes."""
     return course_of(two_drivers)

@@ -1,4 +1,4 @@
-"""What is in a picture, for the tests."""
+"""Reads the content of a plot, for the tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording in words."""
+"""Tests of the summary of a recording in words."""
 
 from __future__ import annotations
 

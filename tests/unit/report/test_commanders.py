@@ -1,4 +1,4 @@
-"""Who drives, who waits for whom, and who is refused for what."""
+"""Tests of the commanders in a report: the one that drives, those that wait, and those refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a course says is what was recorded, and what the robot makes of it."""
+"""A path shows the recorded data, and the replayed robot's view of it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_each_wheel_follows_what_it_was_asked() -> None:
         most = max(point.value for point in asked.points())
         assert max(point.value for point in turned.points()) == pytest.approx(most, rel=0.05)
     right, left = (max(p.value for p in course.asked[wheel].points()) for wheel in (0, 1))
-    assert right > left  # it turned left
+    assert right > left  # the robot turned left
 
 
 def test_what_no_line_says_is_no_value() -> None:
@@ -109,7 +109,8 @@ def test_a_pose_that_is_set_is_no_way_driven() -> None:
 
     course, _ = course_of(set_away)
     assert course.metres < 1.0
-    assert [place.new for place in course.path.places()].count(True) == 2  # the first is new too
+    # the first place counts as new too
+    assert [place.new for place in course.path.places()].count(True) == 2
 
 
 def test_a_part_of_the_time_is_that_part_alone() -> None:

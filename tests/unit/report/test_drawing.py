@@ -1,4 +1,4 @@
-"""Words and numbers as the library gets them."""
+"""Tests of the words and numbers that the plotting library receives."""
 
 from __future__ import annotations
 

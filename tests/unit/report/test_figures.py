@@ -1,4 +1,4 @@
-"""The pictures: the library takes them, and their numbers are those of the course."""
+"""The plotting library accepts the plots, and their numbers are those of the path."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def figures() -> dict[str, Figure]:
 
 
 def known(values: Iterable[float]) -> list[float | None]:
-    """With what compares as equal in place of NaN."""
+    """Return the values with None in place of NaN, so that they compare as equal."""
     return [None if math.isnan(value) else value for value in values]
 
 
@@ -81,14 +81,14 @@ def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
     waits = trace(figures["who"], "waits")
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
     assert "<b>waits</b> teleop has the higher priority: until it is silent" in words
-    assert max(column(waits["x"])) > 1500  # ms
+    assert max(column(waits["x"])) > 1500  # in ms
     rows = [note["text"] for note in figures["who"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
     assert "Silent all the time: app, ros2_control." in figures["who"].caption
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
-    """Colour and pattern of each who drove."""
+    """Return the colour and pattern of each commander that drove."""
     drives = [one for one in figure.data if one["name"].endswith(" drives")]
     looks = {one["name"].split()[0]: one["marker"] for one in drives}
     return {

@@ -1,4 +1,4 @@
-"""Lines a second, those lost, and how late the loop was."""
+"""Tests of the lines per second, the lost lines, and the lateness of the loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MS = 1_000_000
 
 
 def linked(answers: dict[int, int], seconds: int = 10, in_flight: int = 0) -> Link:
-    """100 lines a second; `answers` are those of a second that has others than 100."""
+    """Return a link with 100 lines a second; `answers` gives seconds with another number."""
     link, sent, good = Link(), 0, 0.0
     for n in range(100 * seconds):
         second = n // 100
@@ -31,7 +31,7 @@ def test_lost_lines_are_told_in_their_second() -> None:
     link = linked({4: 70})
     lost = {int(point.t): point.value for point in link.unanswered.points()}
     assert link.totals.unanswered == 30
-    # The newest of a second counts once another has come after it.
+    # The newest line of a second counts once another one has followed it.
     assert lost[4] + lost[5] == 30
     assert {second: count for second, count in lost.items() if count and second not in (4, 5)} == {}
 
@@ -44,7 +44,7 @@ def test_lines_that_are_no_good_are_dropped_and_not_lost() -> None:
         link.step(n / 100, True, counters)
     link.end()
     assert (link.totals.sent, link.totals.unanswered) == (300, 0)
-    assert link.totals.good + link.totals.dropped == 299  # the first had come before
+    assert link.totals.good + link.totals.dropped == 299  # the first line had already arrived
 
 
 def test_a_line_that_could_not_be_true_is_dropped_too() -> None:
@@ -56,7 +56,10 @@ def test_a_line_that_could_not_be_true_is_dropped_too() -> None:
 
 
 def late(lates: list[float], ahead: frozenset[int] = frozenset()) -> Lateness:
-    """Periods of 10 ms, each so many ms late; those `ahead` had a line that went at once."""
+    """Return the lateness after periods of 10 ms, each late by this many ms.
+
+    Periods in `ahead` had a line that left at once.
+    """
     lateness, number = Lateness(100.0), 0
     for n, ms in enumerate(lates):
         if n in ahead:
@@ -81,7 +84,7 @@ def test_missed_periods_are_lateness_from_the_first_of_them(at_once: bool) -> No
     lateness = Lateness(100.0)
     for n in range(10):
         lateness.tick(n / 100, n * 10 * MS, 0, known=True)
-    if at_once:  # in the place of the first that was missed
+    if at_once:  # it replaces the first missed line
         lateness.at_once()
     lateness.tick(0.132, 132 * MS, 3, known=True)
     lateness.tick(0.14, 140 * MS, 0, known=True)

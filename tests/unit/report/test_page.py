@@ -1,4 +1,4 @@
-"""The file: one page that loads nothing, and in which no word of a stranger is more than a word."""
+"""The report is one page that loads nothing, and no text from others becomes markup."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LIBRARY = "var Plotly = {};"
 
 
 class Read(HTMLParser):
-    """What a browser would see."""
+    """The elements that a browser would see."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ def origin(**others: str) -> Origin:
 
 
 def evil_steps() -> list[Step]:
-    """A drive in which everything that strangers write is hostile."""
+    """Return a drive in which all text from others is hostile."""
     from msgspec.structs import replace
 
     _, steps = drive_of_two()
@@ -89,7 +89,7 @@ def test_no_word_of_a_stranger_is_markup_or_program() -> None:
     assert evil().count("</script") == 3
     assert "\u202e" not in evil()
     assert "\x00" not in evil()
-    # And yet a person reads them, and who sent it.
+    # A person can still read the hostile text and its sender.
     assert sum("<script>alert(1)</script>" in words for words in read.words) >= 4
 
 

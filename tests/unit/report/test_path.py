@@ -1,4 +1,4 @@
-"""The picture of the path: metres, equal axes, headings, and what happened where."""
+"""Tests of the plot of the path: metres, equal axes, headings, and the place of each event."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long rows stay short, and nothing that a person looks for is lost."""
+"""Long series are shortened without losing the points that a person looks for."""
 
 from __future__ import annotations
 

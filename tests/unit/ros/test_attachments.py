@@ -1,4 +1,4 @@
-"""The 33 bytes of rmw_zenoh: packed and unpacked to the byte, anything else refused."""
+"""The 33 bytes of rmw_zenoh are packed and unpacked exactly, and anything else is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What each channel encodes is what its definition says, read by a program that knows no other."""
+"""Each channel's payload matches its definition.
+
+A program that knows only the definition reads it.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from tests.unit.ros.test_shapes import STATE as ROBOT_STATE
 
 
 def filled(cls: type[Struct]) -> Any:
-    """A message in which no two fields are alike."""
+    """Return a message in which no two fields are equal."""
     counted = iter(range(1, 1000))
 
     def value(kind: inspect.Type) -> Any:
@@ -41,7 +44,7 @@ def filled(cls: type[Struct]) -> Any:
 
 
 def same(ours: Any, theirs: Any) -> bool:
-    """The fields of both by their order."""
+    """Return whether the fields of both are equal, by their order."""
     if isinstance(ours, Struct):
         fields = [getattr(ours, name) for name in ours.__struct_fields__]
         others = [v for k, v in vars(theirs).items() if k != "__msgtype__"]

@@ -1,4 +1,7 @@
-"""The text of a definition says to another program what the type hash promises, and it is whole."""
+"""The text of a definition is complete.
+
+It tells another program the type that the hash promises.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person reads of a parameter before he sets it."""
+"""Tests of the description of a parameter that an operator reads before setting it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ROS 2 calls a topic, and that the type hashes in its keys are those of the definitions."""
+"""Tests of the ROS 2 topic names, and that the type hashes in keys follow from the definitions."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_type_without_a_hash_has_no_rmw_key() -> None:
         rmw_key(0, "/scan", "sensor_msgs/msg/LaserScan")
 
 
-# hashes: RIHS01 is the sha256 of the type's description as JSON, with all it refers to
+# RIHS01 hashes: the sha256 of the type's description as JSON, with all types it refers to
 
 Field = tuple[str, str]
 
@@ -98,10 +98,10 @@ BASE = {
     "char": 3,  # the `char` of a message definition is a uint8
 }  # fmt: skip
 ARRAY, BOUNDED, SEQUENCE = 48, 96, 144
-"""What a type id grows by."""
+"""Offsets added to a type id."""
 
 NO_MEMBERS = [("uint8", "structure_needs_at_least_one_member")]
-"""A struct without fields gets one."""
+"""Field that ROS adds to a struct without fields."""
 
 
 def split(text: str) -> list[Field]:
@@ -110,7 +110,7 @@ def split(text: str) -> list[Field]:
 
 
 def definitions() -> dict[str, list[Field]]:
-    """The fields of every type by name; a service is a type whose fields are its three messages."""
+    """Return the fields of every type by name; the fields of a service are its three messages."""
     known = {name: [*fields] for name, fields in DEFINITIONS.items() if not name.startswith(OURS)}
     for line in ros_types.MESSAGES.strip().splitlines():
         name, _, fields = line.partition(":")
@@ -137,7 +137,7 @@ KNOWN = definitions()
 
 
 def parse(kind: str) -> tuple[str, int, int]:
-    """The base of a field's type, what is added to its id, and its capacity."""
+    """Return the base of a field's type, the offset added to its id, and its capacity."""
     match = re.fullmatch(r"([\w/]+)(?:\[(<=)?(\d*)\])?", kind)
     assert match is not None, kind
     base, bounded, size = match.groups()
@@ -164,7 +164,7 @@ def describe(name: str) -> dict[str, Any]:
 
 
 def referred(name: str) -> set[str]:
-    """All types that a type is made of, however deep."""
+    """Return all types that a type contains, at any depth."""
     found: set[str] = set()
     for kind, _ in KNOWN[name]:
         base = parse(kind)[0]
@@ -198,7 +198,10 @@ def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
     ],
 )  # fmt: skip
 def test_the_hash_written_here_is_the_one_ros_computes(type_name: str, published: str) -> None:
-    """On types that are no literals of ours, so that both cannot be wrong alike."""
+    """The types come from ROS and not from this project.
+
+    Both sides therefore cannot share an error.
+    """
     assert rihs01(type_name) == published
 
 

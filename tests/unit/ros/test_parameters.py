@@ -1,4 +1,7 @@
-"""The configuration as ROS parameters: listed, read and described; what a request to set says."""
+"""Tests of the configuration as ROS parameters.
+
+They cover list, read, describe, and the answer to a set request.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log and `state` as a ROS message."""
+"""Tests of the log and `state` as ROS messages."""
 
 from __future__ import annotations
 
@@ -71,5 +71,5 @@ def test_state_is_the_same_field_by_field() -> None:
     plain = set(told.__struct_fields__) - {"header", "sources", "counters"}
     assert all(getattr(told, name) == getattr(STATE, name) for name in plain)
     left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
-    # A ROS Trigger has no place for the number of a latch; diagnostics tell of the latch file.
+    # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
     assert left_out == {"stamp", "figures", "encoders", "latch", "latch_file"}

@@ -1,4 +1,4 @@
-"""Tokens are compared whole by their readers: each is written out here as ROS2.md gives it."""
+"""Readers compare tokens whole, so each is written out here as ROS2.md gives it."""
 
 from __future__ import annotations
 

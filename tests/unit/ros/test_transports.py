@@ -1,4 +1,4 @@
-"""The ROS names of the robot: each stands for a native key, in both trees."""
+"""Each ROS name of the robot stands for a native key, in both trees."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def found(ros: RosConfig) -> list[Endpoint]:
 
 
 def keys(ros: RosConfig, transport: str) -> dict[str, str]:
-    """The key of each native one; twists only once."""
+    """Return the key of each native name; twists appear only once."""
     return {e.native: e.key for e in found(ros) if e.transport == transport}
 
 

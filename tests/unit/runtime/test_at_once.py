@@ -1,4 +1,4 @@
-"""A line goes every period, and at once for what is new, never two too close together."""
+"""A line leaves every period, and at once for a new command, but never two too close together."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ GAP_NS = WIRE_NS + BREATH_NS
 
 
 class Paced:
-    """A pace, and what a control loop tells it."""
+    """A pace and the calls of its control loop."""
 
     def __init__(self, period_ns: int = PERIOD_NS) -> None:
         self.pace = Pace(WIRE_NS, period_ns)
         self.sent_ns = -GAP_NS
-        """When the last line went, as the port remembers it."""
+        """Time of the last sent line, as the port remembers it."""
 
     def ticks(self, at_ns: int, missed: int = 0) -> bool:
-        """A period without news; whether its line went."""
+        """End a period without a new command and return whether its line left."""
         due = self.pace.period_ended(missed)
         self.pace.note(due, due, due, False, False)
         self.sent_ns = at_ns if due else self.sent_ns
         return due
 
     def hears(self, at_ns: int, *, news: bool = True, goes: bool = True) -> bool:
-        """A command between two periods; whether a line for it was tried."""
+        """Take a command between two periods and return whether a line for it was tried."""
         due = news and self.at_once(at_ns)
         self.pace.note(False, due, due and goes, news, True)
         self.sent_ns = at_ns if due and goes else self.sent_ns
@@ -46,7 +46,7 @@ class Paced:
 
 
 def ticked() -> Paced:
-    """After the line of a period at 0."""
+    """Return a pace after the line of a period at 0."""
     paced = Paced()
     assert paced.ticks(0)
     return paced

@@ -1,4 +1,4 @@
-"""What the parts of the daemon hear when it ends."""
+"""Tests of the calls that the parts of the daemon receive when it ends."""
 
 from __future__ import annotations
 

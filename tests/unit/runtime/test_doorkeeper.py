@@ -1,4 +1,4 @@
-"""A door that cannot be started is told and tried again: the robot drives on."""
+"""A TLS gateway that cannot be started is reported and retried while the robot drives on."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from acsard.values import Event
 
 
 async def told(kind: Kind = DOOR) -> Event:
-    """The first that the keeper says."""
+    """Return the first event of the supervisor."""
     said: asyncio.Queue[Event] = asyncio.Queue()
     keeper = asyncio.create_task(keep_door(["door"], said.put_nowait, kind))
     first = asyncio.create_task(said.get())
@@ -42,7 +42,7 @@ def test_without_room_for_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
-    """What is started in the place of `acsard`."""
+    """Replace the `acsard` program by this text."""
     file = where / "program"
     file.write_text(f"#!{sys.executable} -S\n{text}\n")
     file.chmod(0o755)

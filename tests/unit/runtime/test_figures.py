@@ -1,4 +1,4 @@
-"""What the daemon tells of itself: since the start and over the last minute, in fixed memory."""
+"""Tests of the daemon's own figures: since the start and over the last minute, in fixed memory."""
 
 from __future__ import annotations
 

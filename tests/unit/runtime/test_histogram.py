@@ -1,4 +1,7 @@
-"""Percentiles in fixed memory: right to a bucket, never below the truth, never above the max."""
+"""Percentiles in fixed memory are exact to one bucket.
+
+They are never below the truth and never above the maximum.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from acsard.runtime.histogram import DECADES, PER_DECADE, Histogram
 from acsard.values import Spread
 
 BUCKET = 10 ** (1 / PER_DECADE)
-"""Upper over lower end of a bucket: 1.122."""
+"""Upper end of a bucket divided by its lower end: 1.122."""
 
 
 def spread_of(values: list[float]) -> Spread:
@@ -23,7 +26,7 @@ def spread_of(values: list[float]) -> Spread:
 
 
 def order_statistic(values: list[float], share: float) -> float:
-    """The smallest value that at least `share` of all do not exceed."""
+    """Return the smallest value that at least `share` of all values do not exceed."""
     return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
 
 

@@ -1,4 +1,4 @@
-"""The content of the latch file: nothing that a damaged disk leaves makes a stop disappear."""
+"""Tests of the latch file's content: no damage by a disk can make a stop disappear."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def test_a_stop_that_is_latched_already_stays() -> None:
 
 
 class Keeper:
-    """A keeper of latches that holds what it was given when it is told to."""
+    """A store of latches that holds its latches only when the test tells it to."""
 
     def __init__(self) -> None:
         self.given: list[Latches] = []

@@ -1,4 +1,4 @@
-"""The latch file on disks that fill up, fail, hang or hold something else."""
+"""Tests of the latch file on disks that are full, fail, hang or hold another file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def config(where: Path) -> Config:
 
 @pytest.fixture
 def started() -> Iterator[Started]:
-    """Start latch files; they are closed and forgotten at the end, as a process would."""
+    """Yield a function that starts latch files, and end them afterwards as a process would."""
     files: list[LatchFile] = []
 
     def start(where: Path) -> tuple[LatchFile, Latches]:
@@ -50,7 +50,7 @@ def started() -> Iterator[Started]:
 
 
 def end(file: LatchFile) -> None:
-    """End as a process ends: the last write, and the lock goes."""
+    """End as a process ends: write for the last time and release the lock."""
     file.close()
     if file._lock >= 0:
         os.close(file._lock)
@@ -190,7 +190,7 @@ def test_each_place_goes_before_the_next_one() -> None:
     assert place(Config(), service | user) == Path("/var/lib/acsard") / NAME
     assert place(Config(), user) == Path("/u/acsard") / NAME
     assert place(Config(), {}) == Path.home() / ".local/state/acsard" / NAME
-    # A relative path in the variable is to be ignored, says its specification.
+    # The specification of the variable says that a relative path must be ignored.
     assert place(Config(), {"XDG_STATE_HOME": "state"}) == place(Config(), {})
     assert place(config(Path("~/mine")), {}) == Path.home() / "mine" / NAME
 
@@ -257,7 +257,7 @@ def full(*words: object, **more: object) -> None:
 
 
 class Stuck:
-    """A disk that takes nothing until it is let go."""
+    """A disk that writes nothing until `goes` is set."""
 
     def __init__(self) -> None:
         self.asked, self.goes, self.texts = threading.Event(), threading.Event(), list[str]()

@@ -1,4 +1,7 @@
-"""The built-in simulator as a device: what `[sim] faults` does to what is read there."""
+"""Tests of the built-in simulator as a device.
+
+They show the effects of `[sim] faults` on its bytes.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\n"
 
 
 async def first_piece(faults: tuple[str, ...], enough: Callable[[bytes], bool]) -> bytes:
-    """The first such piece that the device hands over, while a line is sent for each that came."""
+    """Return the first piece from the device that is `enough`, sending one line per piece."""
     found: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
     with Simulated(Config(sim=SimConfig(faults=faults))) as simulated:
         device = os.open(simulated.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)

@@ -1,4 +1,4 @@
-"""The period is one of our clock's, whatever the kernel's timers do."""
+"""The period follows the daemon's own clock, whatever the kernel's timers do."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PERIOD_NS = 10_000_000
 
 
 class Kernel:
-    """A timer whose clock NTP slews: it waits `rate` times as long as it should."""
+    """A timer whose clock NTP slews, so that it waits `rate` times too long."""
 
     def __init__(self) -> None:
         self.now_ns, self.rate, self.at_ns = 5_000_000_000, 1.0, 0
@@ -75,7 +75,7 @@ def test_a_timer_that_goes_off_again_before_it_is_heard_ends_no_period_twice(
 
 
 def test_what_is_due_is_told_to_whoever_wakes_us_first(kernel: Kernel) -> None:
-    """A command that comes in behind a stall is in the loop's hands before the timer is."""
+    """After a stall, the loop may get a waiting command before it gets the timer."""
     one = Ticker(PERIOD_NS, lambda: None)
     start_ns = kernel.now_ns
     one.start(start_ns)

@@ -1,4 +1,4 @@
-"""A serial device on a pty: why it cannot be opened, and how it is given back."""
+"""Tests of a serial device on a pty: the reasons why it cannot be opened, and its release."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_nothing_to_read_is_no_hang_up_and_a_hang_up_is() -> None:
     master, slave = pty.openpty()
     device = open_raw(os.ttyname(slave), 115200)
     os.close(slave)
-    device.timeout = 0  # as pyserial-asyncio does: it sets the port up once more
+    device.timeout = 0  # pyserial-asyncio does this: it sets the port up once more
     assert device.read(10) == b""
     os.close(master)
     with pytest.raises(SerialException, match=r"hung up|read failed"):
@@ -70,7 +70,7 @@ def test_a_port_that_no_thread_could_close_is_closed_by_the_next_opening(path: s
     finally:
         threading.stack_size(usual)
     device.close()
-    again = open_raw(path, 115200)  # its lock would refuse us if the first were still open
+    again = open_raw(path, 115200)  # the lock would refuse this if the first one were still open
     close(again, wait_s=5.0)
     again.close()
 
@@ -81,7 +81,7 @@ def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str)
         open_raw(path, 115200)
     assert isinstance(refusal(path, locked.value), InUseError)
     close(device, wait_s=5.0)
-    # Root may pass the mark, so it is looked for itself.
+    # Root may open a locked device anyway, so the test reads the lock itself.
     after = os.open(path, os.O_RDWR | os.O_NOCTTY)
     exclusive = bytearray(4)
     fcntl.ioctl(after, 0x80045440, exclusive)  # TIOCGEXCL
@@ -114,7 +114,7 @@ def test_a_device_that_vanishes_inside_any_call_of_the_opening_is_a_lost_device(
             open_raw(path, 115200)
     assert lost.value.errno == errno.EIO
     assert code_of(refusal(path, lost.value)) is Exit.FAILURE
-    close(open_raw(path, 115200), wait_s=5.0)  # nothing of it was left open or locked
+    close(open_raw(path, 115200), wait_s=5.0)  # the failed attempt left nothing open or locked
 
 
 def test_a_device_that_is_no_tty_is_told_so() -> None:

@@ -1,6 +1,8 @@
-"""The fake microcontroller: the protocol from its side, to the byte and to the nanosecond.
+"""Tests of the fake microcontroller's side of the protocol.
 
-`TRUE` has no motor lag and fine encoders, so that what it reports is what it was told.
+They are exact to the byte and the nanosecond.
+
+`TRUE` has no motor lag and fine encoders, so that it reports exactly the commanded speeds.
 """
 
 from __future__ import annotations
@@ -27,13 +29,13 @@ STILL = [0.0] * 4
 TRUE = Config(sim=SimConfig(motor_time_constant=0.0, encoder_counts=1_000_000))
 
 LINE_NS = 33 * 10 * 1_000_000_000 // 115200
-"""One line on the wire: 2.86 ms."""
+"""Duration of one line on the wire; this is 2.86 ms."""
 
 Heard = list[tuple[int, bytes]]
 
 
 def replies(mcu: FakeMcu, until_ns: int) -> Heard:
-    """Let time pass, from one thing that happens to the next; what arrives, and when."""
+    """Advance from one event to the next and return the received data with its times."""
     found = []
     while (due := mcu.next_ns()) is not None and due <= until_ns:
         data = mcu.advance(due)
@@ -44,7 +46,7 @@ def replies(mcu: FakeMcu, until_ns: int) -> Heard:
 
 
 def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
-    """Send a line every 10 ms, `count` times, and listen for 10 ms after the last."""
+    """Send a line every 10 ms, `count` times, and listen for 10 ms after the last one."""
     found = []
     for n in range(count):
         mcu.receive(start_ns + n * 10 * MS, line)
@@ -53,7 +55,7 @@ def drive(mcu: FakeMcu, start_ns: int, count: int, line: bytes = LINE) -> Heard:
 
 
 def told(line: bytes, config: Config = TRUE) -> FakeMcu:
-    """An MCU that was sent this once and has had its time to act."""
+    """Return an MCU that received this line once and had time to act."""
     mcu = FakeMcu(config)
     mcu.receive(0, line)
     mcu.advance(100 * MS)
@@ -261,7 +263,7 @@ def test_noise_costs_the_line_it_hits_and_no_other() -> None:
 
 
 def acted_ns(mcu: FakeMcu) -> int:
-    """When the line sent at 0 took effect."""
+    """Return the time at which the line sent at 0 took effect."""
     while not any(mcu.vehicle.set_points):
         due = mcu.next_ns()
         assert due is not None
@@ -407,8 +409,10 @@ NAMED["frozen_encoder"] = methodcaller("frozen_encoder", 2)
 
 
 def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]:
-    """Half a second of driving, then silence but for one line that is none; answers with times,
-    angles and set points after."""
+    """Drive for half a second, then send only one invalid line.
+
+    Return the answers with their times, the angles and the set points.
+    """
     found = drive(mcu, start_ns, 40)
     found += drive(mcu, start_ns + 400 * MS, 10, SEALED)
     found += replies(mcu, start_ns + 650 * MS)
@@ -643,7 +647,7 @@ def test_a_latching_mcu_is_not_poisoned_by_words() -> None:
 
 
 def arrivals(mcu: FakeMcu, count: int = 100) -> Heard:
-    """What the host reads, a look every ms, of an MCU that is asked every 10 ms."""
+    """Return the data that the host reads each ms from an MCU that is prompted every 10 ms."""
     found = []
     for ms in range(10 * count + 200):
         if ms % 10 == 0 and ms < 10 * count:

@@ -1,4 +1,4 @@
-"""The switches of the fake MCU: on in their block, off after it."""
+"""The faults of the fake MCU are on inside their block and off after it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bytes at the wrong rate."""
+"""Tests of bytes that are received at the wrong baud rate."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ def test_at_a_wrong_rate_no_line_survives(sent: int, heard: int) -> None:
 
 
 def test_a_byte_at_half_the_rate_is_what_the_bits_say() -> None:
-    # 0x00 at 9600 is nine low bits and a high one: 18 low samples at 19200, no stop bit in time.
+    # At 9600 baud 0x00 is nine low bits and a high one. At 19200 these are 18 low samples without a
+    # stop bit in time.
     assert garbled(b"\x00", 9600, 19200) == b"\x00"
-    # 0xff at 9600 is one low bit: a start bit, then 0 and ones at 19200.
+    # At 9600 baud 0xff is one low bit. At 19200 it is a start bit, then a 0 and ones.
     assert garbled(b"\xff", 9600, 19200) == b"\xfe"
 
 

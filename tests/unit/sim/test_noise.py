@@ -1,4 +1,4 @@
-"""Chance that can be repeated."""
+"""Tests of noise that is the same in every run."""
 
 from __future__ import annotations
 

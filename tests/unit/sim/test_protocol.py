@@ -1,4 +1,4 @@
-"""What the firmwares take for a command, and what they answer, to the byte."""
+"""Tests of the lines that each firmware accepts as commands, and of its exact answers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ END = b"\r\n"
 
 
 def closed(body: bytes) -> bytes:
-    """The body with the check it needs and a line end."""
+    """Return the body with its correct check and a line end."""
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 

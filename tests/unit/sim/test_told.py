@@ -1,4 +1,4 @@
-"""What is true of the simulated robot, as the bus hears it."""
+"""Tests of the simulated robot's true state as it is published on the bus."""
 
 from __future__ import annotations
 

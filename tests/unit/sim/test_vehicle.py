@@ -1,4 +1,4 @@
-"""The simulated base: motors with lag, and the path their wheels make."""
+"""Tests of the simulated base: motors with a lag, and the path that their wheels make."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def vehicle(lag: float = LAG, drive: DriveConfig | None = None) -> Vehicle:
 
 
 def moved(seconds: float, *set_points: float, lag: float = 0.0, **changes: float) -> Vehicle:
-    """A vehicle that has run so long from rest: a, b, c, d are right, left, left, right."""
+    """Return a vehicle after this time from rest; a, b, c, d are right, left, left, right."""
     made = vehicle(lag)
     for name, value in changes.items():
         setattr(made, name, value)
@@ -123,7 +123,7 @@ def test_a_turn_on_the_spot_does_not_leave_it() -> None:
 
 
 def test_a_quarter_circle_ends_a_radius_ahead_and_a_radius_aside() -> None:
-    # v = 0.5 m/s and w = 0.5 rad/s: a circle of 1 m
+    # v = 0.5 m/s and w = 0.5 rad/s give a circle of 1 m radius.
     right, left = (0.5 + 0.5 * TRACK / 2) / RADIUS, (0.5 - 0.5 * TRACK / 2) / RADIUS
     made = moved(math.pi, right, left, left, right)
     assert (made.pose.x, made.pose.y) == pytest.approx((1.0, 1.0))
@@ -181,10 +181,10 @@ def test_hands_move_it_whatever_its_motors_do(speed: float) -> None:
     assert math.dist((made.pose.x, made.pose.y), (before.x, before.y)) > 1.5 * abs(speed)
 
 
-# what the host does not know of it
+# properties that the host does not know
 
 SPIN = (3.0, -3.0, -3.0, 3.0)
-"""1 rad/s on the spot, as the host believes."""
+"""Set points that the host takes for 1 rad/s on the spot."""
 
 
 def turned(seconds: float, sim: SimConfig, *set_points: float, steps: int = 1) -> float:

@@ -1,4 +1,4 @@
-"""The wire in virtual time."""
+"""Tests of the wire in virtual time."""
 
 from __future__ import annotations
 

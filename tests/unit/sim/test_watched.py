@@ -1,4 +1,4 @@
-"""The robot that is looked at: where it truly is, and what its gyro says."""
+"""Tests of a simulated robot that shows its true pose and its gyro."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from acsard.sim.watched import LOOK_NS, Sight, WatchedMcu
 TRUE = Config(sim=SimConfig(motor_time_constant=0.0))
 LINE = b"ap02.00,bn02.00,cn02.00,dp02.00\r\n"
 RATE = 2.0 * 2 * 0.05 / 0.30
-"""rad/s at which that line turns it."""
+"""Turn rate that the line commands, rad/s."""
 
 
 def seen(config: Config = TRUE, seconds: float = 1.0, step_ms: int = 5) -> list[Sight]:
-    """All looks at a robot that is told to turn from 100 ms on."""
+    """Return all observations of a robot that is commanded to turn from 100 ms on."""
     sights: list[Sight] = []
     mcu = WatchedMcu(config, 0, sights.append)
     for ms in range(0, int(seconds * 1000) + 1, step_ms):

@@ -1,4 +1,4 @@
-"""A usual screen of `acsard top`, as it is read and as it is sent to a terminal."""
+"""A usual screen of `acsard top`, as text and as sent to a terminal."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SEEN = Seen("acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leav
 
 
 def lines_of(seen: Seen, width: int = 80, height: int | None = 24) -> list[str]:
-    """The screen as it is read."""
+    """Return the lines of the screen as a person reads them."""
     console = Console(width=width, file=io.StringIO(), color_system=None)
     with console.capture() as captured:
         console.print(screen(seen, width, height))
@@ -54,7 +54,7 @@ def lines_of(seen: Seen, width: int = 80, height: int | None = 24) -> list[str]:
 
 
 def painted(seen: Seen, width: int = 80, height: int | None = 24) -> str:
-    """The screen as it is sent to a terminal."""
+    """Return the screen as it is sent to a terminal."""
     console = Console(
         width=width, file=io.StringIO(), force_terminal=True, color_system="256", _environ={}
     )
@@ -70,5 +70,5 @@ def line_with(text: str, seen: Seen = SEEN, width: int = 80) -> str:
 
 
 def of(**changes: object) -> Seen:
-    """The usual screen with another state."""
+    """Return the usual screen with another state."""
     return replace(SEEN, state=replace(STATE, **changes))

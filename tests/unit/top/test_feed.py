@@ -1,4 +1,4 @@
-"""What `acsard top` knows of a robot: the state of this moment at once, and what a silence is."""
+"""`acsard top` shows the current state at once and recognizes a silence."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ KEY = "acsard/acsar/state"
 
 
 class Robot:
-    """A client without a bus: what it would be told, and at what time."""
+    """A client without a bus that gives states at times set by the test."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -146,7 +146,7 @@ def test_a_burst_of_changes_makes_no_silence_of_a_slow_state(robot: Robot) -> No
 
 def test_until_two_states_came_they_may_be_as_slow_as_any(robot: Robot) -> None:
     feed = feed_of(robot)
-    assert feed.seen().silence == 2.0  # there is none at all
+    assert feed.seen().silence == 2.0  # no state has arrived
     feed.ask()
     robot.now += 9.0
     seen = feed.seen()

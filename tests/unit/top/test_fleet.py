@@ -1,4 +1,4 @@
-"""What `acsard fleet` knows of robots that come and go, or are too many."""
+"""Tests of `acsard fleet` with robots that appear and disappear, or are too many."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.unit.top.screens import STATE
 
 
 class Session:
-    """Hands over what a router would tell of tokens."""
+    """A session that hands over liveliness tokens as a router would."""
 
     def __init__(self) -> None:
         self.tell: Any = None
@@ -38,7 +38,7 @@ class Session:
 
 
 class Clock:
-    """Stands still until it is set."""
+    """A clock that stands still until it is set."""
 
     now = 1000.0
 
@@ -59,7 +59,7 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
 def fleet_of(
     session: Session, ids: Sequence[str] = ("*",), answering: Collection[str] = ()
 ) -> Fleet:
-    """Of robots of which some answer what they are asked."""
+    """Return a fleet in which the robots of `answering` answer queries."""
     robot: Any = SimpleNamespace(session=session)
     stamps = count(2000)
     robot.like = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
@@ -119,7 +119,7 @@ def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
         (("robot1", "robot2"), ("robot1", "robot2"), ("robot1", "robot2"), True),
         (("robot1", "robot2"), ("robot1",), ("robot1", "robot2"), False),
         (("robot1", "robot2"), ("robot1", "robot2"), ("robot1",), False),
-        (("*",), ("robot1",), ("robot1",), False),  # another may come yet
+        (("*",), ("robot1",), ("robot1",), False),  # another robot may still appear
     ],
 )
 def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
@@ -130,14 +130,18 @@ def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
     assert not fleet.whole
     for name in here:
         session.comes(name)
-    for _ in range(2):  # asks: what a storage may have said, and what only the robot says
+    # the first query may be answered by a storage, the second one only by the robot
+    for _ in range(2):
         fleet.rows()
         clock.now += ASK_S
     assert fleet.whole is whole
 
 
 class Remembers:
-    """A client of a router whose storage has this robot's last state, and may be told a newer."""
+    """A client of a router whose storage holds this robot's last state.
+
+    The storage may receive a newer state.
+    """
 
     def __init__(self, session: Session) -> None:
         self.session, self.stored = session, STATE
@@ -151,7 +155,7 @@ class Remembers:
 
 
 def told(fleet: Fleet, clock: Clock, seconds: float) -> str:
-    """The line of its robot, looked at for so long."""
+    """Return the line of the robot after watching it for this many seconds."""
     for _ in range(int(seconds / 0.25)):
         fleet.rows()
         clock.now += 0.25
@@ -188,7 +192,7 @@ def test_a_robot_whose_clock_was_set_back_is_heard_by_its_answers(
     fleet = Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448")
     session.comes("robot1")
     told(fleet, clock, 0.5)
-    for second in (2000, 1, 3, 5):  # an hour's clock, and one that begins anew
+    for second in (2000, 1, 3, 5):  # a clock that has run for long, and one that restarts
         robot.stored = replace(STATE, stamp=Time(second))
         told(fleet, clock, 2.5)
     assert "SILENT" not in told(fleet, clock, 0.0)

@@ -1,4 +1,4 @@
-"""A line for each robot: it says what each does, who is gone, and fits."""
+"""Each robot has a line that states its activity, shows when it has gone, and fits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The parts below the mode tell what there is, in its place and with its unit."""
+"""The sections below the mode show each value in its place and with its unit."""
 
 from __future__ import annotations
 

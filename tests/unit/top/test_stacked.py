@@ -1,4 +1,4 @@
-"""On a narrow screen every figure is there that a wide one has, whole."""
+"""A narrow screen shows every figure of a wide one in full."""
 
 from __future__ import annotations
 

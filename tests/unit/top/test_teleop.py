@@ -1,4 +1,4 @@
-"""What `acsard drive` shows: all of the reason, units, and help that stays, at any width."""
+"""`acsard drive` shows the whole reason, units, and help that stays, at any width."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def of(**what: object) -> Teleop:
 
 
 def told(lines: list[str]) -> str:
-    """As it is read."""
+    """Return the lines as one text with single spaces."""
     return " ".join(" ".join(lines).split())
 
 

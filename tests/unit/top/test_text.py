@@ -1,4 +1,4 @@
-"""Values as short text: right in value, bounded in length, harmless in a terminal."""
+"""Values become short text: correct, bounded in length and harmless in a terminal."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_an_age_is_told_in_its_own_unit(seconds: float | None, text: str) -> Non
     [
         (300, 200, 1.0, "100.0/s"),
         (20_000, 0, 2.0, "10000/s"),
-        (10, 200, 1.0, "    -/s"),  # started anew
-        (300, 200, 0.0, "    -/s"),  # one state only
+        (10, 200, 1.0, "    -/s"),  # the daemon restarted
+        (300, 200, 0.0, "    -/s"),  # there is only one state
         (300, 200, -5.0, "    -/s"),  # the clock was set
     ],
 )

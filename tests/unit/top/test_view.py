@@ -1,4 +1,4 @@
-"""One screen of a robot's state: it tells what matters, and holds whatever comes on the bus."""
+"""One screen of a robot's state shows the important facts and survives any message from the bus."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from acsard.top.view import MODES
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
 ENOUGH = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"
-"""Clears the screen, sets the title, is markup, turns the writing round, colours, ends the line."""
+"""Hostile text with many kinds of control sequences.
+
+It clears the screen, sets the title, is markup, reverses direction, colours and breaks the line.
+"""
 
 
-# what it tells
+# content of the screen
 
 
 def test_the_head_says_who_where_and_how_fresh() -> None:
@@ -61,7 +64,7 @@ def test_a_long_reason_goes_on_below_and_moves_nothing() -> None:
     assert short[3:] == long[3:]
 
 
-# no news
+# no state for some time
 
 
 def test_before_the_first_state_it_says_what_it_waits_for() -> None:
@@ -105,7 +108,7 @@ def test_messages_of_another_form_are_told_from_silence() -> None:
     assert "another version" in told
 
 
-# it holds whatever comes
+# any message from the bus
 
 
 def test_a_usual_screen_fits_80_by_24_with_nothing_cut() -> None:
@@ -141,7 +144,7 @@ def test_a_hostile_text_changes_nothing_but_its_own_place() -> None:
 
 
 def harmless(sent: str) -> bool:
-    """Nothing but colours and ends of line is in it that a terminal would obey."""
+    """Return whether a terminal would obey nothing in this text except colours and line ends."""
     rest = re.sub(r"\x1b\[[0-9;]*m", "", sent).replace("\n", "")
     return all(sign.isprintable() for sign in rest)
 

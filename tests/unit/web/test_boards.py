@@ -1,4 +1,4 @@
-"""The ports that the page offers for a check."""
+"""Tests of the ports that the page offers for a check."""
 
 from __future__ import annotations
 
@@ -44,6 +44,6 @@ def test_the_simulator_is_there_once_whatever_is_configured(
 def test_the_configured_one_is_the_first_choice(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A page that shows the simulator must not begin at a real port by itself."""
+    """A page that shows the simulator must not select a real port by itself."""
     monkeypatch.setattr("acsard.web.boards.serial_devices", lambda: [MEGA, HELD])
     assert boards(configured)[0].port == configured

@@ -1,4 +1,4 @@
-"""Stops: each is confirmed by one that was asked after it, however many there are."""
+"""Each stop is confirmed by one that was requested after it, however many there are."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_hav
         assert told.value.role
         with pytest.raises(RefusedError, match="not a robot's id"):
             await calls.call(MAINTAINER, "stop", {}, "**")
-        # Its own by name is its own.
+        # Naming the page's own robot counts as its own.
         assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
 
     asyncio.run(story())

@@ -1,4 +1,4 @@
-"""The thread that hands commands on: what cannot be sent is dropped, and it never dies unseen."""
+"""The thread that sends commands drops those it cannot send, and never dies unnoticed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was refused goes to the log as one line, by reason and by whom, and once."""
+"""Refusals are logged as one line, by reason and by client, exactly once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What may be begun is one of a few commands, with options that are each one of a few."""
+"""The page may start only a few commands, and each option has only a few values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PORTS = ("/dev/acsar", "sim")
 
 
 def parsed(given: list[str]) -> argparse.Namespace:
-    """As the command line takes them."""
+    """Return the arguments as the command line parses them."""
     parser = argparse.ArgumentParser()
     verbs = parser.add_subparsers()
     calibrate.add(verbs)

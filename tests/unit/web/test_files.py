@@ -1,4 +1,7 @@
-"""The page's files: by plain names alone, packed where it pays, new when they change."""
+"""Tests of the page's files.
+
+They are served by plain names only, compressed where it helps, and reloaded on change.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rows of a fleet: who is there, and who has gone, in a session that reaches nobody else."""
+"""Tests of a fleet's rows, present and gone, in a session that reaches no other program."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def session() -> Iterator[zenoh.Session]:
     for _ in range(100):
         try:
             session.close()
-        except RuntimeError:  # a thread of its own still holds it, of a call that was given up
+        except RuntimeError:  # a thread of an abandoned call still holds the session
             time.sleep(0.05)
         else:
             return
@@ -58,7 +58,7 @@ def robots(client: Client | None) -> Robots:
 
 
 async def row(fleet: Fleet, look: Callable[[Row], Any]) -> Row:
-    """The first one that it finds true."""
+    """Return the first row for which `look` is true."""
     async with asyncio.timeout(PATIENCE_S):
         while True:
             for one in fleet.rows():

@@ -1,4 +1,4 @@
-"""What a page says is one frame, or refused whole with a reason."""
+"""A message from a page is exactly one frame, or it is refused whole with a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is too much is refused, and time or a leaving makes room again."""
+"""Requests beyond a limit are refused, until time passes or a client leaves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
     bucket = Bucket(10.0, 20.0, 0)
     assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
     taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
-    assert 99 <= taken <= 100  # ten seconds
+    assert 99 <= taken <= 100  # within ten seconds
 
 
 def test_a_bucket_holds_no_more_than_its_most_after_a_long_rest() -> None:
@@ -134,11 +134,11 @@ def test_the_page_tells_the_places_that_there_are() -> None:
     page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
     told = " ".join(page.read_text(encoding="utf-8").split())
     assert (
-        f"There is room for {CONNECTIONS} from elsewhere: at most {CONNECTIONS_OF_ONE} of one "
-        f"address (whatever their tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
+        f"room for {CONNECTIONS} connections from other machines: at most {CONNECTIONS_OF_ONE} of "
+        f"one address (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
         f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
     ) in told
-    assert f"At the machine there is room for {CONNECTIONS_HERE}, " in told
+    assert f"room for another {CONNECTIONS_HERE} connections from the machine itself" in told
 
 
 def test_each_token_has_a_pace_of_its_own() -> None:

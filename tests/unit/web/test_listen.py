@@ -1,4 +1,7 @@
-"""Where the page listens is where an invitation leads to, with a certificate or not at all."""
+"""An invitation leads to the address on which the page listens.
+
+That address has a certificate, or there is no invitation.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ OWN = [*own_addresses(), "203.0.113.9", "2001:db8::9"]
 
 @pytest.fixture
 def tls(tmp_path: Path) -> str:
-    """A certificate for all addresses of this machine, and for some that it has not."""
+    """Make a certificate for all addresses of this machine and for some that it does not have."""
     Authority.make(tmp_path / "tls", "test", 1).issue(tmp_path / "tls", "robot", OWN, 1)
     return str(tmp_path / "tls")
 

@@ -1,4 +1,4 @@
-"""What Prometheus reads, read as its text format says."""
+"""Tests of the metrics in Prometheus' text format."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ STATE = RobotState(
 
 
 def parsed(told: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
-    """Samples by name and labels, as Prometheus' own client reads them; each has a type, and no two
-    are the same."""
+    """Return samples by name and labels, as Prometheus' own client reads them.
+
+    Each must have a type, and no two may be the same.
+    """
     found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
     for family in text_string_to_metric_families(told):
         assert family.type in ("gauge", "counter"), family

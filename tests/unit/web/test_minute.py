@@ -1,4 +1,4 @@
-"""What a page that is opened gets of the last minute: thinned, bounded, and nothing made up."""
+"""A page that is opened gets the last minute: thinned, bounded and without invented values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WISHED = Twist(Vector3(0.3, 0.0, 0.0), Vector3(0.0, 0.0, -0.6))
 
 
 def lived(seconds: float, look_ns: int = NS_PER_S // 10) -> Minute:
-    """States as they come, of which each is offered."""
+    """Return the minute after each state was offered as it arrived."""
     minute = Minute()
     for at_ns in range(0, int(seconds * NS_PER_S) + 1, look_ns):
         if minute.due(at_ns):
@@ -83,7 +83,7 @@ def test_when_nothing_is_heard_any_more_the_minute_passes() -> None:
 
 
 def test_a_whole_minute_is_small() -> None:
-    """With three decimals at most, so that a phone has it in no time."""
+    """Values have at most three decimals, so that a phone loads them fast."""
     minute = Minute()
     for n in range(1000):
         if minute.due(n * STEP_NS):

@@ -1,4 +1,4 @@
-"""The description has every key, and every reference in it leads somewhere."""
+"""The description has every key, and every reference in it leads to a definition."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WHOLE = document("1.2.3")
 
 
 def references(node: Any) -> list[str]:
-    """All there are."""
+    """Return all references in this node."""
     if isinstance(node, dict):
         own = [node["$ref"]] if "$ref" in node else []
         return own + [one for value in node.values() for one in references(value)]
@@ -59,7 +59,11 @@ def test_every_schema_is_one() -> None:
 
 PAGE = Path(__file__).parents[3] / "deploy/web/README.md"
 
-TO_IT = PAGE.read_text().partition("| to the robot |")[2].partition("| from it |")[0]
+TO_IT = (
+    PAGE.read_text()
+    .partition("| message to the robot |")[2]
+    .partition("| message from the robot |")[0]
+)
 
 MESSAGES = [one for one in re.findall(r"`(\{.*?\})`", TO_IT) if "..." not in one]
 

@@ -1,4 +1,4 @@
-"""A report is drawn by another process: one at a time, bounded, and no longer than it is wanted."""
+"""Another process draws each report: one at a time, bounded, and only while a page wants it."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ WAITS = "import sys, time; print(40, file=sys.stderr, flush=True); time.sleep(10
 
 
 def drawn_by(program: str) -> Reports:
-    """By this one, in the place of acsard's own."""
+    """Return reports that are drawn by this program instead of acsard's own."""
     return Reports((sys.executable, "-S", "-c", program))
 
 
 async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> Progress:
-    """How it is once it is in one of these states."""
+    """Return the progress once it has one of these states."""
     async with asyncio.timeout(PATIENCE_S):
         while (told := found.ask(path, (stamp, 0))).report not in states:
             await asyncio.sleep(0.01)
@@ -79,7 +79,7 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
         await become(found, A, "ready")
         assert found.ask(A, (1, 0)).report == "ready"
         assert found.ask(A, (2, 0)).report == "drawing"
-        # It grows on while it is drawn: what was asked for is told.
+        # The recording grows while it is drawn, so the report has the stamp that was requested.
         await become(found, A, "ready", stamp=3)
 
     run(story)

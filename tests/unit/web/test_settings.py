@@ -1,4 +1,4 @@
-"""What may be set from the page is what `srv/set` takes, with its ranges."""
+"""The page can set exactly the keys that `srv/set` accepts, with their ranges."""
 
 from __future__ import annotations
 

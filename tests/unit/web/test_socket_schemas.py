@@ -1,4 +1,4 @@
-"""The schemas of `/ws`: what it says is as one of them, and spoilt as none."""
+"""Every message of `/ws` matches one of its schemas, and a damaged one matches none."""
 
 from __future__ import annotations
 
@@ -104,5 +104,5 @@ def test_a_message_of_a_key_has_its_type_by_reference(robot: str) -> None:
 
 
 def _without(frame: dict[str, Any]) -> list[dict[str, Any]]:
-    """The robot may go without saying."""
+    """Return the frame without `robot`, which is optional."""
     return [{k: v for k, v in frame.items() if k != "robot"}] if "robot" in frame else []

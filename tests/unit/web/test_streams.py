@@ -1,4 +1,7 @@
-"""The newest of a key: what was published is not replaced by what was asked for."""
+"""The newest sample of a key is kept.
+
+An answer to a query never replaces a published sample.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ KEY = "acsard/acsar/events"
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[zenoh.Session]:
-    """One that reaches nobody."""
+    """Yield a session that reaches no other program."""
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
@@ -26,7 +29,7 @@ def session() -> Iterator[zenoh.Session]:
 
 @pytest.fixture(scope="module")
 def samples(session: zenoh.Session) -> list[zenoh.Sample]:
-    """Two of the key."""
+    """Return two samples of the key."""
     heard = session.declare_subscriber(KEY)
     for said in (b"1", b"2"):
         session.put(KEY, said, encoding="application/json")
@@ -49,7 +52,7 @@ def test_an_answer_that_was_overtaken_is_left_out(samples: list[zenoh.Sample]) -
 
 
 def test_what_comes_by_itself_is_not_asked_for_of_another_robot(session: zenoh.Session) -> None:
-    """A router's storage has the last state of a robot that is off, and it would look like now."""
+    """A router's storage holds the last state of a robot that is off, which would look current."""
 
     async def story(robot: str, key: str) -> bytes:
         streams = Streams()
@@ -77,7 +80,7 @@ def test_what_a_stranger_put_on_a_wildcard_is_not_of_the_key(session: zenoh.Sess
         for key, said in ((KEY, b"1"), ("acsard/**", b"666"), ("acsard/*/*", b"667"), (KEY, b"2")):
             session.put(key, said, encoding="application/json")
         async with asyncio.timeout(10.0):
-            while stream.value()[1] != b"2":  # on a thread of Zenoh's
+            while stream.value()[1] != b"2":  # it arrives on a Zenoh thread
                 await asyncio.sleep(0.001)
         await streams.leave("acsar", "events")
         return stream.value()[:2]

@@ -1,4 +1,4 @@
-"""When a key is due: as often as was asked for, whatever else goes out meanwhile."""
+"""A key is due as often as requested, whatever else is sent meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tokens: only hashes are kept, only their owner reads them, and they end."""
+"""Only hashes of tokens are stored, only their owner can read them, and they expire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The way of the last minutes: thinned, bounded, and begun anew when the pose was set."""
+"""The path of the last minutes is thinned and bounded, and restarts when the pose was set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Who is at the machine, who comes by a name of the robot's, and whose page asks."""
+"""Tests of the place of a client and of the page that asks.
+
+A client is on the machine, or uses one of the robot's names.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +44,7 @@ def test_who_is_at_the_machine_is_here(peer: str, host: str) -> None:
 @pytest.mark.parametrize(
     ("asked", "reason"),
     [
-        # a name of somebody's that he points at 127.0.0.1
+        # a name of an attacker that resolves to 127.0.0.1
         (Asked("127.0.0.1", False, "evil.example:8080"), "host"),
         (Asked("127.0.0.1", False, ""), "host"),
         (Asked("127.0.0.1", False, "localhost.evil.example"), "host"),
@@ -71,7 +74,7 @@ def test_who_comes_through_a_proxy_is_nobody_we_know(secure: bool, host: str) ->
 @pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
 def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
     assert place(Asked("192.168.1.50", True, host), NAMES) == "away"
-    # also at the machine, by the name that others use: with a token as they
+    # A client on the machine that uses the public name needs a token like others.
     assert place(Asked("127.0.0.1", True, host), NAMES) == "away"
 
 
@@ -81,7 +84,7 @@ def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
         (False, "localhost:8080", "http://localhost:8080", None),
         (False, "localhost:8080", "http://localhost:8080", "same-origin"),
         (True, "robot.local", "https://Robot.local", None),
-        (False, "localhost:8080", None, None),  # a program
+        (False, "localhost:8080", None, None),  # a program without a browser
         (False, "localhost:8080", None, "none"),  # typed into the address bar
     ],
 )
@@ -132,7 +135,7 @@ def test_an_ipv4_address_is_itself_by_a_socket_for_both() -> None:
 
 
 def test_a_page_looks_at_its_own_cookie_first_and_at_no_other_robot_s() -> None:
-    """A browser shows those of all ports of a host."""
+    """A browser sends the cookies of all ports of a host."""
     shown = {
         COOKIE: "of before",
         cookie_name("robot1", 8444): "elsewhere",

@@ -1,4 +1,7 @@
-"""Ways of calibrating played through: a simulated robot drives the legs, a person reads off."""
+"""Plays guided calibrations with a simulated robot.
+
+The robot drives the legs, and a simulated person reads the tape.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +20,14 @@ from acsard.config.settings import Config
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
-"""m of the robot's sides and ends that the person measures at."""
+"""Distance between the points of the robot's sides and of its ends that the person measures, m."""
 
 REACTION_RAD = 0.12
 READ_M = 0.002
 
 
 def anyone(seed: int) -> Robot:
-    """A robot whose track, dependence on the rate and wheels nobody knows."""
+    """Return a robot with random track, rate dependence and wheel radii."""
     rng = np.random.default_rng(seed)
     apart = float(rng.uniform(-0.005, 0.005))
     return Robot(
@@ -35,13 +38,16 @@ def anyone(seed: int) -> Robot:
 
 @dataclass
 class Player:
-    """The robot, and the person beside it."""
+    """The simulated robot and the person next to it."""
 
     robot: Robot
     gyro: bool = False
     places: bool = False
     yaw: float = 0.0
-    """rad, since the person set the robot; and the place of its middle."""
+    """Heading since the person aligned the robot, rad.
+
+    `place` is the position of its middle since then, m.
+    """
     place: complex = 0j
     driven_s: float = 0.0
     outermost: complex = 0j
@@ -64,7 +70,7 @@ class Player:
         return self._run(made)
 
     def _run(self, made: Drive) -> Run:
-        """What was told, without the way through a file."""
+        """Return the reported samples as a run, without going through a file."""
         streams: list[tuple[Floats, dict[str, Floats]]] = [
             (made.t, {"left": made.left, "right": made.right})
         ]
@@ -123,7 +129,7 @@ class Player:
 
 
 def play(way: Way, player: Player) -> Calibration:
-    """To its end."""
+    """Play a calibration to its end."""
     step = next(way)
     try:
         while True:

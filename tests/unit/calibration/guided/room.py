@@ -1,4 +1,7 @@
-"""Where a robot truly goes in the room, step by step: nothing here is of the code under test."""
+"""The true path of a robot in the room, step by step.
+
+This module uses none of the code under test.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,23 @@ SIDE = 3.0
 STEP_S = 0.05
 
 ONCE_ROUND = 2 * math.pi + 0.2
-"""rad at which a person ends a first turn, at the worst."""
+"""Largest angle at which a person ends the first turn, rad."""
 
 Start = tuple[complex, float]
-"""Where its middle stands, m from the near right corner of the room, and how it looks."""
+"""Position of the robot's middle and its heading, rad.
+
+The position is in m from the near right corner of the room.
+"""
 
 Drive = tuple[Start, Sequence[Leg]]
-"""Legs between which nobody moves it by hand."""
+"""Start pose and the legs that follow it without a person moving the robot by hand."""
 
 
 def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
-    """All that a way drives when the track is taken for this one; x ahead, y to the left."""
+    """Yield every drive of a calibration if `track` is the estimated track.
+
+    In the poses x is forward and y is left.
+    """
     edge = complex(setup.reach + 0.1, SIDE / 2), 0.0
     if way == "gyro":
         yield edge, (tour.straight(setup), tour.spins(setup))
@@ -48,8 +57,11 @@ def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
 
 
 def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[complex]:
-    """Its middle all the way; `track`: true effective over geometric one; `bend`: by which share
-    the right wheels are larger than the left ones."""
+    """Yield every position of the robot's middle during a drive.
+
+    `track` is the true effective track divided by the geometric one. `bend` is the share by which
+    the right wheels are larger than the left ones.
+    """
     (place, yaw), legs = drive
     geometric = setup.drive.wheel_separation
     believed = setup.drive.wheel_separation_multiplier * geometric
@@ -67,8 +79,12 @@ def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[co
 
 
 def beyond(way: str, setup: Setup, track: float, taken: float, bend: float) -> float:
-    """m by which some point of the robot leaves the room at the worst, less than 0 for none; a
-    wall at the near edge is touched by pushing."""
+    """Return how far some point of the robot leaves the room in the worst case, m.
+
+    The distance is negative if no point leaves it.
+
+    The robot may touch a wall at the near edge, because the person pushes it there.
+    """
     most = -SIDE
     for drive in drives(way, setup, taken):
         for place in places(drive, setup, track, bend):

@@ -1,4 +1,4 @@
-"""Readings as a calibration."""
+"""Tests that turn tape readings into a calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Readings by tape -> parameters, and how sure they are."""
+"""Tests that turn tape readings into parameters and their standard deviations."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ TRUE = {"chi": 1.5, "left": 0.98, "right": 1.01}
 
 
 def driven(plan: Plan) -> tuple[Run, complex, float]:
-    """What its wheels told, and where a robot without noise truly ended."""
+    """Return the wheel log of a robot without noise, its true end position and its true heading."""
     made = drive(replace(Robot(), **(IDEAL | TRUE)), plan)  # type: ignore[arg-type]
     run = log_of(made.csv(gyro=False)).runs[0]
     return run, complex(made.where[-1]), float(made.yaw[-1])
 
 
 def readings() -> list[Reading]:
-    """All kinds, exact."""
+    """Return one exact reading of every kind."""
     spin, _, turned = driven(SPIN)
     straight, end, bent = driven(STRAIGHT)
     curve, there, _ = driven(CURVE)
@@ -63,7 +63,7 @@ def test_whole_turns_that_were_not_counted_do_not_matter() -> None:
 
 @pytest.mark.parametrize("what", ["turned", "distance", "ahead", "aside"])
 def test_slopes_are_those_of_small_steps(what: What) -> None:
-    """But for how the small share that changes with the rate changes in turn."""
+    """The computed slopes ignore a small second-order effect of the rate parameter."""
     steps = joined([driven(CURVE)[0]])
     start = np.array([0.99, 1.01, 0.7, 0.03, 0.0, 0.0, 0.0])
     told = predicted(steps, what, BASE, start)

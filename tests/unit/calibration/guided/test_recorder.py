@@ -1,4 +1,4 @@
-"""What comes on the bus, as a run."""
+"""Tests that turn the messages of the bus into a run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,11 @@ def wheels(seconds: float, right: float, left: float) -> JointState:
 
 
 def recorded() -> Recorder:
-    """Wheels whose stamps are of another clock, 0.1 s and more late; a gyro without stamps."""
+    """Record wheel messages and a gyro.
+
+    The wheel messages have another clock's stamps and arrive at least 0.1 s late. The gyro has no
+    stamps.
+    """
     recorder = Recorder(JOINTS)
     for k in range(100):
         at = 10.0 + 0.02 * k
@@ -50,7 +54,7 @@ def recorded() -> Recorder:
 def test_samples_are_as_far_apart_as_their_stamps_say_and_the_soonest_came_at_once() -> None:
     run = recorded().run()
     assert np.diff(run.t) == pytest.approx(0.02)
-    # The gyro began at 10.0 by our clock, the wheels 0.1 s later.
+    # The gyro began at 10.0 s on this computer's clock, the wheels 0.1 s later.
     assert run.gyro_t[0] == pytest.approx(-0.1)
     assert set(run.left) == {1.0}
     assert set(run.right) == {3.0}

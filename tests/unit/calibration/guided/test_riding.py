@@ -1,4 +1,4 @@
-"""One leg: what is commanded, and what ends it."""
+"""Tests of one leg of a guided calibration: the commands it sends, and the events that end it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Late = Callable[[RobotState], RobotState]
 
 
 def telling(twist: Twist) -> RobotState:
-    """The state of a robot that does as it is told, commanded by app."""
+    """Return the state of a robot that follows this twist, sent by app."""
     left, right = (
         (twist.linear + side * twist.angular * TRACK / 2) / RADIUS for side in (-1.0, 1.0)
     )
@@ -35,7 +35,7 @@ def telling(twist: Twist) -> RobotState:
 
 
 class World:
-    """A daemon that tells its state every tick, and a robot that does as it is told."""
+    """A daemon that publishes its state every tick, and a robot that follows its commands."""
 
     def __init__(self, leg: Leg) -> None:
         self.now = 100.0
@@ -117,7 +117,7 @@ TWO = [SourceState("app", 50, 0.01, "1 more of its senders: the first until it i
 
 
 def of_two(leg: Leg, sender: str) -> World:
-    """The daemon hears two calibrations, and follows this one."""
+    """Return a world whose daemon receives two calibrations and follows this one."""
     world = World(leg)
     world.riding = Riding(leg, "app", DriveConfig(), world.now, US)
     world.tells = changed(sources=TWO, sender=sender)
@@ -163,7 +163,10 @@ def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon(
 
 
 def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> None:
-    """Ctrl-Z, Ctrl-S, a machine without a core: what came meanwhile is heard when it goes on."""
+    """The process stands still after Ctrl-Z, after Ctrl-S, or when it gets no core.
+
+    It receives the messages of that time when it continues.
+    """
     world = World(LEG).until_moving()
     world.now += 1.5
     world.run(TICK)

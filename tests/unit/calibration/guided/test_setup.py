@@ -1,4 +1,4 @@
-"""How fast and how far a robot is driven."""
+"""Tests of the speeds and distances of a guided calibration."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ WAYS = "gyro", "positions", "tape", "wall", "umbmark"
 def test_every_point_of_the_robot_stays_in_the_room(
     way: str, separation: float, multiplier: float
 ) -> None:
-    """Whatever its track is, and with 3 % of doubt where a first turn has told it."""
+    """This holds for every track, and if the first turn measured the track with an error of 3 %."""
     made = setup(robot(separation, multiplier))
     for track in (1.0, 1.4, 1.9, 2.5):
         for off, bend in ((0.97, 0.01), (1.03, -0.01)):

@@ -1,4 +1,4 @@
-"""Turns on the spot, and what is read off."""
+"""Tests of turns on the spot and of the distances that a person reads off."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.unit.calibration.robots import Robot
 
 @given(angle=st.floats(-1.3, 1.3), apart=st.floats(0.1, 1.0))
 def test_two_distances_from_a_line_are_an_angle(angle: float, apart: float) -> None:
-    """A robot with the line on its left that is turned to the left has its front nearer to it."""
+    """A turn to the left brings the front closer to a line on the robot's left."""
     half = apart / 2 * math.sin(angle)
     assert slant(1.0 - half, 1.0 + half, apart) == pytest.approx(angle, abs=1e-9)
 
@@ -54,7 +54,7 @@ def test_there_is_time_for_the_turns(track: float, rate: float) -> None:
 
 
 def once(chi: float) -> Reading:
-    """A first turn of a robot of such a track, ended about when it was round."""
+    """Return the reading of a first turn with this track, ended after about one revolution."""
     player = Player(replace(Robot(chi=chi), **IDEAL))  # type: ignore[arg-type]
     run = player.ride(once_round(usual_setup(), ""))
     return Reading((run,), "turned", player.yaw, 0.01)

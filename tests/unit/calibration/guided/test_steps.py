@@ -1,4 +1,4 @@
-"""The vocabulary of a way."""
+"""Tests of the steps from which a guided calibration is built."""
 
 from __future__ import annotations
 

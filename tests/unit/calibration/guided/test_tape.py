@@ -1,4 +1,4 @@
-"""A tape alone."""
+"""Tests of the guided calibration with only a tape measure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.unit.calibration.robots import Robot
 
 
 class Hasty(Player):
-    """A person who ends the first turn half way round."""
+    """A person who ends the first turn after less than half a revolution."""
 
     def _round_s(self, angular: float) -> float:
         return super()._round_s(angular) / 2.3
@@ -23,7 +23,7 @@ def test_a_first_turn_that_was_ended_half_way_is_found_out() -> None:
 
 
 class Metric(Player):
-    """A person who is asked."""
+    """A person who records every question."""
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)

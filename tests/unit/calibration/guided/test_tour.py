@@ -1,4 +1,4 @@
-"""The tour with a gyro, or with positions."""
+"""Tests of the guided calibration with a gyro or with positions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.unit.calibration.guided.played import Player, anyone, play, usual_set
 
 
 class Blind(Player):
-    """A person without a tape."""
+    """A person without a tape, who answers each question with its default."""
 
     def answer(self, ask: Ask) -> float:
         assert ask.usual is not None

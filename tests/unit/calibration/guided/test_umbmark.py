@@ -1,4 +1,4 @@
-"""Squares, and how far their ends are from their starts."""
+"""Tests of UMBmark squares and of the distances between their ends and their starts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.unit.calibration.robots import SEPARATION, Robot
 
 
 class Exact(Player):
-    """A robot without noise, and a person who notes where the squares ended."""
+    """A person who notes where the squares of a robot without noise ended."""
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
@@ -29,17 +29,20 @@ class Exact(Player):
 
 
 def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
-    """Their equations for E_d and E_b, from the mean ends of squares to the left and to the right.
+    """Compare with the equations for E_d and E_b of Borenstein and Feng.
 
-    What they call the nominal robot is one whose squares would close: of the track by which the
-    turns were told, and of equal wheels.
+    They use the mean ends of left and right squares.
+
+    Their nominal robot is one whose squares would close: it has equal wheels and the track that was
+    used to command the turns.
     """
     robot = replace(Robot(chi=1.3, left=0.999, right=1.001), **IDEAL)  # type: ignore[arg-type]
     player = Exact(robot)
     found = play(umbmark.way(usual_setup()), player).found
     side = umbmark.length(usual_setup())
     left, right = player.ends
-    # Left is counter-clockwise. In their frame the first side is along x, to the left is y.
+    # Left is counter-clockwise. In the frame of their paper the first side is along x, and y is to
+    # the left.
     beta = (right.real - left.real) / (-4 * side)
     ratio = math.tan(beta / 2) * SEPARATION * 1.3 / side
     assert found.values[2] / found.values[1] - 1 == pytest.approx(2 * ratio, abs=1.2e-3)

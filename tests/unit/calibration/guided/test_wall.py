@@ -1,4 +1,4 @@
-"""A wall and a tape."""
+"""Tests of the guided calibration with a wall and a tape measure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Each way played through with simulated robots and a person who reads off to a few mm."""
+"""Tests that play each guided calibration with simulated robots.
+
+The simulated person reads to a few mm.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,10 @@ so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest
 
 @cache
 def robots(way: str, count: int) -> list[tuple[Robot, Calibration, Player, Drive]]:
-    """Each robot, what was found, who played it, and a random drive that was not seen."""
+    """Return each robot, its calibration, its player, and a random drive.
+
+    The calibration did not use the random drive.
+    """
     made = []
     for seed in range(count):
         robot = anyone(seed)
@@ -41,7 +47,7 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
     better = before / after
     rms = float(np.sqrt(np.mean(before**2) / np.mean(after**2)))
     print(f"{way}: heading {rms:.1f} times better, from {min(better):.1f} to {max(better):.1f}")
-    # Of one robot in twenty the floor may skid worse in the drive it is tried on.
+    # One robot in twenty may meet a floor that skids more in the drive that tests the calibration.
     assert rms >= 10
     assert np.mean(better >= 10) >= 0.95
 
@@ -57,7 +63,7 @@ def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     rms = np.sqrt(np.mean(np.square(z)))
     print(f"{way}: {np.mean(np.abs(z) < 2):.1%} of z within 2, rms {rms:.2f}")
     assert np.mean(np.abs(z) < 2) >= (0.95 if count == MANY else 0.85)
-    # So wide that they say nothing would cover as well.
+    # Very large standard deviations would cover the truth as well, but they would be useless.
     assert count == FEW or rms > 0.3
 
 

@@ -1,4 +1,7 @@
-"""Front against rear of one side: what is slip, and what a count, a tyre or a slower motor."""
+"""Tests of the front-rear difference of one side.
+
+It comes from slip, or from a count, a tyre or a slower motor.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ FINE = math.tau / 3200
 def rolled(
     residual: Residual, front: float, rear: float, seconds: float, count: float = FINE
 ) -> list[bool]:
-    """Whether both agreed, line by line, at these speeds in rad/s."""
+    """Return for each line whether the front and rear wheels agreed at these speeds, rad/s."""
     lines = round(seconds / DT)
     return [residual.add(front * DT, rear * DT, KEEP, DT, count) for _ in range(lines)]
 

@@ -1,4 +1,7 @@
-"""A stuck encoder is told from a steady wheel by what its command and the other wheel do."""
+"""A stuck encoder is distinguished from a steady wheel.
+
+The command and the other wheel of the side show the difference.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,15 @@ from acsard.drive.lying_wheels.stuck import Stuck
 DT = 0.01
 FINE = math.tau / 3200
 SLOW_S = 0.25
-"""s in which a slow wheel follows most of the way."""
+"""Time in which a slow wheel completes most of a change, s."""
 
 
 def after(acceleration: float, other: float = 1.0, same: bool = True, count: float = FINE) -> float:
-    """s from where the command leaves 10 rad/s until the wheel that still says 10 is stuck, of
-    which the other one follows by that share; inf for never in a second."""
+    """Return the time until a wheel that still reports 10 rad/s is found stuck, s.
+
+    The time starts when the command leaves 10 rad/s. The other wheel follows the change by the
+    share `other`. The result is inf if one second is not enough.
+    """
     stuck, slow, command, turned = Stuck(), 10.0, 10.0, 10.0
     for line in range(200):
         command += acceleration * DT if line >= 100 else 0.0
@@ -73,7 +79,7 @@ def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
         slow += (command - slow) * DT / (SLOW_S + DT)
         speed += (command - speed) * DT / (lag + DT)
         angles = [angle + speed * DT for angle in angles]
-        own, other = (  # counts
+        own, other = (  # both are whole counts
             math.floor(angle / count) - before for angle, before in zip(angles, said, strict=True)
         )
         said = [said[0] + own, said[1] + other]

@@ -1,4 +1,4 @@
-"""The signs of a lie, and what denies it."""
+"""Tests of the signs that a wheel's encoder is faulty, and of the signs against it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ def felt(speed: float) -> Known:
 def lies(
     own: float, other: float, known: Known, lines: int = 4, same: bool = False
 ) -> tuple[bool, Lie | None]:
-    """Whether the wheel lies after so many lines, speeds in rad/s, and how."""
+    """Return whether the wheel is found faulty after these lines, and its kind of fault.
+
+    Speeds are in rad/s.
+    """
     suspect = Suspect()
     for _ in range(lines):
         if suspect.looks(own * DT, other * DT, same, DT, FINE):

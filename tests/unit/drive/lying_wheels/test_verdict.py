@@ -1,4 +1,4 @@
-"""Front and rear of each side watch each other: who lies is out of the pose, who slips is told."""
+"""The wheels of each side check each other: a faulty one leaves the pose, and slip is reported."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def only(wheel: int, speed: float, others: float = 10.0) -> WheelSpeeds:
 
 
 class Bench:
-    """A witness, asked line by line."""
+    """A consistency check that is fed line by line."""
 
     def __init__(self, counts: int = 3200) -> None:
         kinematics = Kinematics(DriveConfig())
@@ -53,7 +53,10 @@ class Bench:
         seconds: float = 1.0,
         turn: float | None = None,
     ) -> float:
-        """The time after which a wheel was found lying, inf if none was; `turn` in rad/s."""
+        """Return the time until a wheel was found faulty, s, or inf.
+
+        `turn` is the gyro's rate in rad/s.
+        """
         found = math.inf
         for line in range(round(seconds / PERIOD)):
             front_right, front_left, rear_left, rear_right = says.as_tuple()
@@ -74,7 +77,7 @@ def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
     return bench
 
 
-# lies
+# faulty wheels
 
 
 @pytest.mark.parametrize("wheel", range(4))
@@ -146,7 +149,7 @@ def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
     assert apart(before, robot.pose)[0] == pytest.approx(0.01, abs=1e-3)
 
 
-# who is healthy stays
+# no healthy wheel is left out
 
 
 @pytest.mark.parametrize("pushed", [0.5, 3.0, 12.0])
@@ -154,7 +157,7 @@ def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
 def test_hands_that_push_with_nothing_commanded_leave_no_wheel_out(
     pushed: float, in_the_air: int
 ) -> None:
-    """Three wheels roll and one hangs in the air, or the other way round."""
+    """Either three wheels roll while one hangs in the air, or only the one in the air turns."""
     for says in (only(in_the_air, 0.0, pushed), only(in_the_air, pushed, 0.0)):
         bench = Bench()
         for line in range(500):
@@ -216,11 +219,11 @@ def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
     assert unsure.covariance.xx > 90 * sure.covariance.xx
 
 
-# thousands
+# thousands of random drives
 
 
 class Fall:
-    """One drive with one lie: the pose with and without a witness, until the fault."""
+    """One drive with one failure: the pose errors with and without the check, until the fault."""
 
     def __init__(self, kind: str, seed: int, counts: int) -> None:
         rng = np.random.default_rng(seed)
@@ -229,7 +232,7 @@ class Fall:
         wheel = int(rng.integers(4))
         begun = int(rng.integers(300, 700))
         fast = 300 + np.flatnonzero(abs(told[300:700, wheel]) >= 2.0)
-        if not fast.size:  # it stands all the while
+        if not fast.size:  # the robot stands during the whole drive
             begun, wheel = (int(i) for i in np.unravel_index(np.argmax(abs(told[:700])), (700, 4)))
         while fast.size and abs(told[begun, wheel]) < 2.0:
             begun = int(rng.integers(300, 700))
@@ -263,7 +266,7 @@ class Fall:
 
 
 GOAL = 0.05
-"""Of the error that the plain mean makes, of encoders of which a lie shows at once."""
+"""Largest share of the plain mean's error, for encoders that reveal a failure at once."""
 
 COARSE = {
     (400, "stuck"): 0.1,
@@ -272,8 +275,10 @@ COARSE = {
     (20, "reversed"): 0.5,
     (20, "stuck"): 0.1,
 }
-"""Where it is more: 3.5 counts have to go by, and at 20 a turn and little speed a wheel that says
-the opposite is not always told."""
+"""Larger shares for cases in which 3.5 counts must pass before a failure shows.
+
+With 20 counts per turn and at low speed, a reversed wheel is not always found.
+"""
 
 SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 
@@ -291,7 +296,7 @@ SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
 def test_until_the_fault_a_lie_costs_less_than_a_twentieth(
     kind: str, counts: int, count: int
 ) -> None:
-    """On drives at random; of coarse encoders more (`COARSE`)."""
+    """The drives are random. `COARSE` allows more for coarse encoders."""
     falls = [Fall(kind, seed, counts) for seed in range(count)]
     plain = np.array([fall.plain for fall in falls]).mean(axis=0)
     mine = np.array([fall.mine for fall in falls]).mean(axis=0)
@@ -310,14 +315,17 @@ def test_until_the_fault_a_lie_costs_less_than_a_twentieth(
 
 
 def steady(counts: int, speed: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """What is told on a straight, and the angles that four wheels turn; rad/s."""
+    """Return commanded speeds in rad/s and wheel angles in rad of a straight drive."""
     steps = np.concatenate([np.linspace(0.0, 1.0, 150), np.ones(450)])
     told = np.round(steps[:, None] * speed * np.ones(4), 2)
     return told, rolled(told, Robot(counts, tyres=0.005), rng)
 
 
 def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
-    """s until the wheel that lies is left out, on a straight; never another one."""
+    """Return the time until the faulty wheel is left out on a straight drive, s.
+
+    The test fails if another wheel is left out.
+    """
     rng = np.random.default_rng(seed)
     told, angles = steady(counts, speed, rng)
     wheel, begun = int(rng.integers(4)), int(rng.integers(300, 400))
@@ -344,7 +352,7 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
 def test_how_soon_a_lie_is_out_is_a_matter_of_counts_and_speed(
     kind: str, counts: int, speed: float, within: float
 ) -> None:
-    """rad/s of the wheels; 20 are 1 m/s."""
+    """Speeds are those of the wheels in rad/s; 20 rad/s are 1 m/s."""
     found = max(out_after(kind, counts, speed, seed) for seed in range(3))
     print(f"\n{kind}, {counts} counts, {speed:g} rad/s: {found:.2f} s")
     assert found <= within + 1e-9
@@ -353,8 +361,12 @@ def test_how_soon_a_lie_is_out_is_a_matter_of_counts_and_speed(
 def healthy(
     seed: int, seconds: float, counts: int, before: tuple[WheelSpeeds, ...] = ()
 ) -> tuple[int, bool]:
-    """How often slip is told on a clean drive, and whether the pose is the plain mean's, bit for
-    bit; behind the lines of `before`."""
+    """Return how often slip is reported on a clean drive, and whether the pose stays exact.
+
+    The pose must equal the plain mean's bit for bit.
+
+    The lines of `before` precede the drive.
+    """
     rng = np.random.default_rng(10_000 + seed)
     told = commands(rng, seconds)
     robot, plain, alarms, slips = odometry(), Plain(), 0, False
@@ -387,7 +399,7 @@ def test_a_digit_that_flips_at_rest_makes_no_encoder_a_fine_one(seed: int) -> No
 )
 @pytest.mark.parametrize("counts", [96, 400, 3200])
 def test_an_hour_of_clean_driving_raises_one_false_alarm_at_most(counts: int, seconds: int) -> None:
-    """Robots whose motors, tyres and loads differ, each for five minutes."""
+    """The robots differ in motors, tyres and loads. Each drives for at most five minutes."""
     each = min(seconds, 300)
     found = [healthy(seed, each, counts) for seed in range(seconds // each)]
     alarms = sum(alarm for alarm, _ in found)
@@ -397,7 +409,10 @@ def test_an_hour_of_clean_driving_raises_one_false_alarm_at_most(counts: int, se
 
 
 def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float:
-    """s until a tenth more or less on one wheel is told, on a steady drive, at any speed for 0."""
+    """Return the time until an error of a tenth on one wheel is reported on a steady drive, s.
+
+    With `speed` 0 the speed is random.
+    """
     speed = rng.choice((-1, 1)) * (speed or rng.uniform(6.0, 18.0))
     steps = np.concatenate([np.linspace(0.0, 1.0, 90), np.ones(410)])
     told = np.round(steps[:, None] * speed * np.ones(4), 2)
@@ -438,7 +453,7 @@ def test_slip_of_a_tenth_is_told_within_a_fifth_of_a_second(
 def test_how_soon_slip_is_told_is_a_matter_of_counts_and_speed(
     counts: int, speed: float, within: float
 ) -> None:
-    """rad/s of the wheels."""
+    """Speeds are those of the wheels in rad/s."""
     rng = np.random.default_rng(7)
     found = sorted(slipping(rng, counts, speed) for _ in range(5))
     print(f"\n{counts} counts, {speed:g} rad/s: median {found[2]:.2f} s, at most {found[-1]:.2f}")
