@@ -109,7 +109,7 @@ class Guard:
 
     def _note_limits(self) -> None:
         """Let a robot in motion end its ramp by the limits under which it began to move."""
-        if (_wheels(self._last) or _ZERO) == _ZERO:
+        if _wheels(self._last) == _ZERO:
             self._longest = self._ramps
         else:
             (ramp, stop_ramp), (now, stop_now) = self._longest, self._ramps

@@ -10,8 +10,8 @@ The first form draws a seeded sample of all mutants of the core. Tests must noti
 
 Each mutant runs alone, in a process of its own. The tests of the core (`TESTS` in `trials.py`) that
 execute its statement run there until one fails: those of its own module first, then the others, the
-quickest first, and no more than `MOST_SECONDS` of them. The output has each mutant that no test
-noticed, and the reason where `equivalent.py` lists it as one that no test can notice. The exit
+quickest first, and no more than `MOST_SECONDS` of the others. The output has each mutant that no
+test noticed, and the reason where `equivalent.py` lists it as one that no test can notice. The exit
 status is 1 when tests noticed too few.
 
 Why not mutmut or cosmic-ray: both run with this code. But mutmut (3.8) leaves out everything

@@ -519,6 +519,31 @@ def test_new_settings_with_a_longer_ramp_give_a_robot_in_motion_more_time() -> N
     assert clocked.trip(4301, "ready") == LATE
 
 
+def test_new_settings_with_a_longer_stop_give_a_robot_in_motion_more_time() -> None:
+    clocked = Clocked()
+    clocked.guard.use(Config(limits=replace(SLOW_TO_STOP, linear_stop_deceleration=1.0)))
+    assert clocked.trip(0, "stopped") == clocked.trip(1300, "stopped") == ""
+    assert clocked.trip(1301, "stopped") == LATE
+
+
+def test_a_ramp_that_was_longer_counts_no_more_once_the_robot_was_at_rest() -> None:
+    clocked = Clocked()
+    clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))  # 0.4 s
+    assert clocked.trip(100, "ready", 0.0) == ""
+    clocked.drive(1000)
+    assert clocked.trip(1700, "ready") == ""
+    assert clocked.trip(1701, "ready") == LATE
+
+
+def test_the_ramp_of_a_robot_that_skids_is_that_of_its_wider_track() -> None:
+    limits = LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0)
+    narrow, wide = (
+        Guard(STOP, Config(limits=limits, drive=DriveConfig(wheel_separation_multiplier=factor)))
+        for factor in (1.0, 2.0)
+    )
+    assert narrow.memory.ramp_ns == pytest.approx(2 * wide.memory.ramp_ns, rel=1e-6)
+
+
 def test_at_rest_new_settings_bring_their_own_ramp() -> None:
     clocked = Clocked()
     assert clocked.trip(100, "ready", 0.0) == ""

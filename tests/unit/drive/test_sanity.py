@@ -181,6 +181,7 @@ def test_while_an_encoder_is_unknown_any_change_may_be_a_count_but_no_speed_too_
     assert sanity.impossible(stepping(STILL, math.inf)) == ""
     assert sanity.impossible(stepping(only(1, 79.9), math.inf)) == ""
     assert "front_left" in sanity.impossible(stepping(only(1, 80.1), math.inf))
+    assert "front_left" in sanity.impossible(stepping(only(1, 80.1), math.inf, proven=True))
 
 
 # contradictions

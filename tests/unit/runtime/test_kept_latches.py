@@ -43,6 +43,16 @@ def test_the_file_is_json_that_a_person_can_read() -> None:
     text = encode("acsar", Latches(stop=STOP)).decode()
     assert '"why": "stopped by joe@laptop (native)"' in text
     assert len(text.splitlines()) > 10
+    assert '\n  "latches"' in text
+    assert text.endswith("\n}\n")
+
+
+def test_a_text_of_a_stranger_is_kept_up_to_500_characters() -> None:
+    for length in (499, 500, 501):
+        latches = Latches(stop=replace(STOP, by="j" * length))
+        stop = decode("acsar", encode("acsar", latches)).stop
+        assert stop
+        assert len(stop.by) == min(length, 500)
 
 
 def test_all_latches_come_back_marked_as_kept() -> None:
@@ -105,6 +115,8 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
         (b"", "it is empty"),
         (b"\0" * 512, "it is empty"),
         (b"[" * 5000, "it is damaged"),
+        (b"[1, 2]", "it is damaged"),
+        (b'{"format": "2"}', "it is damaged"),
         (encode("acsar", ALL).replace(b'"format": 1', b'"format": 2'), "of another version"),
         (b'{"format": 2, "all": "new"}', "of another version"),
         (encode("other", ALL), "belongs to the robot 'other'"),
