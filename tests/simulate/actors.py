@@ -247,7 +247,7 @@ class Run:
                     witness.offs.append(true_ns)
                 case "set":
                     if not text.startswith("nothing new"):
-                        witness.set_limits(self.true_ns, event["settings"])
+                        witness.set_limits(self.true_ns, event["settings"], true_ns)
                 case "set_pose" | "reset_odometry":
                     self.pose.placed()
 
@@ -376,7 +376,7 @@ class Run:
 
         def start() -> None:
             self.resumed_ns = product.now_ns
-            if product.disk.full:
+            if product.disk.full and not witness.stops:
                 witness.stops.append(self.true_ns)
             product.start()
             self.liveness.event()

@@ -201,8 +201,8 @@ class Witness:
                 raise BrokenError(promise, asked_ns, text)
         latched[:] = later
 
-    def set_limits(self, at_ns: int, settings: dict[str, float]) -> None:
-        """Note settings that the daemon says it has taken."""
+    def set_limits(self, at_ns: int, settings: dict[str, float], asked_ns: int) -> None:
+        """Note settings that the daemon says it has taken; on a full disk it says so late."""
         self.before, self.changed_ns = dict(self.limits), at_ns
         for key, value in settings.items():
             parts = key.split(".")
@@ -219,7 +219,7 @@ class Witness:
             else:
                 self.timeout[parts[2]] = int(value * NS)
             if before_ns != (self.pause_ns, self.timeout):
-                self.arming(at_ns)
+                self.arming(asked_ns)
 
     # what the daemon showed
 
