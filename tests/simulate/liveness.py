@@ -73,6 +73,8 @@ class Liveness:
         run = self.run
         if not self._since or run.active != run.lasting or run.witness.held is not None:
             return
+        if not run.product.plugged:
+            return
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]
             quiet = now_ns - self._event_ns > SETTLES_NS
