@@ -45,7 +45,6 @@ PURE_AMONG_SHELLS = (
     "record.bag",
     "record.batch",
     "record.columns",
-    "record.earlier",
     "record.layout",
     "record.merge",
     "record.plausible",
