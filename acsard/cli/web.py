@@ -178,11 +178,6 @@ def _list(vault: Vault) -> int:
         print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}, {left}")
     if not tokens:
         print(f"no tokens of {vault.robot} in {vault.path}")
-    if older := [one.name for one in tokens if not one.robot]:
-        print(
-            f"made before tokens had a robot, so they open the page of any here: {', '.join(older)}"
-            "; --revoke and --invite them anew"
-        )
     return int(Exit.OK)
 
 
