@@ -119,7 +119,7 @@ class Watched:
             with contextlib.suppress(OSError):
                 os.write(self._holder, b".")
         ended, _, _ = select.select(held, [], [], LOOK_S)
-        return self._leaving or bool(ended and not os.read(held[0], 64))
+        return self._leaving or bool(ended and _at_end(held[0]))
 
     def _open(self) -> Watch:
         side = self._side
@@ -144,6 +144,15 @@ class Watched:
                 pause.wait(LOOK_S)
         except BaseException as error:  # noqa: BLE001 - raised by `run`, which ends the process
             self._error = error
+
+
+def _at_end(holder: int) -> bool:
+    """Return whether the other end of a readable descriptor is closed."""
+    try:
+        return not os.read(holder, 64)
+    except ConnectionResetError:
+        # The other end was closed before it had read all signs of life.
+        return True
 
 
 def _confine() -> None:

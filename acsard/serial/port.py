@@ -173,7 +173,7 @@ class SerialPort:
                 opening.discard(which)
 
         try:
-            device = await in_thread(open_port, OPEN_TIMEOUT_S, late=lambda late: late.close())
+            device = await in_thread(open_port, OPEN_TIMEOUT_S, late=close)
         except NoThreadError as error:
             opening.discard(which)
             raise OSError(errno.EIO, str(error)) from None
