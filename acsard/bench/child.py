@@ -6,8 +6,8 @@ import signal
 import subprocess
 from pathlib import Path
 
-from acsard.host.exits import Exit, ExitError
-from acsard.host.parent import end_with_parent
+from acsard.host.errors import Exit, ExitError
+from acsard.host.processes import end_with_parent
 
 END_S = 5.0
 """Time limit for the end of a process, s. It usually takes 0.2 s."""

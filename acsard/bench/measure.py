@@ -13,7 +13,7 @@ from acsard.bench.rig import Rig
 from acsard.bench.setup import write
 from acsard.bench.table import Result, this_machine
 from acsard.config.settings import Config
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.messages.schema import RobotState
 
 

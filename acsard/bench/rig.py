@@ -35,8 +35,7 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics
 from acsard.host import clock
-from acsard.host.errors import NoAnswerError, UnreachableError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, NoAnswerError, UnreachableError
 from acsard.mcu.codec import Codec
 from acsard.messages.encodings import Decoder, encode, encoding_name
 from acsard.messages.schema import Odometry, RobotState, Twist, Vector3

@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from acsard.cli.common import add_config, load
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

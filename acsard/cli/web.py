@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_bus, load, recorded
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
 from acsard.values import ROLES
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from acsard.config.settings import Config
 from acsard.doctor.finding import Finding, Level
-from acsard.host.ports import BOARDS, serial_devices
 from acsard.host.processes import holders
+from acsard.host.serial_ports import BOARDS, serial_devices
 
 
 def serial_port(config: Config) -> Iterator[Finding]:

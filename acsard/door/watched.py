@@ -20,9 +20,9 @@ import zenoh
 
 from acsard.door.watch import Events, Look, Watch
 from acsard.host import clock
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.host.logs import Log
-from acsard.host.parent import end_with_parent
+from acsard.host.processes import end_with_parent
 from acsard.host.systemd import Systemd
 
 LOOK_S = 0.25

@@ -221,7 +221,6 @@ class Queries:
         value = current(topic.removeprefix(JSON_TREE))
         return [] if value is None else [(topic, type(value).__name__, value)]
 
-
     def _matches(self, query: Query, key: str) -> bool:
         """Return whether a query asks for a key.
 

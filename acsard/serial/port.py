@@ -19,7 +19,7 @@ import serial
 import serial_asyncio
 
 from acsard.host import clock
-from acsard.host.asleep import Asleep
+from acsard.host.clock import Asleep
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.mcu.gate import Gate, Offered

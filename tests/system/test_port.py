@@ -20,7 +20,7 @@ import serial
 
 from acsard.config.settings import McuConfig
 from acsard.host import clock
-from acsard.host.asleep import Asleep
+from acsard.host.clock import Asleep
 from acsard.mcu.check import seal
 from acsard.mcu.session import McuSession
 from acsard.serial.device import open_raw

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.bench.child import daemon_ended
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 
 JSON = '{"event": "ended"}\n'
 

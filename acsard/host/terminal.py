@@ -1,12 +1,20 @@
-"""Sets the terminal to deliver single key presses, for driving by keys."""
+"""The terminal: whether output may contain colours, and single key presses for driving by keys."""
 
 from __future__ import annotations
 
+import os
 import sys
 import termios
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import TextIO
+
+
+def coloured(stream: TextIO) -> bool:
+    """Return whether the stream is a terminal with colours, and NO_COLOR is not set."""
+    wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    return wanted and stream.isatty()
 
 
 @contextmanager

@@ -1,17 +1,21 @@
-"""Tests of the conditions under which output has colours."""
+"""Tests of colours, and of the terminal that reads single keys for keyboard driving."""
 
 from __future__ import annotations
 
 import io
 import os
+import pty
+import select
+import sys
+import termios
 from collections.abc import Iterator
 from typing import TextIO
 
 import pytest
 
 from acsard.config.settings import LogConfig
-from acsard.host.colours import coloured
 from acsard.host.logs import Log
+from acsard.host.terminal import coloured, one_by_one
 from acsard.values import Event
 
 
@@ -66,3 +70,23 @@ def test_the_console_s_log_in_a_file_has_no_colours() -> None:
     logs.close()
     assert "stopped" in stream.getvalue()
     assert "\x1b" not in stream.getvalue()
+
+
+CTRL_S = b"\x13"
+
+
+def test_ctrl_s_is_a_key_and_holds_up_nothing_and_the_terminal_is_left_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    master, slave = pty.openpty()
+    with os.fdopen(slave) as terminal, os.fdopen(master, "rb", 0) as far:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        before = termios.tcgetattr(terminal)
+        assert before[0] & termios.IXON
+        with one_by_one():
+            os.write(far.fileno(), CTRL_S)
+            assert os.read(terminal.fileno(), 9) == CTRL_S
+            os.write(terminal.fileno(), b"written")
+            assert select.select([far], [], [], 5.0)[0]
+            assert far.read(9) == b"written"
+        assert termios.tcgetattr(terminal) == before

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from acsard.bus.inbox import ATTACHMENT_BYTES
-from acsard.host.own_name import own_name, sender_id
+from acsard.host.own_identity import own_name, sender_id
 from acsard.messages.signature import MAX_NAME, MOST, Signature, public_name, unpack
 
 

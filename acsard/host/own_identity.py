@@ -1,13 +1,17 @@
-"""The names under which this process presents itself to a daemon."""
+"""The names and addresses of this process and its machine, as others see them."""
 
 from __future__ import annotations
 
+import ipaddress
+import json
 import os
 import pwd
 import secrets
+import subprocess
 import sys
 from pathlib import Path
 
+from acsard.host.installation_steps import called
 from acsard.messages.signature import MAX_NAME
 
 SECRET_BYTES = 16
@@ -34,3 +38,21 @@ def sender_id(name: str, secret: str = "") -> str:
 def new_secret() -> str:
     """Return 22 random characters that hold no "/"."""
     return secrets.token_urlsafe(SECRET_BYTES)
+
+
+ASK_S = 5.0
+
+
+def own_addresses() -> list[str]:
+    """Return the addresses at which others can reach this machine.
+
+    Loopback and link-local addresses are left out. The list is empty if the command `ip` is
+    missing.
+    """
+    try:
+        found = json.loads(called(("ip", "-json", "address"), ASK_S).stdout or "[]")
+    except (OSError, ValueError, subprocess.TimeoutExpired):
+        return []
+    told = [one["local"] for link in found for one in link.get("addr_info", ()) if "local" in one]
+    real = (ipaddress.ip_address(text) for text in told)
+    return [str(ip) for ip in real if not (ip.is_loopback or ip.is_link_local)]

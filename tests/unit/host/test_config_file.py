@@ -9,8 +9,8 @@ import pytest
 from tomlkit.exceptions import NonExistentKey
 
 from acsard.config.parsing import parse
-from acsard.host.exits import ExitError
-from acsard.host.files import change
+from acsard.host.config_file import change
+from acsard.host.errors import ExitError
 
 REFERENCE = Path(__file__).parents[3] / "acsard.toml"
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.host.exits import ExitError
-from acsard.host.steps import File, Remove, RemoveAll, Run, Write
+from acsard.host.errors import ExitError
+from acsard.host.installation_steps import File, Remove, RemoveAll, Run, Write
 
 
 def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.host.errors import MendableError, NotPermittedError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d", "acsard-web.service.d")
 """Directories that are removed with the last file in them."""
