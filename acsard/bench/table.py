@@ -27,7 +27,7 @@ OWN = {
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",
     "mcu_round_trip": "line -> end of its answer (on a checked link)",
 }
-"""The figures that the daemon measures within its own process, as `figures.Name` defines them."""
+"""The figures that the daemon measures within its own process, as `latencies.Name` defines them."""
 
 
 class Machine(Struct, frozen=True):

@@ -56,7 +56,11 @@ clock by NTP does not change the measured time.
 
 
 class Asleep:
-    """Detector that reports each suspend once."""
+    """Detector that reports each suspend of this computer once.
+
+    The daemon's monotonic clock stands still in a suspend. Without this check, commands and wheel
+    speeds from before it would seem fresh.
+    """
 
     def __init__(self, read: Callable[[], int] = asleep_ns) -> None:
         """Use `read`, which returns how long the computer was suspended since its start, ns."""

@@ -13,8 +13,7 @@ from msgspec.structs import replace
 
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
-from acsard.incoming.asker import asker
-from acsard.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via
+from acsard.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via, asker
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
 from acsard.messages.json_schema import SCHEMAS

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from acsard.drive.gyro import WORDS
 from acsard.messages.schema import Info, RobotState, SourceState, Spread
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.seen import Seen
 from acsard.top.text import (
     ago,

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from acsard.bench.matching import Summary
 from acsard.bench.table import OWN, POINTS, Machine, Result, table, this_machine
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 
 RESULT = Result(
     machine=Machine("a processor", 4, "6.1", "3.13.0", "0.1.0", realtime_permitted=False),

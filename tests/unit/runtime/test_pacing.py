@@ -7,7 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.runtime.at_once import BREATH_NS, IDLE_WAKES, Pace
+from acsard.runtime.pacing import BREATH_NS, IDLE_WAKES, Pace
 
 MS = 1_000_000
 WIRE_NS = 3 * MS

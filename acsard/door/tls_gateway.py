@@ -1,7 +1,7 @@
 """The TLS gateway between clients on other machines and the daemon on loopback.
 
 The gateway is a Zenoh router of its own that forwards only what the access rules allow. The worst
-that a client can cause is a restart of the gateway (`watched.py`), after which all clients
+that a client can cause is a restart of the gateway (`supervision.py`), after which all clients
 reconnect.
 """
 

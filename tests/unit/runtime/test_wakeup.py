@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.runtime import ticker
-from acsard.runtime.period import Period
-from acsard.runtime.ticker import Alarm, Ticker
+from acsard.runtime import wakeup
+from acsard.runtime.pacing import Period
+from acsard.runtime.wakeup import Alarm, Ticker
 
 PERIOD_NS = 10_000_000
 
@@ -28,7 +28,7 @@ class Kernel:
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
     kernel = Kernel()
-    monkeypatch.setattr(ticker, "TimerFd", lambda: kernel)
+    monkeypatch.setattr(wakeup, "TimerFd", lambda: kernel)
     return kernel
 
 

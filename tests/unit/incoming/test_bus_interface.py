@@ -1,11 +1,70 @@
-"""Tests of the log lines and counters about routers that connect and disconnect."""
+"""Tests of the events and counters about the connections of the bus."""
 
 from __future__ import annotations
 
 from collections import Counter
 
-from acsard.incoming.routers import RoutersTold
+import pytest
+
+from acsard.incoming.bus_interface import DOOR_KEY, DoorTold, RoutersTold
+from acsard.incoming.commands import Arrival
+from acsard.messages.encodings import encode, encoding_name
+from acsard.messages.schema import DoorState
 from acsard.values import Event, RoutersStatus
+
+
+def arrival(payload: bytes, encoding: str = "") -> Arrival:
+    return Arrival(DOOR_KEY, True, payload, encoding, 0, None, "")
+
+
+class DoorDaemon:
+    """The daemon's record of the gateway's reports."""
+
+    def __init__(self) -> None:
+        self.told, self.counters = DoorTold(), Counter[str]()
+
+    def hears(self, state: DoorState) -> int | None:
+        heard = arrival(encode(state, "msgpack"), encoding_name("msgpack", "DoorState"))
+        return self.told.hear(heard, self.counters)
+
+
+def test_each_opening_and_each_look_at_a_crowd_counts_once() -> None:
+    daemon = DoorDaemon()
+    for opened, crowded in ((7, 0), (7, 3), (7, 3), (7, 4), (9, 0), (9, 2)):
+        daemon.hears(DoorState(opened, 255, crowded))
+    assert daemon.counters == {"door_opened": 2, "door_crowded": 6}
+
+
+def test_a_crowd_that_was_there_before_the_daemon_counts_whole() -> None:
+    daemon = DoorDaemon()
+    daemon.hears(DoorState(7, 255, 40))
+    assert daemon.counters == {"door_opened": 1, "door_crowded": 40}
+
+
+def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
+    daemon = DoorDaemon()
+    assert daemon.hears(DoorState(7, 0, 0, 1_800_000_000_000_000_000)) == 1_800_000_000_000_000_000
+    assert daemon.hears(DoorState(7, 0, 0)) is None
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\xff",
+        b"{}",
+        b'{"opened": "now"}',
+        b"[]",
+        b'{"opened": -1, "connections": 0, "crowded": 0}',
+        b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 30 + b"}",
+        b'{"opened": 1, "connections": 0, "crowded": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
+    ],
+)
+def test_what_cannot_be_read_counts_nothing(payload: bytes) -> None:
+    counters = Counter[str]()
+    assert DoorTold().hear(arrival(payload), counters) is None
+    assert not counters
+
 
 A, B = "tcp/127.0.0.1:7447", "tcp/robot.local:7447"
 

@@ -2,7 +2,7 @@
 
 As with zenohd, the rules in the file are the permissions of the clients. Within these rules, any
 client with a certificate can still block a router. This one detects it and restarts within 2 s
-(`watched.py`).
+(`supervision.py`).
 """
 
 from __future__ import annotations

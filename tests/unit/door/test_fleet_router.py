@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.door.router import Router
+from acsard.door.fleet_router import Router
 from acsard.host.errors import InUseError, RouterFileError
 
 ROUTER_FILE = Path(__file__).resolve().parents[3] / "deploy" / "zenoh" / "router.json5"
