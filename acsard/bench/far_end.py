@@ -17,8 +17,7 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from acsard.bench.matching import staircase
-from acsard.bench.record import Seen
+from acsard.bench.matching import Seen, staircase
 from acsard.config.parsing import from_builtins
 from acsard.config.settings import Config
 from acsard.host import clock

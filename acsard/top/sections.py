@@ -49,7 +49,7 @@ FIGURES = {
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
-"""Short and long explanation of each `figures.Name`. An arrow leads from one moment to another."""
+"""Short and long words for each `latencies.Name`. An arrow leads from one moment to another."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.bench.measure import measure
-from acsard.bench.setup import bench_config
+from acsard.bench.measure import bench_config, measure
 from acsard.config.settings import Config, ControlConfig
 from acsard.host.errors import Exit, ExitError
 from tests.system.harness import (

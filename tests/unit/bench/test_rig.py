@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.bench.child import daemon_ended
+from acsard.bench.rig import daemon_ended
 from acsard.host.errors import Exit
 
 JSON = '{"event": "ended"}\n'

@@ -7,7 +7,7 @@ import resource
 
 import pytest
 
-from acsard.doctor.machine import scheduling
+from acsard.doctor.examination import scheduling
 from acsard.host import real_time
 
 WANTED = True

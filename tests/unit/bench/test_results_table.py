@@ -6,7 +6,7 @@ import msgspec
 from msgspec.structs import replace
 
 from acsard.bench.matching import Summary
-from acsard.bench.table import OWN, POINTS, Machine, Result, table, this_machine
+from acsard.bench.results_table import OWN, POINTS, Machine, Result, table, this_machine
 from acsard.runtime.latencies import NAMES
 
 RESULT = Result(

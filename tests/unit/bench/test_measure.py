@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.bench.matching import staircase
-from acsard.bench.setup import bench_config, write
+from acsard.bench.measure import bench_config, write
 from acsard.config.parsing import parse
 from acsard.config.settings import BusConfig, Config, ControlConfig, LimitsConfig, McuConfig
 
