@@ -24,9 +24,8 @@ from msgspec import Struct
 
 from acsard.asking.attendant import number_of
 from acsard.calibration.guided.steps import Ask
-from acsard.host.config_file import writable
+from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
-from acsard.host.files import change, require_changeable
 from acsard.web.lines import Doing, Found, Progress, Question, Result, Subject, Told
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Self
 
-from acsard.host.colours import coloured
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
+from acsard.host.terminal import coloured
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson

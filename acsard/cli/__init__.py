@@ -20,8 +20,7 @@ from typing import NoReturn
 from acsard import __version__
 from acsard.cli.exits import code_of
 from acsard.config.nearest import nearest
-from acsard.host.errors import MendableError
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit, MendableError
 from acsard.messages.text import lines
 from acsard.values import AcsardError
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.messages.text import json_line, lines, printable
 from acsard.messages.topics import SERVICES
 

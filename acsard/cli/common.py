@@ -13,8 +13,7 @@ from acsard.config import parsing as configuration
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import RECORD, Config
 from acsard.host.config_file import find
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.messages.text import printable
 from acsard.messages.topics import key_hint, row_of, unknown
 

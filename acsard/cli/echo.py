@@ -15,7 +15,7 @@ from acsard.cli.common import (
     robots_address,
     warn_of_unknown,
 )
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.messages import text
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import signal
 import sys
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 from acsard.messages.text import lines
 

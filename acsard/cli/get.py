@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from acsard.cli.common import MANY, add_bus, require_asked, robots_address
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.messages import text
 from acsard.messages.text import printable
 from acsard.values import AcsardError

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.messages.text import json_line, printable
 
 if TYPE_CHECKING:

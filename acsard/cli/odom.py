@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, load, robot_address
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.client import Client, Subscription

@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_bus, load, recorded
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
 from acsard.values import ROLES
 
@@ -178,11 +177,6 @@ def _list(vault: Vault) -> int:
         print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}, {left}")
     if not tokens:
         print(f"no tokens of {vault.robot} in {vault.path}")
-    if older := [one.name for one in tokens if not one.robot]:
-        print(
-            f"made before tokens had a robot, so they open the page of any here: {', '.join(older)}"
-            "; --revoke and --invite them anew"
-        )
     return int(Exit.OK)
 
 

@@ -28,7 +28,7 @@ from acsard.host.errors import (
     ReplyError,
     UsageError,
 )
-from acsard.host.own_name import new_secret, own_name, sender_id
+from acsard.host.own_identity import new_secret, own_name, sender_id
 from acsard.incoming.queries import BUSY
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name

@@ -14,7 +14,7 @@ from rich.cells import cell_len
 from rich.text import Text
 
 from acsard.messages.schema import RobotState
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.sections import (
     certificate,
     drives,

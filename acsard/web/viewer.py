@@ -16,7 +16,7 @@ from aiohttp import web
 
 from acsard.bus.access import MAY
 from acsard.host import clock
-from acsard.host.own_name import sender_id
+from acsard.host.own_identity import sender_id
 from acsard.messages.signature import public_name
 from acsard.values import NS_PER_S
 from acsard.web import told

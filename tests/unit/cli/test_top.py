@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from acsard.cli import top
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 
 def test_without_its_library_it_says_which_extra_to_install(

@@ -12,7 +12,7 @@ from rich.cells import cell_len
 
 from acsard.drive.modes import Mode
 from acsard.messages.schema import Figure, RobotState, SourceState, Spread, Time
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.seen import Seen
 from acsard.top.view import MODES
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
