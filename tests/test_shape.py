@@ -239,8 +239,9 @@ def test_only_the_clock_reads_a_clock(module: str) -> None:
         assert "datetime" not in roots
 
 
-def test_the_daemon_does_not_load_numpy() -> None:
-    code = "import sys, acsard.runtime.daemon; print('numpy' in sys.modules)"
+@pytest.mark.parametrize("library", ["numpy", "rich"])
+def test_the_daemon_does_not_load_a_library_of_the_tools(library: str) -> None:
+    code = f"import sys, acsard.runtime.daemon; print({library!r} in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
     )

@@ -1,4 +1,4 @@
-"""The screens of `top`, `fleet` and `drive` with the library rich, and `top` as plain text."""
+"""The screens of `top`, `fleet` and `drive`, and `top` as plain text."""
 
 from __future__ import annotations
 
