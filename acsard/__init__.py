@@ -16,6 +16,7 @@ Where to look: one room per concern, in the order they may import each other (P:
 and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-imports` checks it.
 
     values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
+    formatting.py  P  safe text, signed figures, durations, counts and lists, for every message
     config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
     mcu/           P  the serial line: codec, the check, link (is the MCU there?), the port
     drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who is

@@ -18,8 +18,8 @@ from tests.each import each
 PACKAGE = Path(__file__).parents[1] / "acsard"
 
 PURE_ROOMS = (
-    "values", "config", "mcu", "drive", "messages", "ros", "incoming", "robot", "guard", "sim",
-    "checkup", "calibration", "error_budget", "report",
+    "values", "formatting", "config", "mcu", "drive", "messages", "ros", "incoming", "robot",
+    "guard", "sim", "checkup", "calibration", "error_budget", "report",
 )  # fmt: skip
 """Modules without a clock, I/O, asyncio, logging or randomness."""
 

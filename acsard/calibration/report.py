@@ -11,6 +11,7 @@ from acsard.calibration.multipliers import SEPARATION
 from acsard.calibration.solve import Calibration
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt
+from acsard.formatting import many
 
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
@@ -142,7 +143,7 @@ def text(found: Report, calibration: Calibration, where: str) -> str:
 def _text(found: Report, calibration: Calibration, where: str) -> Iterator[str]:
     drives = calibration.drives
     yield (
-        f"{found.log}: {drives.runs} run{'s' if drives.runs > 1 else ''}, {drives.seconds:.0f} s, "
+        f"{found.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
         f"{drives.metres:.1f} m, {drives.turns:.1f} turns at up to {drives.fastest:.2f} rad/s; "
         f"compared with {found.way}"
     )

@@ -20,9 +20,9 @@ from typing import NoReturn
 from acsard import __version__
 from acsard.cli.exits import code_of
 from acsard.config.nearest import nearest
+from acsard.formatting import lines
 from acsard.host.errors import MendableError
 from acsard.host.exits import Exit
-from acsard.messages.text import lines
 from acsard.values import AcsardError
 
 VERBS = (

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
+from acsard.formatting import json_line, printable
 from acsard.host.exits import Exit, ExitError
-from acsard.messages.text import json_line, printable
 
 if TYPE_CHECKING:
     from acsard.record.closing import Closing

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_bus, load, recorded
+from acsard.formatting import lasting
 from acsard.host.errors import UsageError
 from acsard.host.exits import Exit, ExitError
 from acsard.host.extras import install
@@ -151,7 +152,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS
     text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
-    until = f"{_clock(token.ends)}, for {lasts(token.ends - token.made)}"
+    until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
     print(f"{token.name} is {token.role} until {until}; the link is shown only now:\n")
     for url in urls:
         print(f"  {url}#token={text}")
@@ -174,7 +175,8 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 def _list(vault: Vault) -> int:
     tokens, now_s = vault.all(), time.time()
     for one in tokens:
-        left = f"{lasts(one.ends - now_s)} left" if one.ends > now_s else "ended"
+        minutes = round((one.ends - now_s) / 60)
+        left = f"{lasting(60 * minutes)} left" if one.ends > now_s else "ended"
         print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}, {left}")
     if not tokens:
         print(f"no tokens of {vault.robot} in {vault.path}")
@@ -190,16 +192,6 @@ def _revoke(vault: Vault, name: str) -> int:
     vault.revoke(name)
     print(f"{name} counts no more")
     return int(Exit.OK)
-
-
-def lasts(seconds: float) -> str:
-    """Return a duration in words, rounded to minutes, hours or days."""
-    count, unit = round(seconds / 60), "minute"
-    if count >= 60:
-        count, unit = round(seconds / 3600), "hour"
-    if count >= 72 and unit == "hour":
-        count, unit = round(seconds / 86400), "day"
-    return f"{count} {unit}{'' if count == 1 else 's'}"
 
 
 def _clock(seconds: int) -> str:

@@ -15,6 +15,7 @@ from collections.abc import MutableMapping
 from typing import Any, Literal, TextIO
 
 from acsard.config.settings import LogConfig
+from acsard.formatting import printable
 from acsard.host.colours import coloured
 from acsard.host.journal import JournalStream, is_journal, render
 from acsard.values import Event, EventName
@@ -157,8 +158,7 @@ def _printable(
     """Replace characters that would move a terminal's cursor or begin a new line."""
     for key, value in line.items():
         if isinstance(value, str) and not (value.isprintable() and len(value) <= MAX_VALUE):
-            cut = value[:MAX_VALUE]
-            line[key] = "".join(char if char.isprintable() else "?" for char in cut)
+            line[key] = printable(value[:MAX_VALUE])
     return line
 
 

@@ -14,7 +14,7 @@ import textwrap
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from acsard.messages.text import printable
+from acsard.formatting import printable
 from acsard.report.course import Mark
 
 WISHED, LIMITED, MEASURED = "#e08600", "#2f7ed8", "#159a6b"

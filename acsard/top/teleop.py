@@ -11,9 +11,9 @@ from typing import Literal
 
 from msgspec import Struct
 
+from acsard.formatting import printable
 from acsard.messages.schema import RobotState
 from acsard.messages.short import place, speeds
-from acsard.messages.text import printable
 
 NARROWEST = 40
 
