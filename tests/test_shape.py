@@ -56,6 +56,7 @@ PURE_AMONG_SHELLS = (
     "record.story",
     "record.table",
     "record.unpickling",
+    "terminal.tables",
     "top.sections",
     "top.stacked",
     "top.roster",
@@ -81,8 +82,8 @@ PURE_IMPORTS = {
     "__future__", "array", "binascii", "bisect", "collections", "contextlib", "csv", "difflib",
     "enum", "functools", "hashlib", "heapq", "html", "ipaddress", "itertools", "math",
     "msgspec", "numpy", "operator", "pickletools", "re", "rich.cells", "rich.console.Group",
-    "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib", "typing", "xxhash",
-    "zlib",
+    "rich.console.RenderableType", "rich.table", "rich.text", "statistics", "struct", "textwrap",
+    "tomlkit", "tomllib", "typing", "xxhash", "zlib",
 }  # fmt: skip
 """All modules that a pure module may import apart from pure modules, with the allowed names.
 

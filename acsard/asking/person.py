@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Self
 
-from acsard.host.colours import coloured
 from acsard.host.exits import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -55,10 +54,11 @@ class Screen:
     def found(self, finding: Finding) -> None:
         """Print a finding as it is made."""
         from acsard.checkup.report import row
+        from acsard.terminal.output import SENTENCES, show
 
         if not self._as_json:
             self.clear()
-            print(row(finding, coloured(sys.stdout)), flush=True)
+            show(row(finding), most=SENTENCES)
 
     def result(self, found: Report, where: str) -> None:
         """Print the summary of all findings."""

@@ -74,8 +74,9 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.bench.measure import measure
     from acsard.bench.setup import bench_config
-    from acsard.bench.table import table
+    from acsard.bench.table import parts
     from acsard.serial.device import require
+    from acsard.terminal.output import show
 
     port = "" if args.port in (None, "sim") else args.port
     if port:
@@ -86,5 +87,8 @@ def main(args: argparse.Namespace) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     result = measure(bench_config(config, simulated=not port), port, args.seconds)
-    print(msgspec.json.encode(result).decode() if args.json else table(result))
+    if args.json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        show(*parts(result))
     return 0

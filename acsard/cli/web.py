@@ -173,12 +173,18 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 
 
 def _list(vault: Vault) -> int:
+    from acsard.terminal.output import show
+    from acsard.terminal.tables import table
+
     tokens, now_s = vault.all(), time.time()
-    for one in tokens:
-        minutes = round((one.ends - now_s) / 60)
-        left = f"{lasting(60 * minutes)} left" if one.ends > now_s else "ended"
-        print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}, {left}")
-    if not tokens:
+
+    def until(ends: int) -> str:
+        left = f"{lasting(60 * round((ends - now_s) / 60))} left" if ends > now_s else "ended"
+        return f"until {_clock(ends)}, {left}"
+
+    if tokens:
+        show(table((one.name, one.role, until(one.ends)) for one in tokens))
+    else:
         print(f"no tokens of {vault.robot} in {vault.path}")
     if older := [one.name for one in tokens if not one.robot]:
         print(
