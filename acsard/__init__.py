@@ -16,6 +16,7 @@ Where to look: one room per concern, in the order they may import each other (P:
 and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-imports` checks it.
 
     values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
+    formatting.py  P  safe text, signed figures, durations, counts and lists, for every message
     config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
     mcu/           P  the serial line: codec, the check, link (is the MCU there?), the port
     drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who is
@@ -26,6 +27,7 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     ros/           P  the two ROS trees: names and hashes, tokens, attachments, parameters
     incoming/      P  what comes in over the bus: sample -> command, query -> reply or request
     robot.py       P  the order; guard.py: the last look at every outgoing line
+    terminal/      S  what every tool prints with, by the library rich: tables (P), output
     sim/           P  the vehicle, the fake microcontroller, its faults
     checkup/       P  what `acsard mcu check` does: one module a question to the board
     error_budget/  P  what `acsard odom` does: drive_log (what the bus told), steps, budget (each

@@ -180,7 +180,7 @@ _RMW_ROUTER = """ZENOH_CONFIG_OVERRIDE='listen/endpoints=["tcp/127.0.0.1:7447"]'
 
 COMMANDS: dict[str, How] = {
     # README.md
-    "python3 -m venv .venv && .venv/bin/pip install '.[web,top]' && .venv/bin/acsard run": FIRST,
+    "python3 -m venv .venv && .venv/bin/pip install '.[web]' && .venv/bin/acsard run": FIRST,
     "python3 -m venv .venv && .venv/bin/pip install -e '.[test]' && .venv/bin/pytest": InCi(
         "-e '.[test]'"
     ),

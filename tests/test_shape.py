@@ -18,8 +18,8 @@ from tests.each import each
 PACKAGE = Path(__file__).parents[1] / "acsard"
 
 PURE_ROOMS = (
-    "values", "config", "mcu", "drive", "messages", "ros", "incoming", "robot", "guard", "sim",
-    "checkup", "calibration", "error_budget", "report",
+    "values", "formatting", "config", "mcu", "drive", "messages", "ros", "incoming", "robot",
+    "guard", "sim", "checkup", "calibration", "error_budget", "report",
 )  # fmt: skip
 """Modules without a clock, I/O, asyncio, logging or randomness."""
 
@@ -52,6 +52,7 @@ PURE_AMONG_SHELLS = (
     "record.story",
     "record.table",
     "record.unpickling",
+    "terminal.tables",
     "top.sections",
     "top.stacked",
     "top.roster",
@@ -77,8 +78,8 @@ PURE_IMPORTS = {
     "__future__", "array", "binascii", "bisect", "collections", "contextlib", "csv", "difflib",
     "enum", "functools", "hashlib", "heapq", "html", "ipaddress", "itertools", "math",
     "msgspec", "numpy", "operator", "pickletools", "re", "rich.cells", "rich.console.Group",
-    "rich.text", "statistics", "struct", "textwrap", "tomlkit", "tomllib", "typing", "xxhash",
-    "zlib",
+    "rich.console.RenderableType", "rich.table", "rich.text", "statistics", "struct", "textwrap",
+    "tomlkit", "tomllib", "typing", "xxhash", "zlib",
 }  # fmt: skip
 """All modules that a pure module may import apart from pure modules, with the allowed names.
 
@@ -235,8 +236,9 @@ def test_only_the_clock_reads_a_clock(module: str) -> None:
         assert "datetime" not in roots
 
 
-def test_the_daemon_does_not_load_numpy() -> None:
-    code = "import sys, acsard.runtime.daemon; print('numpy' in sys.modules)"
+@pytest.mark.parametrize("library", ["numpy", "rich"])
+def test_the_daemon_does_not_load_a_library_of_the_tools(library: str) -> None:
+    code = f"import sys, acsard.runtime.daemon; print({library!r} in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
     )

@@ -16,7 +16,6 @@ from types import FrameType
 from typing import TYPE_CHECKING, Self
 
 from acsard.host.errors import Exit, ExitError
-from acsard.host.terminal import coloured
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson
@@ -55,10 +54,11 @@ class Screen:
     def found(self, finding: Finding) -> None:
         """Print a finding as it is made."""
         from acsard.checkup.report import row
+        from acsard.terminal.output import SENTENCES, show
 
         if not self._as_json:
             self.clear()
-            print(row(finding, coloured(sys.stdout)), flush=True)
+            show(row(finding), most=SENTENCES)
 
     def result(self, found: Report, where: str) -> None:
         """Print the summary of all findings."""

@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import platform
 import threading
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from msgspec import Struct
+from rich.console import RenderableType
 
 from acsard import __version__
 from acsard.bench.matching import Summary
+from acsard.terminal.tables import table
 
 POINTS = {
     "command_to_wire": "command put here -> first byte of its line at the port's far end",
@@ -124,26 +127,29 @@ def _realtime_permitted() -> bool:
     return bool(permitted)
 
 
-def table(result: Result) -> str:
-    """Return the figures as text for people."""
-    head, width = "  count      p50      p99      max  us", max(map(len, POINTS.values()))
-    lines = [*_about(result), "", f"{'measured from outside':{width}}{head}"]
-    for name, points in POINTS.items():
-        lines.append(f"{points:{width}}{_cells(result.outside.get(name))}")
-    lines += ["", f"{'measured by the daemon itself':{width}}{head}"]
-    for name, points in OWN.items():
-        lines.append(f"{points:{width}}{_cells(result.own.get(name))}")
-    return "\n".join([*lines, "", *_counts(result)])
+def parts(result: Result) -> Iterator[RenderableType]:
+    """Yield the tables of the figures for people."""
+    outside = _figures("measured from outside", POINTS, result.outside)
+    own = _figures("measured by the daemon itself", OWN, result.own)
+    yield table(_about(result))
+    yield from ("", table([*outside, (), *own], right={1, 2, 3, 4}), "")
+    yield table(_counts(result))
 
 
-def _cells(summary: Summary | None) -> str:
+def _figures(
+    head: str, points: dict[str, str], found: Mapping[str, Summary | None]
+) -> list[tuple[str, ...]]:
+    rows = [(words, *_cells(found.get(name))) for name, words in points.items()]
+    return [(head, "count", "p50", "p99", "max us"), *rows]
+
+
+def _cells(summary: Summary | None) -> tuple[str, ...]:
     if summary is None or not summary.count:
-        return "  not measured"
-    s = summary
-    return f"{s.count:7d}{s.p50:9.0f}{s.p99:9.0f}{s.max:9.0f}"
+        return ("not measured",)
+    return (str(summary.count), *(f"{us:.0f}" for us in (summary.p50, summary.p99, summary.max)))
 
 
-def _about(result: Result) -> list[str]:
+def _about(result: Result) -> list[tuple[str, str]]:
     m = result.machine
     permitted = "permitted" if m.realtime_permitted else "not permitted"
     used = "used by the daemon" if result.realtime else "not used by the daemon"
@@ -151,14 +157,17 @@ def _about(result: Result) -> list[str]:
     if not result.simulated:
         port = f"{result.port}, zero speeds only"
     return [
-        f"machine   {m.cpu}, {m.cores} cores, Linux {m.kernel}, Python {m.python}",
-        f"          real-time scheduling {permitted}, {used}",
-        f"run       acsard {m.acsard}, {port}, {result.rate_hz:g} Hz at {result.baud_rate} baud, "
-        f"{result.seconds:g} s",
+        ("machine", f"{m.cpu}, {m.cores} cores, Linux {m.kernel}, Python {m.python}"),
+        ("", f"real-time scheduling {permitted}, {used}"),
+        (
+            "run",
+            f"acsard {m.acsard}, {port}, {result.rate_hz:g} Hz at {result.baud_rate} baud, "
+            f"{result.seconds:g} s",
+        ),
     ]
 
 
-def _counts(result: Result) -> list[str]:
+def _counts(result: Result) -> list[tuple[str, str]]:
     r = result
     seen = "" if r.commands_seen is None else f", {r.commands_seen} seen on the wire"
     said = "" if r.lines_said is None else f" of {r.lines_said}"
@@ -175,7 +184,6 @@ def _counts(result: Result) -> list[str]:
         ("memory", f"{r.resident_mb:.0f} MB resident"),
         ("start-up", f"{start} from the start of the process to the first line on the port"),
     ]
-    lines = [f"{name:16}{text}" for name, text in rows]
     if not r.simulated:
-        lines.append(f"{'left out':16}the wire of a real port cannot be seen from here")
-    return lines
+        rows.append(("left out", "the wire of a real port cannot be seen from here"))
+    return rows

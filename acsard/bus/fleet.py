@@ -15,6 +15,7 @@ from acsard.bus.address import require_id
 from acsard.bus.quiet import Around
 from acsard.bus.subscription import Subscription, queue_on
 from acsard.config.settings import TLS
+from acsard.formatting import many
 from acsard.host.errors import NoAnswerError, UsageError
 from acsard.messages.topics import by_key, full_key
 from acsard.values import ROOT
@@ -86,7 +87,7 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
 
 def seen(endpoint: str, robots: int) -> str:
     """Return how many robots a wildcard found and where. Elsewhere others may be visible."""
-    return f"all seen at {endpoint}: {robots} robot{'' if robots == 1 else 's'}"
+    return f"all seen at {endpoint}: {many(robots, 'robot')}"
 
 
 def nobody(endpoint: str) -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Sequence
 
 from msgspec import Struct
+from rich.console import RenderableType
 
 from acsard.calibration.multipliers import SEPARATION
 from acsard.calibration.solve import Calibration
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt
+from acsard.formatting import many
+from acsard.terminal.tables import table
 
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
@@ -134,41 +136,28 @@ def deviations(found: Calibration) -> dict[str, float]:
     return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
 
 
-def text(found: Report, calibration: Calibration, where: str) -> str:
-    """Return the report as text."""
-    return "\n".join(_text(found, calibration, where))
-
-
-def _text(found: Report, calibration: Calibration, where: str) -> Iterator[str]:
+def parts(found: Report, calibration: Calibration, where: str) -> Iterator[RenderableType]:
+    """Yield the sentences and the table of the report."""
     drives = calibration.drives
     yield (
-        f"{found.log}: {drives.runs} run{'s' if drives.runs > 1 else ''}, {drives.seconds:.0f} s, "
+        f"{found.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
         f"{drives.metres:.1f} m, {drives.turns:.1f} turns at up to {drives.fastest:.2f} rad/s; "
         f"compared with {found.way}"
     )
-    yield ""
-    yield f"{'':<31}{'now':>8}{'found':>10}   standard deviation"
     now, then = calibration.now, calibration.found
-    for name, was, value, std in zip(NAMES, now.values, then.values, then.std, strict=True):
-        yield f"{name:<31}{was:>8.4f}{value:>10.4f}   {std:.4f}"
     was = found.effective_track / then.values[SEPARATION] * now.values[SEPARATION]
-    yield (
-        f"{'effective track, m':<31}{was:>8.4f}{found.effective_track:>10.4f}   "
-        f"{found.effective_track_std:.4f}"
-    )
+    figures = [
+        *zip(NAMES, now.values, then.values, then.std, strict=True),
+        ("effective track, m", was, found.effective_track, found.effective_track_std),
+    ]
+    rows = [(name, *(f"{value:.4f}" for value in values)) for name, *values in figures]
+    yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
+    yield from _better(found)
     yield ""
-    yield from _wrapped(_better(found))
-    yield ""
-    yield from _wrapped(_remains(found, calibration))
-    yield from _wrapped([f"note: {note}" for note in found.notes])
-    yield ""
-    yield f"{where}: written" if found.written else "for acsard.toml (or --write):"
+    yield from _remains(found, calibration)
+    yield from (f"note: {note}" for note in found.notes)
+    yield from ("", f"{where}: written" if found.written else "for acsard.toml (or --write):")
     yield from excerpt(keys(calibration))
-
-
-def _wrapped(sentences: Sequence[str]) -> Iterator[str]:
-    for sentence in sentences:
-        yield from textwrap.wrap(sentence, 100, subsequent_indent="  ")
 
 
 def _better(found: Report) -> list[str]:

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from acsard.formatting import many
+
 Floats = npt.NDArray[np.float64]
 
 WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
@@ -40,8 +42,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
         if wild.any():
             example = float(values[wild][0])
             values[wild] = math.nan
-            count = int(wild.sum())
-            cells = f"{count} cell{'s' if count > 1 else ''}"
+            cells = many(int(wild.sum()), "cell")
             yield f"{cells} of {name} left out as impossible, like {example:g}"
 
 

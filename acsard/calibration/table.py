@@ -20,6 +20,7 @@ from msgspec import Struct
 from acsard.calibration.spikes import bounded
 from acsard.calibration.units import SI, factor, parted
 from acsard.config.nearest import nearest
+from acsard.formatting import many, printable
 from acsard.values import AcsardError
 
 Floats = npt.NDArray[np.float64]
@@ -267,8 +268,7 @@ class _Reader:
             except ValueError:
                 if parted(cell)[0] == self._names[i]:
                     return []  # the header is repeated because logs were concatenated
-                shown = cell if len(cell) <= 30 else cell[:27] + "..."
-                shown = "".join(c if c.isprintable() else "?" for c in shown)
+                shown = printable(cell if len(cell) <= 30 else cell[:27] + "...")
                 date = self._names[i] == "t" and ":" in cell
                 why = "a date, and t is in s" if date else "no number"
                 self._refuse(f'line {number}, column {self._names[i]}: "{shown}" is {why}')
@@ -290,14 +290,10 @@ class _Reader:
         if not rows:
             raise LogError("there are no rows below the header: record a drive")
         if self._bad:
-            notes = [*notes, f"{_rows(self._bad)} left out: {self._first}"]
+            notes = [*notes, f"{many(self._bad, 'row')} left out: {self._first}"]
         values = np.frombuffer(self._values).reshape(rows, len(self._picks))
         columns = {
             self._names[i]: values[:, at] * self._factors[i] for at, i in enumerate(self._picks)
         }
         runs = np.array(self._runs, dtype=np.int64)
         return Table(columns, runs, tuple(self._known), (*notes, *bounded(columns)))
-
-
-def _rows(count: int) -> str:
-    return f"{count} row{'s' if count > 1 else ''}"

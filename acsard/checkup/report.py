@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Sequence
 
 from msgspec import Struct
+from rich.table import Table
+from rich.text import Text
 
 from acsard.checkup import advice, lateness
 from acsard.checkup.findings import REST, Finding
 from acsard.config.writing import excerpt
+from acsard.terminal.tables import table
 
-COLOURS = {"PASS": 32, "WARN": 33, "FAIL": 31, "SKIPPED": 90}
+COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
 
 
 class Report(Struct, frozen=True):
@@ -66,16 +68,12 @@ def failed(findings: Sequence[Finding]) -> bool:
     return any(finding.verdict == "FAIL" for finding in findings)
 
 
-def row(finding: Finding, colours: bool) -> str:
-    """Return a finding as text: verdict, name and figure, then its meaning and its remedy."""
-    mark = f"{finding.verdict:<7}"
-    if colours:
-        mark = f"\033[{COLOURS[finding.verdict]}m{mark}\033[0m"
-    found = [f"{mark} {finding.name:<22} {finding.figure}".rstrip()]
-    for lead, text in (("", finding.text), ("-> ", finding.mend)):
-        first, others = " " * 8 + lead, " " * (8 + len(lead))
-        found += textwrap.wrap(text, 100, initial_indent=first, subsequent_indent=others)
-    return "\n".join(found)
+def row(finding: Finding) -> Table:
+    """Return the verdict with name and figure, then the meaning and the remedy."""
+    verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
+    below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
+    head = f"{finding.name:<22} {finding.figure}"
+    return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
 
 
 def summary(found: Report, where: str) -> str:

@@ -20,8 +20,8 @@ from typing import NoReturn
 from acsard import __version__
 from acsard.cli.exits import code_of
 from acsard.config.nearest import nearest
+from acsard.formatting import lines
 from acsard.host.errors import Exit, MendableError
-from acsard.messages.text import lines
 from acsard.values import AcsardError
 
 VERBS = (

@@ -73,8 +73,9 @@ def main(args: argparse.Namespace) -> int:
     import msgspec
 
     from acsard.bench.measure import bench_config, measure
-    from acsard.bench.results_table import table
+    from acsard.bench.results_table import parts
     from acsard.serial.device import require
+    from acsard.terminal.output import show
 
     port = "" if args.port in (None, "sim") else args.port
     if port:
@@ -85,5 +86,8 @@ def main(args: argparse.Namespace) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     result = measure(bench_config(config, simulated=not port), port, args.seconds)
-    print(msgspec.json.encode(result).decode() if args.json else table(result))
+    if args.json:
+        print(msgspec.json.encode(result).decode())
+    else:
+        show(*parts(result))
     return 0

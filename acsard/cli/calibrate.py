@@ -90,8 +90,9 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
 
     from acsard.calibration.doubts import RefusedError
     from acsard.calibration.guided.steps import GuideError
-    from acsard.calibration.report import Refusal, keys, report, text
+    from acsard.calibration.report import Refusal, keys, parts, report
     from acsard.calibration.table import LogError
+    from acsard.terminal.output import SENTENCES, plain, show
 
     where, mine = load(args.config)
     if args.write:
@@ -113,9 +114,12 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
     told = report(source, found, config.drive, where if args.write else "")
     written = args.write
     if lines is None:
-        print(msgspec.json.encode(told).decode() if args.json else text(told, found, where))
+        if args.json:
+            print(msgspec.json.encode(told).decode())
+        else:
+            show(*parts(told, found, where), most=SENTENCES)
     else:
-        lines.shows(text(told, found, where))
+        lines.shows(plain(*parts(told, found, where), width=SENTENCES))
         trouble = differing(config, mine, where)
         written = written or lines.offer(args.config, keys(found), trouble)
     if written and not args.log:

@@ -12,9 +12,9 @@ from acsard.bus.address import Address, address_of
 from acsard.config import parsing as configuration
 from acsard.config.parsing import ConfigError
 from acsard.config.settings import RECORD, Config
+from acsard.formatting import many, printable
 from acsard.host.config_file import find
 from acsard.host.errors import Exit, ExitError, UsageError
-from acsard.messages.text import printable
 from acsard.messages.topics import key_hint, row_of, unknown
 
 Overrides = dict[str, dict[str, object]]
@@ -86,10 +86,8 @@ def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Con
     except ConfigError as error:
         for problem in error.problems:
             print(f"{where}: {problem}", file=sys.stderr)
-        count = len(error.problems)
-        raise ExitError(
-            Exit.BAD_CONFIG, f"{count} problem{'s' if count > 1 else ''} in {where}"
-        ) from None
+        count = many(len(error.problems), "problem")
+        raise ExitError(Exit.BAD_CONFIG, f"{count} in {where}") from None
 
 
 def recorded(config: Config) -> Config:

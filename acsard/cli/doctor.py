@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from functools import partial
-from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, by_environment, require_one
 from acsard.host.config_file import find
-from acsard.host.terminal import coloured
 
-if TYPE_CHECKING:
-    from acsard.doctor.finding import Finding
+MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}
+"""The word and the colour of each level of a finding."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -33,9 +30,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Examine the machine and print the findings. Return 1 if any of them is a failure."""
     import msgspec
+    from rich.text import Text
 
     from acsard.bus.address import address_of
     from acsard.doctor.examination import examine
+    from acsard.terminal.output import show_whole
 
     require_one(args)
     told = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
@@ -43,16 +42,7 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(msgspec.json.encode(findings).decode())
     else:
-        colours = coloured(sys.stdout)
-        for finding in findings:
-            print(line(finding, colours))
+        for one in findings:
+            mend = f"\n      -> {one.mend}" if one.mend else ""
+            show_whole(Text.assemble(MARKS[one.level], f"  {one.subject}: {one.text}{mend}"))
     return 1 if any(finding.level == "failure" for finding in findings) else 0
-
-
-def line(finding: Finding, colours: bool) -> str:
-    """Return a finding as text for a terminal, with its fix on a second line."""
-    mark = {"ok": "ok  ", "warning": "warn", "failure": "FAIL"}[finding.level]
-    if colours:
-        mark = f"\033[{ {'ok': 32, 'warning': 33, 'failure': 31}[finding.level] }m{mark}\033[0m"
-    text = f"{mark}  {finding.subject}: {finding.text}"
-    return f"{text}\n      -> {finding.mend}" if finding.mend else text

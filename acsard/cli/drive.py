@@ -114,8 +114,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "drive",
         help="drive by keyboard",
-        description="Drive by keyboard from this terminal, on a screen of its own (in colours with "
-        "the extra `top`); line by line where TERM is dumb.\n\n" + HELP,
+        description="Drive by keyboard from this terminal, on a screen of its own; line "
+        "by line where TERM is dumb.\n\n" + HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--linear", type=float, default=0.5, metavar="M/S", help="default 0.5")
@@ -151,10 +151,8 @@ def _show(ride: Ride) -> None:
     dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
     if dumb or not sys.stdout.isatty():
         return _plain(ride)
-    try:
-        from acsard.top.terminal import drive
-    except ImportError:  # without the library rich the screen has no colours
-        from acsard.top.bare import drive
+    from acsard.top.terminal import drive
+
     return drive(ride.step, ride.seen)
 
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from acsard import formatting
 from acsard.cli.common import (
     MANY,
     add_bus,
@@ -16,7 +17,6 @@ from acsard.cli.common import (
     warn_of_unknown,
 )
 from acsard.host.errors import Exit, ExitError
-from acsard.messages import text
 
 if TYPE_CHECKING:
     import zenoh
@@ -153,9 +153,9 @@ def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: s
         except DecodeError:
             pass
         else:
-            return text.printable(f"{whose}: {told}" if whose else told)
+            return formatting.printable(f"{whose}: {told}" if whose else told)
     line = json_line(encoding, payload)
-    return of_robot(whose, line) if whose else text.json_line(line)
+    return of_robot(whose, line) if whose else formatting.json_line(line)
 
 
 def _record(
@@ -218,7 +218,7 @@ def of_robot(whose: str, line: str) -> str:
     import msgspec
 
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
-    return text.json_line(msgspec.json.encode(told).decode())
+    return formatting.json_line(msgspec.json.encode(told).decode())
 
 
 def json_line(encoding: str, payload: bytes) -> str:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
 from acsard.host.errors import Exit, ExitError
-from acsard.host.extras import install
 
 if TYPE_CHECKING:
     from acsard.client import Client
@@ -36,8 +35,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         help="a line for each robot, live",
         description="Show mode, speed, link, version and why of every robot that the bus or router "
         "at --connect knows, live; q or Ctrl-C leaves. By TLS a role may use exact keys only: "
-        "name the robots there, --id robot1,robot2. Into a pipe, or with --once, print one table. "
-        f"The live screen needs an extra: {install('top')}.",
+        "name the robots there, --id robot1,robot2. Into a pipe, or with --once, print one table.",
     )
     parser.add_argument("--once", action="store_true", help="print one table and end")
     add_bus(parser, MANY + " (the default)")
@@ -48,6 +46,7 @@ def main(args: argparse.Namespace) -> int:
     """Show the robots until the operator leaves, or print one table."""
     from acsard.bus.fleet import ALL
     from acsard.client import connect
+    from acsard.top import terminal
     from acsard.top.fleet import Fleet
 
     (endpoint, robot_id, tls), many = robots_address(args)
@@ -57,12 +56,6 @@ def main(args: argparse.Namespace) -> int:
         fleet = Fleet(robot, ids, endpoint)
         if args.once or dumb or not sys.stdout.isatty():
             return _once(fleet, robot.like(ids[0]) if tls and ids != (ALL,) else None)
-        try:
-            from acsard.top import terminal
-        except ImportError:
-            raise ExitError(
-                Exit.FAILURE, f"needs the library rich; use --once, or run: {install('top')}"
-            ) from None
         terminal.roster(fleet)
     return int(Exit.OK)
 

@@ -7,9 +7,9 @@ import signal
 import sys
 
 from acsard.cli.common import add_bus, robot_address
+from acsard.formatting import lines
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
-from acsard.messages.text import lines
 
 DEFAULT = "127.0.0.1:8765"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 
+from acsard import formatting
 from acsard.cli.common import MANY, add_bus, require_asked, robots_address
+from acsard.formatting import printable
 from acsard.host.errors import Exit
-from acsard.messages import text
-from acsard.messages.text import printable
 from acsard.values import AcsardError
 
 
@@ -54,4 +54,5 @@ def main(args: argparse.Namespace) -> int:
 def _show(line: str) -> None:
     import msgspec
 
-    print(text.json_line(msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line))
+    shown = msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line
+    print(formatting.json_line(shown))

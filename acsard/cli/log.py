@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
+from acsard.formatting import json_line, printable
 from acsard.host.errors import Exit, ExitError
-from acsard.messages.text import json_line, printable
 
 if TYPE_CHECKING:
     from acsard.record.closing import Closing
@@ -82,29 +82,34 @@ def list_all(args: argparse.Namespace) -> int:
     from acsard.host.errors import RecordingError
     from acsard.record.closing import closing
     from acsard.record.file import Recording
+    from acsard.terminal.output import show
+    from acsard.terminal.tables import table
 
     where, files = _files(args)
     if not files:
         print(f"no recordings in {where}")
+    rows: list[tuple[str, ...]] = []
     for path in files:
         try:
             last = closing(path)
-            print(_row(path, last) if last else _row_of_all(Recording(path)))
+            rows.append(_row(path, last) if last else _row_of_all(Recording(path)))
         except RecordingError as error:
-            print(f"{path.name}  {error}")
+            rows.append((path.name, "", "", "", printable(str(error))))
+    if rows:
+        show(table(rows, right={2, 3}))
     return int(Exit.OK)
 
 
-def _row(path: Path, last: Closing) -> str:
+def _row(path: Path, last: Closing, note: str = "") -> tuple[str, ...]:
     from acsard.record.closing import how_it_ends
 
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
-    row = f"{path.name}  {began}  {seconds:6.0f} s  {size:7.0f} kB  {last.said}"
-    return printable(row).rstrip() + _bracketed(how_it_ends(last.cut, last.why))
+    said = last.said + _bracketed(how_it_ends(last.cut, last.why)) + note
+    return path.name, began, f"{seconds:.0f} s", f"{size:.0f} kB", printable(said).strip()
 
 
-def _row_of_all(recording: Recording) -> str:
+def _row_of_all(recording: Recording) -> tuple[str, ...]:
     """Return the row of a recording without an end. The whole recording must be read for it."""
     from acsard.host.errors import RecordingError
     from acsard.record.file import Gist, event_of
@@ -115,7 +120,7 @@ def _row_of_all(recording: Recording) -> str:
         if topic == "events":
             with suppress(RecordingError):  # omit only the event that cannot be decoded
                 gist.event(event_of(recording, data))
-    return _row(recording.path, gist.closing()) + _state(recording)
+    return _row(recording.path, gist.closing(), _state(recording))
 
 
 def _bracketed(text: str) -> str:

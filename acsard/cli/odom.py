@@ -144,10 +144,11 @@ def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None
 def _print(found: Budget, as_json: bool) -> None:
     import msgspec
 
-    from acsard.error_budget.text import advice, text
+    from acsard.error_budget.text import advice, parts
+    from acsard.terminal.output import SENTENCES, show
 
     if not as_json:
-        print(text(found), flush=True)
+        show(*parts(found), most=SENTENCES)
         return
     millimetres, degrees = found.total()
     told = msgspec.to_builtins(found)

@@ -87,9 +87,10 @@ def main_uninstall(args: argparse.Namespace) -> int:
 def main_status(args: argparse.Namespace) -> int:
     """Print the state of files and units. Return 0 if the daemon's unit is active."""
     from acsard.host import service_installation as service
+    from acsard.terminal.output import show
+    from acsard.terminal.tables import table
 
-    for file in service.files():
-        print(f"{file.condition():12}  {file.path}")
+    show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer on this machine")
     if state:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
+from acsard.formatting import json_line, lines
 from acsard.host.config_file import writable
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
-from acsard.messages.text import json_line, lines
 
 if TYPE_CHECKING:
     from acsard.values import Plain

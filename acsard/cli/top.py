@@ -7,8 +7,6 @@ import os
 import sys
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.host.errors import Exit, ExitError
-from acsard.host.extras import install
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -17,8 +15,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "top",
         help="the robot on one screen, live",
         description="Show mode, pose, wheels, command sources, link and timing on one screen, "
-        "live; q or Ctrl-C leaves. Into a pipe, or with --once, print one screen as plain text. "
-        "Needs the library rich; without it, it tells what to type.",
+        "live; q or Ctrl-C leaves. Into a pipe, or with --once, print one screen as plain text.",
     )
     parser.add_argument("--once", action="store_true", help="print one screen and end")
     add_bus(parser)
@@ -27,11 +24,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Show the robot until the operator leaves, or print one screen."""
-    try:
-        from acsard.top import terminal
-    except ImportError:
-        raise ExitError(Exit.FAILURE, f"needs the library rich; run: {install('top')}") from None
     from acsard.client import connect
+    from acsard.top import terminal
     from acsard.top.feed import Feed
 
     endpoint, robot_id, tls = robot_address(args)

@@ -29,18 +29,16 @@ def main(args: argparse.Namespace) -> int:
     """Print the table."""
     from acsard.incoming.queries import topic_table
     from acsard.messages.encodings import encode
+    from acsard.terminal.output import show
+    from acsard.terminal.tables import table
 
     _, config = load(args.config)
-    table = ros_table(config) if args.ros else topic_table(config)
+    topics = ros_table(config) if args.ros else topic_table(config)
     if args.json:
-        print(encode(table, "json").decode())
+        print(encode(topics, "json").decode())
         return 0
-    rows = [("KEY", "", "TYPE", "RATE", "MEANING")]
-    rows += [(t.key, t.direction, t.type, t.rate, t.note) for t in table.topics]
-    widths = [max(len(row[i]) for row in rows) for i in range(4)]
-    for row in rows:
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
-        print("  ".join([*cells, row[4]]).rstrip())
+    rows = [(t.key, t.direction, t.type, t.rate, t.note) for t in topics.topics]
+    show(table(rows, ("KEY", "", "TYPE", "RATE", "MEANING")))
     return 0
 
 

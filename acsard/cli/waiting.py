@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
-from acsard.messages.text import printable
+from acsard.formatting import printable
 
 if TYPE_CHECKING:
     from acsard.bus.address import Address

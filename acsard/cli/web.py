@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_bus, load, recorded
+from acsard.formatting import lasting
 from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
 from acsard.values import ROLES
@@ -150,7 +151,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS
     text, token = vault.invite(args.invite, args.name or args.invite, days, args.hours or 0)
-    until = f"{_clock(token.ends)}, for {lasts(token.ends - token.made)}"
+    until = f"{_clock(token.ends)}, for {lasting(token.ends - token.made)}"
     print(f"{token.name} is {token.role} until {until}; the link is shown only now:\n")
     for url in urls:
         print(f"  {url}#token={text}")
@@ -171,11 +172,18 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 
 
 def _list(vault: Vault) -> int:
+    from acsard.terminal.output import show
+    from acsard.terminal.tables import table
+
     tokens, now_s = vault.all(), time.time()
-    for one in tokens:
-        left = f"{lasts(one.ends - now_s)} left" if one.ends > now_s else "ended"
-        print(f"{one.name:20}  {one.role:10}  until {_clock(one.ends)}, {left}")
-    if not tokens:
+
+    def until(ends: int) -> str:
+        left = f"{lasting(60 * round((ends - now_s) / 60))} left" if ends > now_s else "ended"
+        return f"until {_clock(ends)}, {left}"
+
+    if tokens:
+        show(table((one.name, one.role, until(one.ends)) for one in tokens))
+    else:
         print(f"no tokens of {vault.robot} in {vault.path}")
     return int(Exit.OK)
 
@@ -184,16 +192,6 @@ def _revoke(vault: Vault, name: str) -> int:
     vault.revoke(name)
     print(f"{name} counts no more")
     return int(Exit.OK)
-
-
-def lasts(seconds: float) -> str:
-    """Return a duration in words, rounded to minutes, hours or days."""
-    count, unit = round(seconds / 60), "minute"
-    if count >= 60:
-        count, unit = round(seconds / 3600), "hour"
-    if count >= 72 and unit == "hour":
-        count, unit = round(seconds / 86400), "day"
-    return f"{count} {unit}{'' if count == 1 else 's'}"
 
 
 def _clock(seconds: int) -> str:

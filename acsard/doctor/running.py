@@ -18,6 +18,7 @@ from acsard.config.parsing import effective, from_builtins
 from acsard.config.settings import SIMULATOR, Config
 from acsard.config.validation import write
 from acsard.doctor.finding import Finding, Level
+from acsard.formatting import listed
 from acsard.host import clock
 from acsard.host.processes import name_of
 from acsard.messages.schema import DiagnosticStatus, Info, RobotState
@@ -143,9 +144,8 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
         if not its:
             continue
         told = [one.words(key) for key, one in its.items()]
-        more = f"; and {len(told) - SHOWN} more" if len(told) > SHOWN else ""
         text = f"the daemon that runs ({who}) has other values ({how}): "
-        text += f"{'; '.join(told[:SHOWN])}{more}"
+        text += listed(told, SHOWN, "; ")
         mend = mend.format(which="them" if len(its) > 1 else "it", lines=_tables(its))
         yield Finding("configuration", level, text, mend)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from acsard.drive.arbiter import MAX_SENDERS, Choice
+from acsard.formatting import lasting
 from acsard.values import Wait
 
 REFUSED = {
@@ -49,7 +50,7 @@ def waiting(wait: Wait) -> str:
                 "the network, then restart the sender"
             )
         case "neutral":
-            lasts = f"; it has sent speeds for over {_long(wait.lasts)}" if wait.lasts else ""
+            lasts = f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else ""
             alone = f", and no speed for {wait.seconds:g} s after it," if wait.shared else ""
             return (
                 f"send a zero first: {wait.source} must send a zero{alone} before it can drive"
@@ -57,7 +58,7 @@ def waiting(wait: Wait) -> str:
             )
         case "zeros":
             kept = f"; {wait.kept} sends speeds and is kept waiting" if wait.kept else ""
-            zeros = f"nothing but zeros for over {_long(wait.lasts)}"
+            zeros = f"nothing but zeros for over {lasting(wait.lasts)}"
             return f"held by {wait.source}, which sends {zeros}{kept}"
         case "higher":
             return f"{wait.source} has the higher priority: until it is silent"
@@ -65,11 +66,3 @@ def waiting(wait: Wait) -> str:
             return f"{wait.source}, of the same priority, came first: until it is silent"
         case "senders":
             return f"{wait.senders} more of its senders: the first until it is silent"
-
-
-def _long(seconds: float) -> str:
-    """Return a duration in hours, minutes or seconds, in the largest unit that it fills."""
-    for unit, size in (("h", 3600), ("min", 60)):
-        if seconds >= size:
-            return f"{seconds / size:g} {unit}"
-    return f"{seconds:g} s"

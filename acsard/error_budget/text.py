@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator
+
+from rich.console import RenderableType
+from rich.table import Table
 
 from acsard.drive.uncertainty import COARSE_COUNTS
 from acsard.error_budget.budget import Basis, Budget, Cause, Share
-
-WIDTH = 100
+from acsard.terminal.tables import table
 
 MEANING: dict[Cause, str] = {
     "time": "when each line was made",
@@ -45,9 +46,16 @@ CALIBRATE = (
 """Advice while the robot is not calibrated."""
 
 
-def text(budget: Budget) -> str:
-    """Return the table, the data that it is based on, and advice on the largest share."""
-    return "\n".join(_lines(budget))
+def parts(budget: Budget) -> Iterator[RenderableType]:
+    """Yield the table, the data that it is based on, and advice on the largest share."""
+    if budget.still:
+        yield _standing(budget)
+    else:
+        yield from (_driven(budget), "", _table(budget))
+    if budget.learned is not None:
+        yield from ("", _track(budget, budget.learned))
+    sentence = advice(budget)
+    yield from ("", f"{sentence[0].upper()}{sentence[1:]}.")
 
 
 def advice(budget: Budget) -> str:
@@ -64,25 +72,6 @@ def advice(budget: Budget) -> str:
     return "; ".join(told) or "nothing here makes odometry wrong"
 
 
-def _lines(budget: Budget) -> Iterator[str]:
-    if budget.still:
-        yield from _wrapped(_standing(budget))
-    else:
-        yield from _wrapped(_driven(budget))
-        yield ""
-        yield from _table(budget)
-    if budget.learned is not None:
-        yield ""
-        yield from _wrapped(_track(budget, budget.learned))
-    yield ""
-    sentence = advice(budget)
-    yield from _wrapped(f"{sentence[0].upper()}{sentence[1:]}.")
-
-
-def _wrapped(sentence: str) -> list[str]:
-    return textwrap.wrap(sentence, WIDTH)
-
-
 def _driven(budget: Budget) -> str:
     missing = f" ({budget.missing} missing)" if budget.missing else ""
     return (
@@ -92,14 +81,14 @@ def _driven(budget: Budget) -> str:
     )
 
 
-def _table(budget: Budget) -> Iterator[str]:
-    yield f"{'':<14}{'mm in 100 m':>12}{'deg a turn':>12}   {'':<36}told by"
-    for share in budget.shares:
-        figures = f"{_number(share.mm_per_100_m, 0):>12}{_number(share.deg_per_turn, 2):>12}"
-        yield f"{share.cause:<14}{figures}   {MEANING[share.cause]:<36}{TOLD[share.basis]}"
-    millimetres, degrees = budget.total()
-    figures = f"{_number(millimetres, 0):>12}{_number(degrees, 2):>12}"
-    yield f"{'all':<14}{figures}   the root of their squares"
+def _table(budget: Budget) -> Table:
+    known = [(s.cause, s.mm_per_100_m, s.deg_per_turn, MEANING[s.cause], TOLD[s.basis])
+             for s in budget.shares]  # fmt: skip
+    total = ("all", *budget.total(), "the root of their squares", "")
+    rows = [
+        (name, _number(mm, 0), _number(deg, 2), *told) for name, mm, deg, *told in [*known, total]
+    ]
+    return table(rows, ("", "mm in 100 m", "deg a turn", "", "told by"), right={1, 2})
 
 
 def _track(budget: Budget, learned: float) -> str:

@@ -9,22 +9,22 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from acsard.formatting import printable, signed
 from acsard.messages.schema import Odometry, Pose, PoseStamped, RobotState, Twist, TwistStamped
-from acsard.messages.text import printable
 
 
 def place(x: float, y: float, yaw: float) -> list[str]:
     """Format a pose with units: x and y in m, yaw in degrees. The arguments are in m and rad."""
     return [
-        f"x {_signed(x, 3, 8)} m",
-        f"y {_signed(y, 3, 8)} m",
-        f"yaw {_signed(math.degrees(yaw), 1, 6)}°",
+        f"x {signed(x, 3, 8)} m",
+        f"y {signed(y, 3, 8)} m",
+        f"yaw {signed(math.degrees(yaw), 1, 6)}°",
     ]
 
 
 def speeds(linear: float | None, angular: float | None) -> list[str]:
     """Format a twist with units: m/s and rad/s, or "-" for an unknown speed."""
-    return [f"forward {_signed(linear, 2, 5)} m/s", f"turn {_signed(angular, 2, 5)} rad/s"]
+    return [f"forward {signed(linear, 2, 5)} m/s", f"turn {signed(angular, 2, 5)} rad/s"]
 
 
 def short(message: object) -> str:
@@ -49,14 +49,6 @@ def _pose(pose: Pose) -> list[str]:
 
 def _twist(twist: Twist) -> list[str]:
     return speeds(twist.linear.x, twist.angular.z)
-
-
-def _signed(value: float | None, decimals: int, width: int) -> str:
-    if value is None:
-        return "-".rjust(width)
-    # Adding 0.0 turns "-0.00" into "+0.00".
-    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"
-    return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
 
 
 SHORT: dict[type, Callable[[Any], list[str]]] = {

@@ -12,7 +12,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from msgspec import Meta, Struct
 
-from acsard.messages.text import printable
+from acsard.formatting import printable
 
 END = "acsard end"
 """Name of the MCAP metadata record that holds the `Closing`."""

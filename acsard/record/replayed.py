@@ -10,9 +10,9 @@ from acsard.config.live import flat
 from acsard.config.parsing import ConfigError, effective, parse
 from acsard.config.settings import Config
 from acsard.config.validation import show
+from acsard.formatting import listed, many, printable
 from acsard.guard import Memory
 from acsard.host.errors import RecordingError
-from acsard.messages.text import printable
 from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording
 from acsard.record.merge import adopt
@@ -123,7 +123,9 @@ class Course:
                 raise RecordingError(f"{path}: its first steps are missing or damaged")
             if number is not None and step.number != number + 1:
                 missing = step.number - number - 1
-                self.trouble = f"{missing} steps are missing after step {number}"
+                self.trouble = (
+                    f"{many(missing, 'step is', 'steps are')} missing after step {number}"
+                )
                 return
             self.number = step.number
             yield step
@@ -309,8 +311,7 @@ def because(then: Config, now: Config, tally: Tally, began_ns: int) -> list[str]
     before, after = (dict(flat(effective(config))) for config in (then, now))
     keys = [key for key in before | after if before.get(key) != after.get(key)]
     told = [f"{key} {_set(key, before)} then, {_set(key, after)} now" for key in keys]
-    more = [f"and {len(told) - MOST_KEYS} more"] if len(told) > MOST_KEYS else []
-    rows = [f"set otherwise: {'; '.join(told[:MOST_KEYS] + more) or 'nothing'}"]
+    rows = [f"set otherwise: {listed(told, MOST_KEYS, '; ') or 'nothing'}"]
     first, fault = tally.first, tally.fault
     if first is not None and "line" in first.what:
         shaping = [key for key in keys if key.startswith(SHAPE_LINES)]

@@ -15,8 +15,8 @@ from collections import Counter, deque
 from typing import NamedTuple
 
 from acsard.drive.modes import Mode
+from acsard.formatting import printable
 from acsard.guard import Memory
-from acsard.messages.text import printable
 from acsard.record.unpickling import unpickled
 from acsard.robot import Robot
 from acsard.values import AcsardError

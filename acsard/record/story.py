@@ -14,6 +14,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
+from acsard.formatting import many
 from acsard.mcu.whose_silence import is_ours
 from acsard.record.steps import MICRO, Step
 from acsard.values import Event
@@ -83,7 +84,8 @@ class Story:
             yield Told(wall_s, "start", "the daemon starts")
         elif self._number is not None and step.number != self._number + 1:
             missing = step.number - self._number - 1
-            yield Told(wall_s, "gap", f"{missing} steps are missing before this one", "warning")
+            gap = f"{many(missing, 'step is', 'steps are')} missing before this one"
+            yield Told(wall_s, "gap", gap, "warning")
         self._number = step.number
         yield from self._drive(step, wall_s)
         for event in step.said.events:
@@ -125,11 +127,6 @@ NEWS = {
 """Words for the events in a summary; "" for an event that only ends another one."""
 
 
-def _several(word: str) -> str:
-    first, _, rest = word.partition(" of ")
-    return f"{first}s of {rest}" if rest else f"{word}s"
-
-
 def summary(events: Iterable[Told], starts: bool = False) -> str:
     """Summarize the events in a few words.
 
@@ -147,6 +144,6 @@ def summary(events: Iterable[Told], starts: bool = False) -> str:
             stopped.append(event.by)
         counts[word] += event.count
     said = ["start"] if starts else []
-    said += [f"{count} {_several(word) if count > 1 else word}" for word, count in counts.items()]
+    said += [many(count, word) for word, count in counts.items()]
     text = ", ".join(said)
     return f"{text} (stopped by {', '.join(stopped)})" if stopped else text

@@ -14,6 +14,7 @@ from acsard.config.live import flat
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.validation import show
+from acsard.formatting import lasting, listed, many
 from acsard.report.course import Course, Mark
 
 Clock = Callable[[float, bool], str]
@@ -69,29 +70,15 @@ def _shown(table: dict[str, object], key: str) -> str:
     return show(table[key]) if key in table else "-"
 
 
-def lasted(seconds: float) -> str:
-    """Format a duration for people."""
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
-
-
-def many(count: int, one: str, more: str = "") -> str:
-    """Return a count with its noun; zero is written as `no`."""
-    return f"{count or 'no'} {one if count == 1 else more or one + 's'}"
-
-
 def summary(course: Course) -> str:
     """Return the course of events in two or three sentences."""
     fast, counts = course.fastest, course.marks.counts
     drove = sum(one.seconds for one in course.driven.values())
     way = (
-        f"It drove {course.metres:.2f} m in {lasted(drove)} of {lasted(course.seconds)}, "
+        f"It drove {course.metres:.2f} m in {lasting(drove)} of {lasting(course.seconds)}, "
         f"at most {fast.linear:.2f} m/s and {fast.angular:.2f} rad/s."
         if drove
-        else f"It did not drive in these {lasted(course.seconds)}."
+        else f"It did not drive in these {lasting(course.seconds)}."
     )
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in course.marks.all() if mark.name == "stop"])
@@ -111,8 +98,7 @@ def _names(marks: list[Mark]) -> str:
     names = list(dict.fromkeys(mark.by for mark in marks if mark.by))
     if not names:
         return ""
-    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
-    return f" (by {', '.join(names[:MOST_NAMES])}{more})"
+    return f" (by {listed(names, MOST_NAMES)})"
 
 
 def reasons(course: Course) -> list[tuple[str, str, str, float]]:
@@ -141,8 +127,7 @@ def _first_of_each(marks: list[Mark], began: float, clock: Clock) -> str:
     for mark in marks:
         first.setdefault(mark.text, mark)
     told = [f"{clock(began + one.t, False)} {one.text}" for one in first.values()]
-    more = f"; and {len(told) - MOST_NAMES} more" if len(told) > MOST_NAMES else ""
-    return "; ".join(told[:MOST_NAMES]) + more
+    return listed(told, MOST_NAMES, "; ")
 
 
 def notes(course: Course, origin: Origin) -> list[str]:
@@ -167,12 +152,13 @@ def rows(course: Course, origin: Origin, clock: Clock) -> Iterator[tuple[str, st
     """Yield the label and the content of each row of the summary table."""
     began, config = course.began or 0.0, course.config
     yield "When", f"{clock(began, True)} to {clock(began + course.seconds, True)}"
-    yield "How long", f"{lasted(course.seconds)}, {course.steps} steps"
+    yield "How long", f"{lasting(course.seconds)}, {course.steps} steps"
     yield "How far", f"{course.metres:.2f} m, both ways counted"
     fast = course.fastest
     yield "Top speed", f"{fast.linear:.2f} m/s, {fast.angular:.2f} rad/s (measured)"
     driven = [
-        f"{name} {one.metres:.2f} m in {lasted(one.seconds)}" for name, one in course.driven.items()
+        f"{name} {one.metres:.2f} m in {lasting(one.seconds)}"
+        for name, one in course.driven.items()
     ]
     yield "Who drove", ", ".join(driven) or "nobody"
     marks = course.marks.all()

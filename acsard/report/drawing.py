@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from acsard.messages.text import printable
+from acsard.formatting import printable
 from acsard.report.course import Course, Mark, Marks
 from acsard.report.thinning import Place
 

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 
 import msgspec
 
-from acsard.messages.text import printable
-from acsard.report.account import Clock, Origin, differences, lasted, notes, reasons, rows, summary
+from acsard.formatting import lasting, printable
+from acsard.report.account import Clock, Origin, differences, notes, reasons, rows, summary
 from acsard.report.course import Course
 from acsard.report.drawing import Figure
 from acsard.report.figures import Pictures
@@ -184,7 +184,7 @@ def _reasons(course: Course) -> str:
             f'<td class="name">{escaped(name)}</td>',
             f'<td class="time">{escaped(does)}</td>',
             f"<td>{escaped(words)}</td>",
-            f'<td class="time">{lasted(seconds)}</td>',
+            f'<td class="time">{lasting(seconds)}</td>',
         )
         for name, does, words, seconds in reasons(course)
     ]

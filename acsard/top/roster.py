@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from msgspec import Struct
 
+from acsard.formatting import printable, rough, signed
 from acsard.messages.schema import RobotState
-from acsard.messages.text import printable
 from acsard.top.teleop import reason
 
 SILENT_S = 2.0
@@ -102,19 +101,12 @@ def told(row: Row) -> tuple[str, ...]:
     return (
         name,
         printable(state.mode),
-        _speed(state),
+        signed(state.linear, 2, 6),
         printable(state.link),
         printable(row.version) or "-",
-        _age(row.age),
+        rough(row.age),
         why,
     )
-
-
-def _speed(state: RobotState) -> str:
-    """Return the forward speed in m/s, or "-" without feedback."""
-    if state.linear is None:
-        return "-"
-    return f"{state.linear + 0.0:+.2f}" if math.isfinite(state.linear) else "?"
 
 
 def _absence(row: Row) -> str:
@@ -127,14 +119,3 @@ def _order(row: Row) -> tuple[int, str]:
     """Sort by urgency, then by id. Absence counts before the last reported mode."""
     what = _absence(row) or ("" if row.state is None else row.state.mode)
     return URGENT.index(what) if what in URGENT else len(URGENT), row.robot_id
-
-
-def _age(seconds: float) -> str:
-    if seconds == math.inf:
-        return "never"
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    for size, unit in ((1.0, "s"), (60.0, "min"), (3600.0, "h")):
-        if seconds < 99.5 * size:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 86400:.0f} d"

@@ -11,20 +11,11 @@ from collections.abc import Callable, Sequence
 from rich.text import Text
 
 from acsard.drive.gyro import WORDS
+from acsard.formatting import rough, signed
 from acsard.messages.schema import Info, RobotState, SourceState, Spread
 from acsard.runtime.latencies import NAMES
 from acsard.top.seen import Seen
-from acsard.top.text import (
-    ago,
-    bar,
-    clean,
-    count,
-    duration,
-    rate,
-    row,
-    rule,
-    signed,
-)
+from acsard.top.text import bar, clean, count, rate, row, rule
 from acsard.values import NS_PER_S
 
 WIDEST = 116
@@ -128,7 +119,7 @@ def _source(source: SourceState, state: RobotState, room: int) -> Text:
     mark, style = ("▶ ", "bold green") if drive else ("  ", "" if live else "dim")
     name = Text(clean(source.name))
     name.truncate(room, overflow="ellipsis", pad=True)
-    figures = f"{count(source.priority):>8}  {ago(source.age):<7}"
+    figures = f"{count(source.priority):>8}  {rough(source.age):<7}"
     return Text(f"{mark}{name.plain} {figures}{waits(source, state)}", style)
 
 
@@ -264,5 +255,5 @@ def spread(found: Spread | None) -> Text:
     """Return median, 99th percentile and maximum of a figure, in 21 cells."""
     if found is None or found.count <= 0:
         return Text("-".rjust(7) * 3, "dim")
-    p50, p99, most = (duration(value).rjust(7) for value in (found.p50, found.p99, found.max))
+    p50, p99, most = (rough(1e-6 * us, 1e-6).rjust(7) for us in (found.p50, found.p99, found.max))
     return Text.assemble(p50, (p99, "bold"), (most, "dim"))

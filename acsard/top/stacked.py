@@ -13,6 +13,7 @@ from textwrap import wrap
 from rich.cells import cell_len
 from rich.text import Text
 
+from acsard.formatting import rough, signed
 from acsard.messages.schema import RobotState
 from acsard.runtime.latencies import NAMES
 from acsard.top.sections import (
@@ -30,7 +31,7 @@ from acsard.top.sections import (
     wheel,
 )
 from acsard.top.seen import Seen
-from acsard.top.text import ago, clean, count, rule, signed
+from acsard.top.text import clean, count, rule
 
 BELOW = 80
 """Width in cells from which the wide layout is used."""
@@ -65,7 +66,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
         mark = "▶ " if drives(one, state) else "  "
         name = Text(clean(one.name))
         name.truncate(13, overflow="ellipsis", pad=True)
-        said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {ago(one.age)}")]
+        said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {rough(one.age)}")]
         said += folded(waits(one, state), width, 4)
         if len(lines) > 1 and len(lines) + len(said) > room:
             break

@@ -1,7 +1,6 @@
 """The lines that `acsard drive` shows of the robot, for any width. This module is pure.
 
-It needs no library. A terminal shows the lines as a screen (`terminal.py`, `bare.py`); any other
-output gets single lines.
+A terminal shows the lines as a screen (`terminal.py`); any other output gets single lines.
 """
 
 from __future__ import annotations
@@ -12,9 +11,9 @@ from typing import Literal
 
 from msgspec import Struct
 
+from acsard.formatting import printable
 from acsard.messages.schema import RobotState
 from acsard.messages.short import place, speeds
-from acsard.messages.text import printable
 
 NARROWEST = 40
 

@@ -1,4 +1,4 @@
-"""The screens of `top`, `fleet` and `drive` with the library rich, and `top` as plain text."""
+"""The screens of `top`, `fleet` and `drive`, and `top` as plain text."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from acsard.terminal.output import plain
 from acsard.top.feed import Feed
 from acsard.top.fleet import Fleet
 from acsard.top.held import PERIOD_S, be_lenient, hold, steer
@@ -37,10 +38,8 @@ def once(feed: Feed) -> str:
     time.sleep(ONCE_S)
     feed.ask()
     be_lenient()
-    console = Console(color_system=None, force_terminal=False)
-    with console.capture() as captured:
-        console.print(screen(feed.seen(), console.width))
-    return "\n".join(line.rstrip() for line in captured.get().splitlines())
+    width = Console().width
+    return plain(screen(feed.seen(), width), width=width)
 
 
 def live(feed: Feed) -> None:

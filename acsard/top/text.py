@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from rich.cells import cell_len
 from rich.text import Text
 
+from acsard.formatting import printable
+
 MOST = 256
 """Maximum number of characters of a text; a screen shows fewer."""
 
@@ -20,21 +22,7 @@ _EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 def clean(text: str) -> str:
     """Return the text without control, invisible and zero-width characters."""
-    return "".join(
-        " " if c.isspace() else c if c.isprintable() and cell_len(c) else "\ufffd"
-        for c in text[:MOST]
-    )
-
-
-def signed(value: float | None, decimals: int, width: int) -> str:
-    """Format a number with its sign, right-aligned: "-" for None and NaN.
-
-    A number that is too long for `width` is written with an exponent.
-    """
-    if value is None or math.isnan(value):
-        return "-".rjust(width)
-    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 turns "-0.00" into "+0.00"
-    return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
+    return "".join(c if cell_len(c) else "\ufffd" for c in printable(text[:MOST]))
 
 
 def count(number: int) -> str:
@@ -42,28 +30,6 @@ def count(number: int) -> str:
     if abs(number) < 10**10:
         return f"{number:,}"
     return f"{float(max(-(10**300), min(10**300, number))):.1e}"
-
-
-def duration(us: float) -> str:
-    """Format microseconds with about two digits, in at most 6 characters."""
-    if not 0.0 <= us < 1e10:
-        return "?"
-    if us < 999.5:
-        return f"{us:.0f} µs" if us >= 0.5 else "<1 µs"
-    value, unit = (us / 1e3, "ms") if us < 999.5e3 else (us / 1e6, "s")
-    return f"{value:.1f} {unit}" if value < 9.95 else f"{value:.0f} {unit}"
-
-
-def ago(seconds: float | None) -> str:
-    """Format the time since an event, or "never" for None."""
-    if seconds is None:
-        return "never"
-    if not 0.0 <= seconds < 1e9:
-        return "?"
-    for size, unit in ((1.0, "s"), (60.0, "min"), (3600.0, "h")):
-        if seconds < 99.5 * size:
-            return f"{seconds / size:.1f} s" if unit == "s" else f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 86400:.0f} d"
 
 
 def rate(later: int, earlier: int, seconds: float) -> str:

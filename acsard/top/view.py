@@ -13,12 +13,13 @@ from msgspec.structs import replace
 from rich.console import Group
 from rich.text import Text
 
+from acsard.formatting import lasting, rough
 from acsard.messages.schema import RobotState
 from acsard.top import sections as beside
 from acsard.top import stacked
 from acsard.top.sections import WIDEST
 from acsard.top.seen import Seen
-from acsard.top.text import ago, clean, ends
+from acsard.top.text import clean, ends
 
 MOST_SOURCES = 32
 
@@ -73,7 +74,7 @@ def _header(seen: Seen, width: int) -> Text:
     left = Text.assemble((clean(seen.robot_id), "bold"), "  ", clean(seen.endpoint))
     if seen.info is not None:
         left.append(f"  acsard {clean(seen.info.version)}", "dim")
-    right = Text(f"heard {ago(seen.age)} ago" if seen.state is not None else "", "dim")
+    right = Text(f"heard {rough(seen.age)} ago" if seen.state is not None else "", "dim")
     if seen.hint:
         right.append(f"   {seen.hint}")
     return ends(left, right, width)
@@ -107,7 +108,7 @@ def _split(words: str, room: int) -> tuple[str, str]:
 
 def _no_news(seen: Seen, width: int) -> list[Text]:
     """Return a bar across the screen that marks the data below as old."""
-    since = ago(int(min(seen.age, 1e9))).replace(".0", "")
+    since = lasting(int(min(seen.age, 1e9)))
     words = f"NO NEWS FOR {since}: is the daemon running?"
     if seen.undecodable:
         words = f"NOTHING READABLE FOR {since}: is the daemon of another version?"

@@ -571,16 +571,6 @@ os.execvp("bash", [*words, *sys.argv[1:]])
 """The same program, as a job of a shell."""
 
 
-WITHOUT_RICH = """\
-import fcntl, runpy, sys, termios
-fcntl.ioctl(0, termios.TIOCSCTTY, 0)
-sys.modules["rich"] = None
-sys.argv[0] = "acsard"
-runpy.run_module("acsard", run_name="__main__")
-"""
-"""The same program, without the library of the screens."""
-
-
 class Terminal:
     """A person at a terminal: presses keys and reads the screen."""
 
@@ -700,25 +690,19 @@ def screens(terminal: Terminal) -> list[str]:
 
 
 @contextmanager
-def screened(
-    shared: Daemon, columns: int, how: str = ON_TERMINAL
-) -> Iterator[tuple[Terminal, Program]]:
+def screened(shared: Daemon, columns: int) -> Iterator[tuple[Terminal, Program]]:
     """Run `acsard drive` at a terminal of that width that can show a screen."""
-    with at_terminal(shared, "drive", "xterm-256color", columns, how) as (terminal, program):
+    with at_terminal(shared, "drive", "xterm-256color", columns) as (terminal, program):
         until(lambda: [one for one in screens(terminal) if WAITS in one], 10.0, "it")
         yield terminal, program
 
 
-RICH_OR_NOT = pytest.mark.parametrize("how", [ON_TERMINAL, WITHOUT_RICH], ids=["rich", "bare"])
-
-
 @pytest.mark.variations(2)
 @pytest.mark.parametrize("columns", [40, 80])
-@RICH_OR_NOT
 def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
-    shared: Daemon, bus: Bus, columns: int, how: str
+    shared: Daemon, bus: Bus, columns: int
 ) -> None:
-    with screened(shared, columns, how) as (terminal, _):
+    with screened(shared, columns) as (terminal, _):
         with held(terminal, "i"):
             until(lambda: "DRIVING" in screens(terminal)[-1], 5.0, "driving")
         frames = screens(terminal)
@@ -734,13 +718,12 @@ def test_drive_shows_reason_pose_and_help_on_a_screen_of_any_width(
 
 
 @pytest.mark.slow
-@RICH_OR_NOT
 def test_a_drive_that_is_suspended_stops_gives_the_terminal_back_and_goes_on(
-    shared: Daemon, bus: Bus, how: str
+    shared: Daemon, bus: Bus
 ) -> None:
     with Terminal() as fresh:
         usual = fresh.settings
-    with screened(shared, 80, how) as (terminal, program), bus.follow("cmd/teleop") as commands:
+    with screened(shared, 80) as (terminal, program), bus.follow("cmd/teleop") as commands:
         during = terminal.settings
         assert during != usual
         with held(terminal, "i"):

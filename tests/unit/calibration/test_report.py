@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import msgspec
 
-from acsard.calibration.report import NAMES, keys, report, text
+from acsard.calibration.report import NAMES, keys, parts, report
 from acsard.config.parsing import parse
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt
+from acsard.terminal.output import SENTENCES, plain
 from tests.unit.calibration.cut import calibrated, usual
 
 FOUND = calibrated(usual().csv(places=False))
@@ -35,8 +36,8 @@ def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
 
 
 def test_people_are_told_what_it_improves_and_what_remains() -> None:
-    told = text(REPORT, FOUND, "acsard.toml")
+    told = plain(*parts(REPORT, FOUND, "acsard.toml"), width=SENTENCES)
+    assert "wheel_separation_multiplier   " in told
     assert f"a turn of 360 deg ends {REPORT.turn_error_before:.0f} deg off now" in told
     assert "what remains" in told
     assert "--distance METRES" in told
-    assert all(len(line) <= 110 for line in told.splitlines())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections import deque
 from types import SimpleNamespace
 from typing import Any
@@ -278,13 +276,3 @@ def test_a_file_has_the_help_once() -> None:
     page = Page()
     assert page.with_help(["news"], NO_END) == [*HELP, "news"]
     assert page.with_help(["news"] * 1000, NO_END) == ["news"] * 1000
-
-
-def test_without_the_library_of_the_screen_the_rest_is_there() -> None:
-    words = (
-        "import sys; sys.modules['rich'] = None\n"
-        "import acsard.cli.drive, acsard.top.fleet, acsard.top.bare, acsard.top.roster\n"
-        "try:\n    import acsard.top.terminal\nexcept ImportError:\n    print('no screen')"
-    )
-    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=60)
-    assert (done.stdout, done.stderr) == ("no screen\n", "")

@@ -8,7 +8,8 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.error_budget.budget import Basis, Budget, Cause, Share
-from acsard.error_budget.text import WIDTH, advice, text
+from acsard.error_budget.text import advice, parts
+from acsard.terminal.output import SENTENCES, plain
 
 DRIVEN = Budget(
     10.0, 4.0, 400.0, 1000, 3, 0.25, 0.004, 0.01, 0, gyro=False, still=False,
@@ -20,6 +21,10 @@ def of(*shares: tuple[Cause, float | None, Basis], **fields: Any) -> Budget:
     """Return a budget with these shares by cause, error in mm and basis."""
     made = tuple(Share(cause, mm, mm, basis) for cause, mm, basis in shares)
     return replace(DRIVEN, shares=made, **fields)
+
+
+def text(budget: Budget) -> str:
+    return plain(*parts(budget), width=SENTENCES)
 
 
 KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
@@ -69,7 +74,7 @@ def test_the_table_has_every_cause_and_their_sum() -> None:
     assert next(row for row in rows if row.startswith("time")).split()[1:3] == ["30", "30.00"]
     assert next(row for row in rows if row.startswith("slip")).endswith("[odometry]")
     assert next(row for row in rows if row.startswith("all")).split()[1:3] == ["50", "50.00"]
-    assert max(map(len, rows)) <= WIDTH
+    assert max(map(len, rows)) <= SENTENCES
 
 
 def test_what_this_driving_does_not_tell_is_a_dash_and_what_is_tiny_no_zero() -> None:

@@ -22,7 +22,7 @@ def installed(where: Path, **direct: object) -> Distribution:
     info = where / "acsard-1.dist-info"
     info.mkdir()
     lines = ["Name: acsard", "Requires-Dist: zenoh", "Requires-Dist: one<2,>=1; extra == 'lan'"]
-    lines += ["Requires-Dist: two; extra == 'lan'", "Requires-Dist: three; extra == 'top'"]
+    lines += ["Requires-Dist: two; extra == 'lan'", "Requires-Dist: three; extra == 'web'"]
     (info / "METADATA").write_text("\n".join(lines) + "\n\n")
     if direct:
         (info / "direct_url.json").write_text(json.dumps(direct))
@@ -44,7 +44,7 @@ def test_from_what_is_gone_it_is_the_libraries_alone(tmp_path: Path, url: str) -
 
 
 def test_from_nobody_knows_where_it_is_the_libraries_alone(tmp_path: Path) -> None:
-    assert wanted_by(installed(tmp_path), "top") == ["three"]
+    assert wanted_by(installed(tmp_path), "web") == ["three"]
 
 
 @pytest.mark.parametrize("extra", get_args(Extra))

@@ -228,7 +228,7 @@ def test_no_text_of_a_stranger_moves_the_cursor_or_makes_a_line(
     evil = "cmd/\x1b[2J\n\r\x00\u202eapp"
     (line,) = written(tmp_path, Event("command_refused", evil, by=evil), form=form)
     told = line.replace("\x1b[0m", "").replace("\x1b[1m", "").replace("\x1b[2m", "")
-    assert "cmd/?[2J????app" in told
+    assert "cmd/\ufffd[2J  \ufffd\ufffdapp" in told.replace("\\ufffd", "\ufffd")
     assert "\x1b[2J" not in line
     assert "\u202e" not in line
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.config.settings import Config, Source
-from acsard.report.account import Origin, Setting, differences, lasted, reasons, rows, summary
+from acsard.report.account import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two
 
@@ -80,9 +80,3 @@ def test_sentences_that_differ_by_a_number_are_one_reason_as_the_longest_says_it
         band.add(t, "waits", f"lines come 0.1{n} s apart")
     band.end(4.0)
     assert reasons(course) == [("app", "waits", "lines come 0.11 s apart", 3.0)]
-
-
-def test_times_are_said_as_people_do() -> None:
-    assert [lasted(s) for s in (0.04, 59.94, 60.0, 3599.7, 86400.0)] == [
-        "0.0 s", "59.9 s", "1 min 0 s", "1 h 0 min", "24 h 0 min",
-    ]  # fmt: skip

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from acsard.top.text import ago, bar, clean, count, duration, ends, rate, rule, signed
+from acsard.top.text import bar, clean, count, ends, rate, rule
 from acsard.top.text import row as labelled
 
 
@@ -40,46 +40,11 @@ def test_cleaned_text_is_printable_and_bounded(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("us", "text"),
-    [
-        (0.0, "<1 µs"), (63.1, "63 µs"), (999.4, "999 µs"), (999.6, "1.0 ms"), (8912.5, "8.9 ms"),
-        (9949.0, "9.9 ms"), (9960.0, "10 ms"), (332_775.0, "333 ms"), (2.5e6, "2.5 s"),
-        (9.9e9, "9900 s"), (1e12, "?"), (-1.0, "?"), (math.nan, "?"), (math.inf, "?"),
-    ],
-)  # fmt: skip
-def test_a_duration_is_told_in_its_own_unit(us: float, text: str) -> None:
-    assert duration(us) == text
-
-
-@given(st.floats())
-def test_a_duration_never_takes_more_than_6_characters(us: float) -> None:
-    assert len(duration(us)) <= 6
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
-     (math.inf, "   +inf"), (math.nan, "      -")],
-)  # fmt: skip
-def test_a_number_has_its_sign_and_its_place(value: float, text: str) -> None:
-    assert signed(value, 2, 7) == text
-
-
-@pytest.mark.parametrize(
     ("number", "text"), [(0, "0"), (1234567, "1,234,567"), (10**30, "1.0e+30"), (-5, "-5")]
 )
 def test_a_count_is_readable_however_large(number: int, text: str) -> None:
     assert count(number) == text
     assert len(count(number**1000)) < 15
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(None, "never"), (0.04, "0.0 s"), (12.34, "12.3 s"), (240.0, "4 min"), (7300.0, "2 h"),
-     (9e5, "10 d"), (math.nan, "?"), (-1.0, "?")],
-)  # fmt: skip
-def test_an_age_is_told_in_its_own_unit(seconds: float | None, text: str) -> None:
-    assert ago(seconds) == text
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_a_slow_state_is_not_silent_before_its_time() -> None:
 
 def test_what_was_known_before_the_silence_stays_dimmed() -> None:
     seen = replace(SEEN, age=100.0)
-    assert "NO NEWS FOR 2 min" in lines_of(seen)[2]
+    assert "NO NEWS FOR 1 min 40 s" in lines_of(seen)[2]
     assert "+1.250 m" in line_with("yaw", seen)
     assert len(lines_of(seen)) == 24
     assert re.search(r"\x1b\[2mx   \+1.250", painted(seen))

@@ -8,10 +8,11 @@ import pytest
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.guided.measured import calibrated
 from acsard.calibration.guided.readings import Reading
-from acsard.calibration.report import keys, report, text
+from acsard.calibration.report import keys, parts, report
 from acsard.config.parsing import parse
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt
+from acsard.terminal.output import plain
 from tests.unit.calibration.guided.test_readings import readings
 
 DRIVE = DriveConfig()
@@ -28,7 +29,7 @@ def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
 
 def test_people_read_it_and_the_configuration_takes_it() -> None:
     made = calibrated("a tape", readings(), DRIVE)
-    told = text(report("the drive", made, DRIVE, ""), made, "acsard.toml")
+    told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml"))
     assert "compared with a tape" in told
     assert "a turn of 360 deg ends" in told
     config = parse("\n".join(excerpt(keys(made))).encode())

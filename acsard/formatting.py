@@ -1,0 +1,94 @@
+"""Formats texts and values for people; pure.
+
+A text from a stranger passes `printable`, `lines` or `json_line` before a terminal gets it. Counts,
+durations and signed figures look the same in every message, because this module formats them all.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+
+def printable(text: str) -> str:
+    """Return the text on one line, without control characters that a terminal would obey."""
+    return "".join(" " if c.isspace() else c if c.isprintable() else "\ufffd" for c in text)
+
+
+def lines(text: str) -> str:
+    """Make a text of several lines printable, and keep its line breaks."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+_ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")
+
+
+def json_line(text: str) -> str:
+    """Escape the unprintable characters of a JSON text; the JSON value stays the same."""
+    return _ABOVE_ASCII.sub(
+        lambda m: m[0] if m[0].isprintable() or ord(m[0]) > 0xFFFF else f"\\u{ord(m[0]):04x}", text
+    )
+
+
+def many(count: int, one: str, more: str = "") -> str:
+    """Return a count with its noun: `no lines`, `1 line`, `2 lines`, `2 changes of who drives`.
+
+    `more` is the plural if it does not end in "s".
+    """
+    noun, of, rest = one.partition(" of ")
+    return f"{count or 'no'} {one if count == 1 else more or f'{noun}s{of}{rest}'}"
+
+
+def listed(items: Sequence[str], most: int, joint: str = ", ") -> str:
+    """Join texts; say how many are left out if there are more than `most`."""
+    more = [f"and {len(items) - most} more"] if len(items) > most else []
+    return joint.join([*items[:most], *more])
+
+
+def signed(value: float | None, decimals: int, width: int) -> str:
+    """Format a number with its sign, right-aligned: "-" for None and NaN.
+
+    A number that is too long for `width` is written with an exponent.
+    """
+    if value is None or math.isnan(value):
+        return "-".rjust(width)
+    text = f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 turns "-0.00" into "+0.00"
+    return (text if len(text) <= width else f"{value:+.0e}").rjust(width)
+
+
+_UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
+
+
+def lasting(seconds: float) -> str:
+    """Format a duration in its two largest units; below a minute, in s with one decimal."""
+    if seconds < 59.95:
+        return f"{round(seconds, 1):g} s"
+    parts: list[tuple[int, str]] = []
+    rest = round(seconds)
+    for unit, size in _UNITS:
+        count, rest = divmod(rest, size)
+        if count or parts:
+            parts.append((count, unit))
+    return " ".join(f"{count} {unit}" for count, unit in parts[:2] if count)
+
+
+_ROUGH = (
+    ("µs", 1e-6, 999.5e-6), ("ms", 1e-3, 0.9995), ("s", 1.0, 99.5), ("min", 60.0, 99.5 * 60),
+    ("h", 3600.0, 99.5 * 3600), ("d", 86400.0, math.inf),
+)  # fmt: skip
+"""Unit, its size in s, and the duration in s from which the next unit is used."""
+
+
+def rough(seconds: float | None, finest: float = 1.0) -> str:
+    """Format a duration or an age with two digits or more, in at most 7 characters.
+
+    None and infinity are "never". `finest` is the size of the smallest unit, s.
+    """
+    if seconds is None or seconds == math.inf:
+        return "never"
+    if not 0.0 <= seconds < 1e9:
+        return "?"
+    unit, size = next((u, s) for u, s, most in _ROUGH if s >= finest and seconds < most)
+    value = seconds / size
+    return f"{value:.{int(value < 9.95)}f} {unit}"

@@ -1,0 +1,1 @@
+"""What the tools print with: tables, and output that fits a terminal."""

@@ -1,0 +1,53 @@
+"""Prints tables and sentences: within the width of a terminal, in its colours, or plain elsewhere.
+
+No text is read as markup. A stranger's text must be made printable before.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from typing import TextIO
+
+from rich.console import Console, Group, RenderableType
+from rich.text import Text
+
+WHOLE = 10_000
+"""Width in characters within which no row of a table is wrapped, so that it can be copied."""
+
+SENTENCES = 100
+"""Width in characters of output that has sentences."""
+
+
+def show(*parts: RenderableType, most: int = WHOLE) -> None:
+    """Print each part on lines of its own, with whole rows or at most `most` characters wide."""
+    console = _console(sys.stdout)
+    if console.is_terminal and most < WHOLE:
+        console.print(Group(*parts), width=min(most, console.width))
+    else:
+        print(plain(*parts, width=most), flush=True)
+
+
+def show_whole(text: Text) -> None:
+    """Print a text without wrapping it, so that a command in it can be copied from the terminal."""
+    _console(sys.stdout).print(text, soft_wrap=True)
+
+
+def plain(*parts: RenderableType, width: int = WHOLE) -> str:
+    """Return the parts as plain text."""
+    file = io.StringIO()
+    _console(file, width).print(Group(*parts))
+    return "\n".join(line.rstrip() for line in file.getvalue().splitlines())
+
+
+def _console(file: TextIO, width: int | None = None) -> Console:
+    """Return a console that takes no text for markup, for an emoji or for a number to highlight."""
+    return Console(
+        file=file,
+        width=width,
+        force_terminal=file.isatty(),
+        color_system="auto" if file.isatty() else None,
+        markup=False,
+        emoji=False,
+        highlight=False,
+    )

@@ -1,0 +1,69 @@
+"""Tables and sentences fit a terminal, and are plain and whole anywhere else."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import pytest
+from rich.text import Text
+
+from acsard.terminal.output import plain, show, show_whole
+from acsard.terminal.tables import table
+
+ROWS = table([("odom", "1", "a long sentence " * 6), ("tf", "100", "short")], ("KEY", "N"), {1})
+
+
+def test_columns_are_aligned_and_no_line_ends_in_spaces() -> None:
+    lines = plain(ROWS).splitlines()
+    assert lines[0] == "KEY     N"
+    assert lines[1] == ("odom    1  " + "a long sentence " * 6).rstrip()
+    assert lines[2] == "tf    100  short"
+
+
+def test_text_is_never_read_as_markup_or_emoji() -> None:
+    text = "[bold]x[/bold] :smile: [odometry]"
+    assert plain(text, table([(text,)])) == f"{text}\n{text}"
+
+
+def test_a_narrow_table_keeps_every_character() -> None:
+    lines = plain(ROWS, width=30).splitlines()
+    assert max(map(len, lines)) <= 30
+    assert sum(line.count("sentence") for line in lines) == 6
+
+
+def test_a_pipe_gets_whole_rows_without_colours(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    show(ROWS)
+    show_whole(Text("red " * 20, "red"))
+    text = capsys.readouterr().out
+    assert "\x1b" not in text
+    assert len(text.splitlines()) == 4
+
+
+def test_a_terminal_wraps_sentences_in_its_width_but_no_row_of_a_table_and_no_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", "30")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        show("one two " * 10, table([(Text("mark", "red"), "")]), most=100)
+        show(ROWS)
+        show_whole(Text("run this " * 6, "red"))
+        text = ""
+        while text.count("\x1b[0m") < 2:
+            text += os.read(ours, 4096).decode()
+    os.close(ours)
+    lines = text.splitlines()
+    assert [line.strip() for line in lines[:4]] == [
+        "one two one two one two one", "two one two one two one two", "one two one two one two",
+        "\x1b[31mmark\x1b[0m",
+    ]  # fmt: skip
+    assert lines[4:7] == plain(ROWS).splitlines()
+    assert lines[7] == f"\x1b[31m{'run this ' * 6}\x1b[0m"
