@@ -26,6 +26,8 @@ PURE_ROOMS = (
 PURE_AMONG_SHELLS = (
     "bus.access",
     "bus.quiet",
+    "client.commander",
+    "client.follower",
     "runtime.at_once",
     "runtime.figures",
     "runtime.histogram",

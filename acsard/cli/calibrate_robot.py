@@ -18,7 +18,7 @@ from acsard.calibration.guided.riding import Riding
 from acsard.calibration.guided.steps import GuideError, Leg
 from acsard.calibration.runs import Run
 from acsard.client import Client
-from acsard.client.driving import SEND_PERIOD_S
+from acsard.client.commander import SEND_PERIOD_S
 from acsard.config.settings import Config
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState

@@ -292,7 +292,7 @@ class Ride:
 
     def seen(self) -> Seen:
         """Return the values to show now."""
-        from acsard.client.driving import objection
+        from acsard.client.commander import objection
         from acsard.top.teleop import Teleop as Seen
 
         now, state, robot = time.monotonic(), self._state, self._robot

@@ -16,7 +16,7 @@ import foxglove
 import zenoh
 
 from acsard.client import Client
-from acsard.client.driving import objection
+from acsard.client.commander import objection
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.facts import Facts, learn
 from acsard.foxglove.notices import Notices
