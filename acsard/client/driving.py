@@ -27,7 +27,6 @@ from acsard.client.commander import (
 from acsard.client.follower import QUIET_S
 from acsard.client.watch import Followed, Watch
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
-from acsard.messages.schema import RobotState
 
 SETTLED_S = 0.2
 """Time after an action, s, by which a state from before the action has arrived."""
@@ -172,25 +171,3 @@ class _Drive:
             state = self.watch.state
             arrives = state is None or heard(state, self._robot.source)
             raise (NotDrivenError if arrives else UnheardError)(self.objection)
-
-
-class Answers:
-    """Tells which replies prove that the daemon is alive.
-
-    A router's storage also replies, for a dead robot with its last state. A state that arrives
-    unqueried never comes from a storage, but it may be older, because a clock can be set back.
-    """
-
-    def __init__(self) -> None:
-        self._last: RobotState | None = None
-
-    def news(self, answer: RobotState, held: RobotState | None) -> bool:
-        """Return whether the reply is newer than the held state, or than the reply before it.
-
-        The second case covers a robot whose clock was set back since the held state arrived. A
-        reply equal to the held state is not news.
-        """
-        before, self._last = (held, self._last), answer
-        if held is not None and answer.stamp == held.stamp:
-            return False
-        return any(one is not None and answer.stamp.to_ns() > one.stamp.to_ns() for one in before)
