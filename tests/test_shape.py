@@ -28,6 +28,7 @@ PURE_AMONG_SHELLS = (
     "bus.quiet",
     "client.commander",
     "client.follower",
+    "client.riding",
     "runtime.at_once",
     "runtime.figures",
     "runtime.histogram",
