@@ -38,7 +38,6 @@ PURE_AMONG_SHELLS = (
     "bench.record",
     "door.watch",
     "foxglove.commanders",
-    "foxglove.hand",
     "foxglove.news",
     "foxglove.objections",
     "foxglove.parameters",

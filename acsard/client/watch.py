@@ -29,10 +29,15 @@ class Followed(Protocol):
 class Watch(Follower):
     """The newest state of the robot of a client. One thread uses it."""
 
-    def __init__(self, robot: Followed, now: float) -> None:
+    def __init__(
+        self, robot: Followed, now: float, wake: Callable[[], object] | None = None
+    ) -> None:
+        """Subscribe; `wake` is called on a thread of Zenoh when a state arrives."""
         super().__init__(now)
         self._robot, self._decoder = robot, Decoder(RobotState)
         self._states = robot.subscribe(STATE)
+        if wake is not None:
+            self._states.wakes(wake)
         self._answers: deque[zenoh.Sample] = deque()
         """Replies to queries. A thread of Zenoh appends them here and does nothing else."""
 
