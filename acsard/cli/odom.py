@@ -27,9 +27,6 @@ used; and what to do about the largest. It sends nothing. Of a robot that stands
 settings tell.
 """
 
-FIRST_S = 3.0
-"""Time allowed for the first feedback line, s."""
-
 LOOK_S = 0.05
 
 
@@ -107,6 +104,8 @@ def _await_line(robot: Client, lines: Subscription) -> None:
 
     Raises `ExitError` with the robot's reason if none arrives within `FIRST_S`.
     """
+    from acsard.client.follower import FIRST_S
+
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:

@@ -1,24 +1,24 @@
 """The robot on the bus during a calibration: it drives legs, and its messages are recorded.
 
-`calibration/guided/riding.py` decides which command to send.
+`riding.py` decides which command to send.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import zenoh
 
-from acsard.asking.attendant import Attendant
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.calibration.guided.recorder import Recorder
-from acsard.calibration.guided.riding import Riding
 from acsard.calibration.guided.steps import GuideError, Leg
 from acsard.calibration.runs import Run
-from acsard.client import Client
-from acsard.client.driving import SEND_PERIOD_S
+from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
+from acsard.client.follower import FIRST_S
+from acsard.client.riding import Riding
+from acsard.client.synchronous import Client
 from acsard.config.settings import Config
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
@@ -32,17 +32,7 @@ LOOK_S = 0.005
 A key press stops the robot at most this much later.
 """
 
-OPENING_S, OPENING_PERIOD_S = 0.4, 0.01
-"""Duration of the opening and the period of its zeros, s.
-
-The daemon measures the delay of this sender with the zeros.
-"""
-
-ZEROS = 3
 SHOWN_S = 0.2
-
-FIRST_S = 3.0
-"""Time allowed for the first sample of a sensor, s."""
 
 POSITIONS = (Odometry, PoseStamped)
 """Types of a position message, in the order of decoding attempts.
@@ -51,6 +41,16 @@ CDR does not name its type, and a payload that is too short for odometry is a po
 """
 
 Take = Callable[[Any, float], object]
+
+
+class Prompt(Protocol):
+    """Interface of the prompt as a leg uses it."""
+
+    def keys(self, wait_s: float) -> str:
+        """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
+
+    def progress(self, share: float) -> None:
+        """Show which share of the leg is done, 0 to 1."""
 
 
 class Sensor:
@@ -96,8 +96,8 @@ class Sensor:
 class Robot:
     """The robot on the bus: sends the commands of a leg and records the sensors meanwhile."""
 
-    def __init__(self, client: Client, config: Config, attendant: Attendant) -> None:
-        self._client, self._attendant = client, attendant
+    def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
+        self._client, self._prompt = client, prompt
         self._joints, self._geometry = config.joints.as_tuple(), config.drive
         self._sensors: list[tuple[Sensor, str]] = []
         self._wheels = self._own("wheel_states", JointState)
@@ -137,7 +137,7 @@ class Robot:
         begun = sent = shown = time.monotonic()
         last = None
         while not riding.over:
-            for key in self._attendant.keys(LOOK_S):
+            for key in self._prompt.keys(LOOK_S):
                 riding.key(key, time.monotonic())
             now = time.monotonic()
             self._hear(riding, recorder, now)
@@ -147,9 +147,9 @@ class Robot:
                 self._client.send(command.linear, command.angular)
                 last, sent = command, now
             if now - shown > SHOWN_S:
-                self._attendant.progress(riding.progress(now))
+                self._prompt.progress(riding.progress(now))
                 shown = now
-        self._attendant.progress(1.0)
+        self._prompt.progress(1.0)
 
     def _hear(self, riding: Riding, recorder: Recorder, now: float) -> None:
         self._states.hear(riding.state, now)

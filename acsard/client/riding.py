@@ -9,15 +9,11 @@ from __future__ import annotations
 from enum import StrEnum
 
 from acsard.calibration.guided.steps import Leg
+from acsard.client.commander import NEVER, OPENED_S, OPENING_S
+from acsard.client.follower import QUIET_S
 from acsard.config.settings import DriveConfig
 from acsard.messages.schema import RobotState
 from acsard.values import REST, Twist
-
-OPENING_S, OPENED_S = 0.4, 4.0
-"""Shortest time of zeros at first, and the time after which unaccepted zeros end the leg, s."""
-
-SILENT_S = 0.5
-"""Longest silence of the daemon, s."""
 
 HELD_UP = "this computer was too busy to run the calibration: end what else runs on it"
 
@@ -35,9 +31,6 @@ STILL = 0.02
 
 STANDING_S, STANDS_S = 0.5, 6.0
 """Time for which the wheels must stand, and time within which they must come to rest, s."""
-
-LATCHED = ("inactive", "stopped", "fault", "leaving", "waiting")
-"""Modes in which the daemon obeys no command."""
 
 ENTER = "\r\n"
 PRESSED = "a key was pressed"
@@ -95,7 +88,7 @@ class Riding:
         """
         if self.phase is Phase.OPENING and pressed in ENTER:
             return
-        if self.phase is Phase.MOVING and now - self._stepped > SILENT_S / 2:
+        if self.phase is Phase.MOVING and now - self._stepped > QUIET_S / 2:
             self._halt(HELD_UP)  # the person may have pressed it because the robot had stopped
         last = self._number == len(self._leg.moves) - 1
         if self.phase is Phase.MOVING and self._leg.by_key and last:
@@ -106,7 +99,7 @@ class Riding:
     def state(self, state: RobotState, now: float) -> None:
         """Handle a `state` message of the daemon."""
         self._heard = now
-        if state.mode in LATCHED:
+        if state.mode in (*NEVER, "waiting"):
             self._halt(f"the robot is {state.mode}: {state.reason}")
         elif state.source not in ("", self._source):
             self._halt(f"{state.source} commands the robot now")
@@ -131,10 +124,10 @@ class Riding:
         # After a pause of this process, it is unknown whether the daemon was silent. The robot has
         # braked meanwhile, and the time of a move may be over, so that the next one would begin at
         # the wrong place.
-        if held_up > SILENT_S / 2 and self.phase is Phase.MOVING:
+        if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP)
-        elif now - self._heard > SILENT_S:
-            self._halt("no word from the daemon" if held_up <= SILENT_S / 2 else HELD_UP)
+        elif now - self._heard > QUIET_S:
+            self._halt("no word from the daemon" if held_up <= QUIET_S / 2 else HELD_UP)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:

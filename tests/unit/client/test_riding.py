@@ -7,8 +7,10 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from acsard.calibration.guided.riding import HELD_UP, OPENED_S, SILENT_S, Phase, Riding
 from acsard.calibration.guided.steps import Leg, Move
+from acsard.client.commander import OPENED_S
+from acsard.client.follower import QUIET_S
+from acsard.client.riding import HELD_UP, Phase, Riding
 from acsard.config.settings import DriveConfig
 from acsard.messages.schema import RobotState, SourceState, Time
 from acsard.values import REST, Twist
@@ -151,14 +153,14 @@ def test_a_program_that_leaves_while_zeros_go_out_is_waited_for() -> None:
 def test_a_daemon_that_falls_silent_stops_it() -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
     world.speaks = False
-    world.run(SILENT_S + 2 * TICK)
+    world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
     assert world.riding.halted == "no word from the daemon"
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
-    assert world.riding.step(world.now + SILENT_S + TICK) == REST
+    assert world.riding.step(world.now + QUIET_S + TICK) == REST
     assert world.riding.halted == HELD_UP
 
 
