@@ -38,9 +38,10 @@ FAULT_MINUTES, CASE_MINUTES = 10.0, 30.0
 FIRST_SEED = 1
 
 CHILD = """
-import json, sys
+import gc, json, sys
 from tests.simulate.actors import played
 from tests.simulate.plan import made
+gc.freeze()
 seed, left = int(sys.argv[1]), float(sys.argv[2])
 while left > 0.0:
     result = played(made(seed))
@@ -86,6 +87,9 @@ def edited(fault: Fault) -> dict[str, str]:
     texts: dict[str, str] = {}
     for module, old, new in fault.edits:
         text = texts.get(module) or (ROOT / "acsard" / module).read_text(encoding="utf-8")
+        if not old:
+            texts[module] = text + new
+            continue
         if text.count(old) != 1:
             raise ValueError(f"{fault.name}: {module} has {text.count(old)} times {old!r}")
         texts[module] = text.replace(old, new)

@@ -37,6 +37,10 @@ HARMLESS = {
 }  # fmt: skip
 """Troubles of the board that are no reason to latch a fault."""
 
+MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
+"""Refused messages that may have been speeds of a program that shares its identity, so a zero
+before them arms nobody."""
+
 
 class BrokenError(AssertionError):
     """A promise did not hold."""
@@ -134,7 +138,11 @@ class Witness:
         self.delivered += 1
         source = sender["source"]
         if message.junk not in ("", "cancels"):
-            return  # it is neither a speed nor a zero
+            if sample.shared and message.junk in MAYBE_SPEEDS:
+                other = self.senders.setdefault((source, sample.identity), Sender())
+                self._arm(other, arrived_ns)
+                other.zeros.clear()
+            return
         if message.junk == "cancels":
             v, w = 0.0, 0.0
         else:

@@ -23,7 +23,7 @@ from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
 from tests.simulate.product import Disk, problems
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.roads import NS, messages
+from tests.simulate.roads import NS, Message, messages, sample
 
 PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
 EMPTY: Plan = {
@@ -155,6 +155,18 @@ def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> N
         witness.cleared(9 * NS, 4 * NS, "cleared; each sender must send a zero", "ann")
     witness.cleared(9 * NS, 6 * NS, "cleared; each sender must send a zero", "ann")
     assert witness.held is None
+
+
+@pytest.mark.parametrize(("junk", "armed"), [("not a number", False), ("stranger", True)])
+def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
+    junk: str, armed: bool
+) -> None:
+    witness = witnessed()
+    sender = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
+    for at_s, v, kind in ((1.0, 0.0, ""), (1.5, 0.0, junk), (2.5, 0.3, "")):
+        one = Message(int(at_s * NS), int(at_s * NS), v, 0.0, 0, 0, kind)
+        witness.command(sender, one, sample(sender, one, PLAIN["config"], 0), one.arrives_ns)
+    assert (witness.wishes[-1][1].armed_ns == NS) is armed
 
 
 def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> None:
