@@ -159,6 +159,8 @@ class Liveness:
         takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
         if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
             return
+        if witness.unsure:
+            return
         got, told = witness.twist(witness.last), witness.clamped(speed, turn)
         room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
         if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
