@@ -175,7 +175,7 @@ def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> No
     witness.unanswered("set", {"limits.wheel_speed": 0.5 * limit}, 4 * NS)
     witness.new_life(5 * NS)
     assert (witness.limits["wheel_speed"], witness.unsure) == (limit, {"wheel_speed"})
-    witness.set_limits(6 * NS, {"limits.wheel_speed": 0.7 * limit})
+    witness.set_limits(6 * NS, {"limits.wheel_speed": 0.7 * limit}, 6 * NS)
     assert (witness.limits["wheel_speed"], witness.unsure) == (0.7 * limit, set())
 
 
