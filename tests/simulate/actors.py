@@ -412,16 +412,18 @@ class Run:
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
-        for ticket, reply in self.product.replies():
-            answered = self._calls.pop(ticket, None)
-            if answered is not None:
-                answered(reply)
+        if self._calls:
+            for ticket, reply in self.product.replies():
+                answered = self._calls.pop(ticket, None)
+                if answered is not None:
+                    answered(reply)
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()
         for name, _ in self.active:
             witness.troubles[name] = true_ns
-        self.reports.follows(true_ns, seen.followed_ns)
+        if seen.followed_ns is not None:
+            self.reports.follows(true_ns, seen.followed_ns)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:
