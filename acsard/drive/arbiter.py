@@ -45,6 +45,10 @@ class Choice(Struct, frozen=True):
     sender: str = ""
 
 
+IDLE = Choice()
+"""The choice while no source sends and none is doubted."""
+
+
 class _Source:
     """One configured source and its senders."""
 
@@ -189,12 +193,17 @@ class Arbiter:
 
     def choose(self, now_ns: int) -> Choice:
         """Return the command that the robot follows now."""
-        heard = [source for source in self._ranking if source.senders]
-        live = [(source, found[0]) for source in heard if (found := source.live(now_ns))]
+        live = [
+            (source, found[0])
+            for source in self._ranking
+            if source.senders and (found := source.live(now_ns))
+        ]
         if not live:
             self._holder = None
-            doubted = (source.doubted(now_ns) for source in heard)
-            return Choice(wait=next(filter(None, doubted), COMMAND))
+            for source in self._ranking:
+                if source.senders and (wait := source.doubted(now_ns)) is not None:
+                    return Choice(wait=wait)
+            return IDLE
         source, sender = live[0]
         if len(live) > 1:
             source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
@@ -242,4 +251,6 @@ class Arbiter:
 
 def _lasts(ns: int) -> float:
     """Return the largest of `LASTING_S` that this duration has reached, 0.0 if none."""
-    return max((seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S), default=0.0)
+    if ns < LASTING_S[0] * NS_PER_S:
+        return 0.0  # as in nearly every step
+    return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

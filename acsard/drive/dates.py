@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 from acsard.values import NS_PER_S
 
 _DAYS_TO_1970 = 719_468
@@ -10,6 +12,8 @@ _DAYS_TO_1970 = 719_468
 _DAYS_PER_400_YEARS = 146_097
 
 
+# A latched robot says in each step when it was latched.
+@lru_cache(8)
 def utc(wall_ns: int) -> str:
     """Return a time given in ns since 1970 as `2026-11-22 13:05:07 UTC` (Gregorian calendar)."""
     days, seconds = divmod(wall_ns // NS_PER_S, 86_400)

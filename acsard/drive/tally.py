@@ -58,10 +58,10 @@ class Tally:
 
     def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
         """Take events; return the lines to write now, from these and from those that waited."""
+        if not (events or self._held):
+            return ()
         for event in events:
             self._held.setdefault(event.name, _Held()).add(event)
-        if not self._held:
-            return ()
         told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
         return tuple([self._held.pop(name).line() for name in told])
 

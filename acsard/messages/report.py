@@ -109,7 +109,11 @@ class Report:
             self._happened.add(outputs.events, outputs.now)
         if outputs.estimates:
             self._estimate = outputs.estimates[-1]
-        elif not (outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted):
+        if not wanted:
+            return iter(())
+        if not outputs.estimates and not (
+            outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted
+        ):
             # Most steps end here when no client follows the robot closely.
             return iter(())
         return self._due(outputs, wanted, look)

@@ -64,6 +64,9 @@ class FakeMcu(Faults):
         self._boot_until_ns = now_ns + int(config.sim.boot_time * NS_PER_S)
         self._fed_ns = now_ns
         self._on_ns = self._boot_until_ns
+        self._angles: list[float] = []
+        self._seen: list[int] = []
+        """The counts that the encoders showed last."""
         self._window = (now_ns, self._encoders())
         self._measured = [0.0] * 4
         self._moved = [0] * 4
@@ -208,10 +211,8 @@ class FakeMcu(Faults):
             return
         self._replied_ns = now_ns
         comma, end = self.ending[:-2].encode(), self.ending[-2:].encode()
-        text = (
-            protocol.speeds_text(self._speeds(now_ns), self.separator, self.unpadded_replies)
-            + comma
-        )
+        speeds = tuple(self._speeds(now_ns))
+        text = protocol.speeds_text(speeds, self.separator, self.unpadded_replies) + comma
         if command.sequence:
             sample = self._sample() if command.wants_sample and self.samples else ()
             text += protocol.suffix(text, command.sequence, sample)
@@ -242,8 +243,12 @@ class FakeMcu(Faults):
 
     def _encoders(self) -> list[int]:
         """Return the counts of the motors a to d."""
-        angles, tau, per_turn = self.vehicle.angles, math.tau, self._counts
-        return [math.floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
+        angles = self.vehicle.angles
+        if angles != self._angles:
+            floor, tau, per_turn = math.floor, math.tau, self._counts
+            self._angles = angles.copy()
+            self._seen = [floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
+        return self._seen
 
     def _speeds(self, now_ns: int) -> list[float]:
         """Return the speeds by the encoders: whole counts over the time since the last reading."""
@@ -253,6 +258,11 @@ class FakeMcu(Faults):
             gains = [0.0 if motor == self.stuck else gain for motor, gain in enumerate(gains)]
         if now_ns - since >= SHORTEST_WINDOW_NS:
             counts = self._encoders()
+            if counts == before and self.frozen is None:
+                # No motor has turned by a count, so no gain and no swapped wire can show.
+                self._moved, self._measured = [0] * 4, [0.0] * 4
+                self._window = (now_ns, counts)
+                return [0.0] * 4
             scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
             every = [b - a for a, b in zip(before, counts, strict=True)]
             read = zip(self.encoders, self.encoder_signs, strict=True)

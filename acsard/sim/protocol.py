@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 
 from msgspec import Struct
 
@@ -40,9 +41,9 @@ def whole(line: bytes) -> Command | None:
     if b"#" not in text and b"*" not in text:
         return _plain(text)
     body, check = text[:-5], text[-5:]
-    if check != b"*" + _hex(_crc(body), 4):
-        return None
     plain, _, suffix = body.partition(b"#")
+    if check != b"*%04X" % _crc(body[len(plain) :], _crc_of_plain(plain)):
+        return None
     sequence, letters = suffix[:2], suffix[2:]
     if len(sequence) != 2 or any(digit not in HEX for digit in sequence):
         return None
@@ -77,6 +78,8 @@ def latched(line: bytes) -> Command:
     return Command(values)
 
 
+# A steady robot gets the same speeds again and again.
+@lru_cache(256)
 def _plain(text: bytes) -> Command | None:
     match = _LINE.fullmatch(text)
     if match is None:
@@ -90,7 +93,8 @@ def _value(word: bytes) -> float:
     return -size if word[0] == 0x6E else size
 
 
-def speeds_text(speeds: Sequence[float], separator: str, unpadded: bool) -> bytes:
+@lru_cache(1024)
+def speeds_text(speeds: tuple[float, ...], separator: str, unpadded: bool) -> bytes:
     """Return the plain part of a reply."""
     form = "%s%s%.2f" if unpadded else "%s%s%05.2f"
     words = [
@@ -102,9 +106,13 @@ def speeds_text(speeds: Sequence[float], separator: str, unpadded: bool) -> byte
 
 def suffix(text: bytes, sequence: bytes, sample: Sequence[int]) -> bytes:
     """Return the suffix of a checked reply; `sample` is empty, or ms and four counts."""
-    fields = b"".join(_hex(number % 65536, 4) for number in sample)
-    body = b"#" + sequence + (b"@" + fields if fields else b"")
-    return body + b"*" + _hex(_crc(text + body), 4)
+    body = b"#" + sequence
+    if sample:
+        ms, a, b, c, d = sample
+        body += b"@%04X%04X%04X%04X%04X" % (
+            ms & 0xFFFF, a & 0xFFFF, b & 0xFFFF, c & 0xFFFF, d & 0xFFFF,
+        )  # fmt: skip
+    return body + b"*%04X" % _crc(body, _crc_of_plain(text))
 
 
 def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
@@ -113,16 +121,17 @@ def identity(counts: int, watchdog_ms: int, sample: bool) -> bytes:
     return text.encode() + b"\r\n"
 
 
-def _hex(number: int, digits: int) -> bytes:
-    return bytes(HEX[number >> 4 * place & 15] for place in reversed(range(digits)))
-
-
-def _crc(data: bytes) -> int:
-    """Return the CRC-16/XMODEM: polynomial x16 + x12 + x5 + 1, initial value 0."""
-    crc = 0
+def _crc(data: bytes, crc: int = 0) -> int:
+    """Return the CRC-16/XMODEM: polynomial x16 + x12 + x5 + 1, initial value 0 or `crc`."""
+    table = _CRC_OF
     for byte in data:
-        crc = (crc << 8 & 0xFFFF) ^ _CRC_OF[crc >> 8 ^ byte]
+        crc = (crc << 8 & 0xFFFF) ^ table[crc >> 8 ^ byte]
     return crc
+
+
+@lru_cache(1024)
+def _crc_of_plain(text: bytes) -> int:
+    return _crc(text)
 
 
 def _crc_of(byte: int) -> int:

@@ -59,6 +59,9 @@ class Vehicle:
         """Let `dt` s pass under the present set points, or pushed by hand at `push` m/s."""
         if dt <= 0.0:
             return
+        if push is None and not (any(self.set_points) or any(self.speeds)):
+            self._time += dt
+            return
         grip = self._grip()
         self._time += dt
         if push is not None:

@@ -181,8 +181,6 @@ class World:
         self._alarm_set_ns: int | None = None
         """As `runtime.ticker.Alarm` keeps them: when it rings, what it was last set to."""
         self._missed = 0
-        self._listens = False
-        """As `runtime.wakeup` keeps it: a command that comes in now gets a step of its own."""
 
     def _see(self, sight: Sight) -> None:
         self.truth = sight.pose
@@ -193,6 +191,11 @@ class World:
             self.bus.arrivals.append(
                 Arrival("imu", True, payload, "", sight.at_ns, None, "", "native", signed)
             )
+
+    @property
+    def _listens(self) -> bool:
+        """As `runtime.wakeup` keeps it: a command that comes in now gets a step of its own."""
+        return self.steps > 0 and self.loop.listens
 
     @property
     def instant(self) -> Instant:
@@ -256,9 +259,9 @@ class World:
         self.port.pause = pause
 
     def _step(self, period: Period = NO_PERIOD) -> None:
-        outputs = self.loop.step(self.instant, period)
+        now_ns = self.now_ns
+        outputs = self.loop.step(Instant(now_ns, now_ns + self.wall_offset_ns), period)
         self.steps += 1
-        self._listens = self.loop.listens
         retry_ns = self.loop.retry_ns
         if retry_ns is not None and retry_ns != self._alarm_set_ns:
             self._alarm_ns = retry_ns

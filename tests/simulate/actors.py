@@ -422,13 +422,15 @@ class Run:
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
-        self._take_answers()
+        if self._calls:
+            self._take_answers()
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()
         for name, _ in self.active:
             witness.troubles[name] = true_ns
-        self.reports.follows(true_ns, seen.followed_ns)
+        if seen.followed_ns is not None:
+            self.reports.follows(true_ns, seen.followed_ns)
         witness.step(seen.decided_ns + offset, seen.mode, seen.reason, self._fed_ns)
         witness.cut |= seen.link != "up"
         for at_ns, line in seen.lines:

@@ -57,14 +57,14 @@ class PoseWitness:
         """Judge the estimates of one step."""
         at_ns, x, y, yaw, _ = truth
         self._true.append((at_ns + offset_ns, (x, y, yaw)))
-        if faults & LIARS:
+        lies = not LIARS.isdisjoint(faults)
+        if lies:
             self.doubt()
         for sampled_ns, ex, ey, eyaw, covariance, _ in estimates:
-            if not all(map(math.isfinite, (ex, ey, eyaw, *covariance))):
+            # A sum is finite only if each of its numbers is.
+            if not math.isfinite(ex + ey + eyaw + sum(covariance)):
                 raise BrokenError("the pose is finite", now_ns, f"{ex} {ey} {eyaw} {covariance}")
-            self._one(
-                now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, bool(faults & LIARS)
-            )
+            self._one(now_ns, sampled_ns + offset_ns, (ex, ey, eyaw), covariance, lies)
 
     def end_step(self) -> None:
         """Forget the pose if it was set in this step."""
@@ -88,23 +88,24 @@ class PoseWitness:
         true = self._true_at(at_ns)
         if true is None:
             return
+        by_time = 0.1 * self.speed_at(at_ns)
         if self._anchor is None:
             self._anchor = true, pose
-            self._room = 0.1 * self.speed_at(at_ns)
-            self._first = covariance
+            self._room = by_time
             return
         expected = _through(self._anchor, true)
         dx, dy = pose[0] - expected[0], pose[1] - expected[1]
         dyaw = math.remainder(pose[2] - expected[2], math.tau)
         xx, _, _, yy, _, yawyaw = covariance
         far = math.hypot(true[0] - self._anchor[0][0], true[1] - self._anchor[0][1])
-        room = ROOM_M + self._room + 0.1 * self.speed_at(at_ns)
-        room_yaw = ROOM_RAD + self._room / self.track + 0.1 * self.speed_at(at_ns) / self.track
+        room = ROOM_M + self._room + by_time
+        room_yaw = ROOM_RAD + self._room / self.track + by_time / self.track
         allowed = SIGMAS * math.sqrt(xx + yy) + room + far * room_yaw
-        if math.hypot(dx, dy) > allowed:
+        off = math.hypot(dx, dy)
+        if off > allowed:
             raise BrokenError(
                 "the pose stays within its covariance", now_ns,
-                f"{math.hypot(dx, dy):.3f} m off, allowed {allowed:.3f} m",
+                f"{off:.3f} m off, allowed {allowed:.3f} m",
             )  # fmt: skip
         if abs(dyaw) > SIGMAS * math.sqrt(yawyaw) + room_yaw:
             raise BrokenError(

@@ -30,6 +30,7 @@ from acsard.runtime.kept_latches import (
     unwritable,
 )
 from acsard.sim.watched import WatchedMcu
+from acsard.values import Estimate as Measured
 from acsard.values import Event, Instant, Latches, Outputs, Received
 from tests.scenarios.world import START, World
 
@@ -41,6 +42,9 @@ HELD = 16
 
 Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
 """Time of the sample, x, y, yaw, the upper triangle of the covariance, and the wheel angles."""
+
+
+NONE: Sequence[Estimate] = ()
 
 
 class Seen(NamedTuple):
@@ -66,6 +70,18 @@ def problems(config: dict[str, Any]) -> list[str]:
     except ConfigError as error:
         return error.problems
     return []
+
+
+def _plain(found: Measured) -> Estimate:
+    pose, spread = found.pose, found.covariance
+    return (
+        found.at.mono_ns,
+        pose.x,
+        pose.y,
+        pose.yaw,
+        (spread.xx, spread.xy, spread.xyaw, spread.yy, spread.yyaw, spread.yawyaw),
+        found.positions,
+    )
 
 
 class Disk:
@@ -163,25 +179,9 @@ class Product:
             if self.echo:
                 for _, line in lines:
                     world.port.feed(Received(world.instant, line))
-        world.events.clear()
-        estimates: list[Estimate] = [
-            (
-                found.at.mono_ns,
-                found.pose.x,
-                found.pose.y,
-                found.pose.yaw,
-                (
-                    found.covariance.xx,
-                    found.covariance.xy,
-                    found.covariance.xyaw,
-                    found.covariance.yy,
-                    found.covariance.yyaw,
-                    found.covariance.yawyaw,
-                ),
-                found.positions,
-            )
-            for found in outputs.estimates
-        ]
+        if world.events:
+            world.events.clear()
+        estimates = [_plain(one) for one in outputs.estimates] if outputs.estimates else NONE
         self._see(
             Seen(
                 world.now_ns,
@@ -320,8 +320,8 @@ class Product:
     def truth(self) -> tuple[int, float, float, float, float]:
         """Return the time of the board, the true pose, and the true speed of the fastest wheel."""
         mcu = self._world.mcu
-        pose = mcu.vehicle.pose
-        fastest = max(map(abs, mcu.vehicle.speeds))
+        vehicle = mcu.vehicle
+        pose, fastest = vehicle.pose, max(map(abs, vehicle.speeds))
         return mcu._now_ns, pose.x, pose.y, pose.yaw, fastest
 
     @property

@@ -424,8 +424,10 @@ class Witness:
 
     def wheels(self, at_ns: int, fastest: float) -> None:
         """Judge the true wheels: those of a robot that is held must stand in the end."""
+        if fastest < 0.5 or self.pending:
+            return
         held = self.held
-        if held is None or fastest < 0.5 or self.pending:
+        if held is None:
             return
         since_ns, why = held
         if at_ns < since_ns + self.ramp_ns(stop=False) + STAND_NS:

@@ -78,7 +78,7 @@ def test_what_is_no_line_is_none(line: bytes) -> None:
 
 
 def test_a_reply_is_padded_or_not() -> None:
-    speeds = [12.5, -8.75, 0.0, -120.0]
+    speeds = (12.5, -8.75, 0.0, -120.0)
     assert protocol.speeds_text(speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
     assert protocol.speeds_text(speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
 
