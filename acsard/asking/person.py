@@ -20,8 +20,8 @@ from acsard.host.terminal import coloured
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson
+    from acsard.checkup.checkup_report import Report
     from acsard.checkup.findings import Finding
-    from acsard.checkup.report import Report
 
 SIMULATOR = "sim"
 
@@ -54,7 +54,7 @@ class Screen:
 
     def found(self, finding: Finding) -> None:
         """Print a finding as it is made."""
-        from acsard.checkup.report import row
+        from acsard.checkup.checkup_report import row
 
         if not self._as_json:
             self.clear()
@@ -64,7 +64,7 @@ class Screen:
         """Print the summary of all findings."""
         import msgspec
 
-        from acsard.checkup.report import summary
+        from acsard.checkup.checkup_report import summary
 
         self.clear()
         print(msgspec.json.encode(found).decode() if self._as_json else summary(found, where))
