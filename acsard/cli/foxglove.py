@@ -49,7 +49,7 @@ def main(args: argparse.Namespace) -> int:
             Exit.FAILURE, f"needs the library foxglove-sdk; run: {install('foxglove')}"
         ) from None
     from acsard.client import connect
-    from acsard.foxglove.address import loopback
+    from acsard.foxglove.viewer_server import loopback
 
     address = loopback(args.address)
     endpoint, robot_id, tls = robot_address(args)

@@ -20,11 +20,10 @@ from acsard.client.driving import objection
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.facts import Facts, learn
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.objections import Objections
 from acsard.foxglove.relay import Relay
-from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
-from acsard.foxglove.services import CALLED, STOPS, services
-from acsard.foxglove.settings import Settings
+from acsard.foxglove.viewer_commands import Objections
+from acsard.foxglove.viewer_server import Listener, Refusals, Shown, as_parameters, start
+from acsard.foxglove.viewer_services import CALLED, STOPS, Settings, services
 from acsard.host import clock
 from acsard.messages.schema import RobotState
 from acsard.messages.topics import full_key

@@ -13,9 +13,8 @@ from threading import Condition, Thread
 import zenoh
 
 from acsard.client import Client
-from acsard.foxglove.hand import Hand, Wish
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.twists import encoding_of, wish
+from acsard.foxglove.viewer_commands import Hand, Wish, encoding_of, wish
 from acsard.host import clock
 from acsard.messages.encodings import DecodeError
 from acsard.values import NS_PER_S

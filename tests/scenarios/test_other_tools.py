@@ -16,7 +16,7 @@ from typing import Literal
 import msgspec
 import pytest
 
-from acsard.foxglove.hand import Hand, Wish
+from acsard.foxglove.viewer_commands import Hand, Wish
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
 from acsard.values import NS_PER_S

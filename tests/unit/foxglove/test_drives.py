@@ -13,8 +13,8 @@ from acsard.client import Client
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.foxglove.drives import Drives
-from acsard.foxglove.hand import STALE_NS
 from acsard.foxglove.notices import Notices
+from acsard.foxglove.viewer_commands import STALE_NS
 from acsard.host import clock
 from acsard.incoming.commands import Arrival, Receiver
 from acsard.messages.encodings import encode

@@ -1,16 +1,22 @@
-"""Decides which commands of one viewer go to the robot, and when. This module is pure.
+"""Decodes one viewer's commands, and decides which of them go to the robot, and when.
 
-A panel repeats its command while a button is held and is silent after the release. Each message is
-sent at most once; nothing is repeated here. After a silence a zero is sent first, because the
-daemon requires one from a sender that starts. The daemon itself judges how late a message with a
-stamp is, but few messages carry one. Therefore a burst of messages after a silence is discarded: a
-congested link or a stalled process held it back.
+This module is pure. A panel repeats its command while a button is held and is silent after the
+release. Each message is sent at most once; nothing is repeated here. After a silence a zero is sent
+first, because the daemon requires one from a sender that starts. The daemon itself judges how late
+a message with a stamp is, but few messages carry one. Therefore a burst of messages after a silence
+is discarded: a congested link or a stalled process held it back.
+
+A viewer whose commands do not drive is informed why.
 """
 
 from __future__ import annotations
 
 from msgspec import Struct
 
+from acsard.config.settings import DriveConfig, JointsConfig
+from acsard.drive.kinematics import Kinematics
+from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
+from acsard.messages.encodings import DecodeError, encoding_name
 from acsard.values import NS_PER_S, REST, Twist
 
 SILENCE_NS = 3 * NS_PER_S // 10
@@ -125,3 +131,54 @@ class Hand:
     def is_slow(self) -> bool:
         """Return whether the messages come so seldom that the robot stops in between."""
         return self._slow >= SLOW_TIMES
+
+
+_receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
+"""Decoder for twists only. They depend on neither joints nor wheels, so the defaults are
+sufficient."""
+
+
+def encoding_of(encoding: str, schema_name: str) -> str:
+    """Return the Zenoh encoding of a channel. Raises `DecodeError` if it cannot carry twists."""
+    package, _, name = schema_name.partition("/")
+    full = f"{package}/msg/{name.removeprefix('msg/')}"
+    if full not in (TWISTS[0], STAMPED_TWISTS[0]):
+        raise DecodeError("wrong_type", f"{schema_name or 'no type'} where {TWISTS[0]} is wanted")
+    if encoding == "cdr":
+        return f"{encoding_name('cdr')};{full}"
+    if encoding == "json":
+        return encoding_name("json")
+    raise DecodeError("unknown_encoding", f"{encoding} where json or cdr is wanted")
+
+
+def wish(encoding: str, payload: bytes) -> Wish:
+    """Return the twist and the stamp of a message. Raises `DecodeError`."""
+    found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
+    return Wish(found.twist, found.stamp_ns)
+
+
+OBJECTS_NS = NS_PER_S // 2
+"""Delay before an objection is reported: the first 0.25 s of a new sender never drive, which is
+normal."""
+
+
+class Objections:
+    """The objection to one viewer's commands."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self.told = ""
+        """The objection that was reported and still holds, or ""."""
+
+    def look(self, objection: str, now_ns: int) -> bool:
+        """Process the current objection ("" for none); return whether `told` has changed."""
+        if not objection:
+            self._since_ns = None
+            changed, self.told = bool(self.told), ""
+            return changed
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        if now_ns - self._since_ns < OBJECTS_NS or objection == self.told:
+            return False
+        self.told = objection
+        return True

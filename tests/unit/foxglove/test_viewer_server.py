@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.cli import foxglove as verb
-from acsard.foxglove.address import DEFAULT, loopback
+from acsard.foxglove.viewer_server import DEFAULT, loopback
 from acsard.host.errors import UsageError
 
 

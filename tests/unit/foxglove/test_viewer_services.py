@@ -11,8 +11,8 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.server import Listener, Shown
-from acsard.foxglove.settings import POLL_NS, Settings
+from acsard.foxglove.viewer_server import Listener, Shown
+from acsard.foxglove.viewer_services import POLL_NS, Settings
 from acsard.host import clock
 
 KEY, OTHER = "rates.odom", "rates.joint_states"

@@ -1,4 +1,4 @@
-"""A command shown live equals the message in an export, whichever way it arrived."""
+"""Tests of the messages and parameters that a viewer receives."""
 
 from __future__ import annotations
 
@@ -7,11 +7,30 @@ import os
 import pytest
 from msgspec.structs import replace
 
+from acsard.config.live import LIVE
+from acsard.config.parsing import effective
 from acsard.config.settings import Config, RosConfig
-from acsard.foxglove.commanders import Reader, Way, ways
+from acsard.foxglove.viewer_messages import (
+    News,
+    Reader,
+    Way,
+    changed,
+    parameter_values,
+    selected,
+    ways,
+)
 from acsard.incoming.commands import Arrival
 from acsard.messages.encodings import FORMATS, DecodeError, Format, encode
-from acsard.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
+from acsard.messages.schema import (
+    Events,
+    Happening,
+    Header,
+    JointState,
+    Time,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
 from acsard.messages.topics import full_key
 from acsard.ros.attachments import Attachment
 from acsard.ros.transports import command_keys
@@ -105,3 +124,97 @@ def test_wheels_and_frame_are_those_of_this_robot() -> None:
 def test_what_the_daemon_refuses_is_no_command_here(payload: bytes, put: bool) -> None:
     with pytest.raises(DecodeError):
         read(payload, put=put)
+
+
+KEPT = 20
+
+
+def events(total: int, of: str = "first") -> Events:
+    """Return the daemon's events after this many of them."""
+    kept = range(max(0, total - KEPT), total)
+    told = [Happening(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
+    return Events(Time(total), total, told)
+
+
+def names(news: News, said: Events) -> list[str]:
+    return [line.name for line in news.of(said)]
+
+
+def test_who_opens_the_log_gets_all_that_is_still_known() -> None:
+    lines = News().of(events(3))
+    assert [(line.stamp.sec, line.level, line.name) for line in lines] == [
+        (0, 30, "mode0"),
+        (1, 30, "mode1"),
+        (2, 30, "mode2"),
+    ]
+    assert lines[0].msg == "first 0 (by ann)"
+    assert len(News().of(events(1000))) == KEPT
+
+
+@pytest.mark.parametrize(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
+def test_each_is_told_once(before: int, now: int) -> None:
+    news = News()
+    news.of(events(before))
+    assert names(news, events(now)) == [f"mode{n}" for n in range(before, now)]
+
+
+def test_those_that_nobody_kept_are_gone() -> None:
+    news = News()
+    news.of(events(10))
+    assert names(news, events(100)) == [f"mode{n}" for n in range(80, 100)]
+
+
+def test_an_answer_that_is_older_than_what_came_by_itself_tells_nothing() -> None:
+    news = News()
+    news.of(events(10))
+    assert names(news, events(9)) == []
+    assert names(news, events(11)) == ["mode10"]
+
+
+def test_one_that_goes_on_brings_nothing_old_back() -> None:
+    news, fault = News(), events(1).events[0]
+    missed = Happening(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
+    news.of(Events(Time(5), 2, [fault, missed]))
+    later = replace(missed, stamp=Time(8), text="9 more periods")
+    assert names(news, Events(Time(8), 4, [fault, later])) == ["periods_missed"]
+
+
+def test_another_daemon_begins_anew() -> None:
+    news = News()
+    news.of(events(10))
+    later = replace(events(2, "second"), stamp=Time(11))
+    assert names(news, later) == ["mode0", "mode1"]
+
+
+NOW = parameter_values(effective(Config()))
+
+
+def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
+    single = {key for key in LIVE if "*" not in key}
+    timeouts = {
+        f"commands.sources.{name}.timeout" for name in ("teleop", "app", "nav", "ros2_control")
+    }
+    assert set(NOW) == single | timeouts
+
+
+def test_lists_are_lists_as_the_protocol_wants_them() -> None:
+    assert {type(value) for value in NOW.values()} <= {float, int, str, bool, list}
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ([], set(NOW)),
+        (["rates.odom"], {"rates.odom"}),
+        (["rates.odom", "no.such"], {"rates.odom"}),
+    ],
+)
+def test_who_names_none_gets_all(names: list[str], found: set[str]) -> None:
+    assert set(selected(NOW, names)) == found
+
+
+def test_news_are_what_has_another_value() -> None:
+    later = NOW | {"rates.odom": 50.0, "log.level": "debug"}
+    assert changed(NOW, later) == {"rates.odom": 50.0, "log.level": "debug"}
+    assert changed(later, later) == {}
+    assert changed({}, later) == later

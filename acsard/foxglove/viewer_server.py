@@ -1,12 +1,13 @@
-"""The websocket server of foxglove-sdk: its callbacks and its start.
+"""The websocket server of foxglove-sdk: its address, its callbacks and its start.
 
-The library implements the protocol. The protocol has no authentication, so `address.py` limits the
+The library implements the protocol. The protocol has no authentication, so `loopback` limits the
 server to this machine.
 """
 
 from __future__ import annotations
 
 import errno
+import ipaddress
 import logging
 import os
 from collections.abc import Callable
@@ -17,8 +18,34 @@ from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, W
 
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.settings import Settings
-from acsard.host.errors import InUseError, NotPermittedError
+from acsard.foxglove.viewer_services import Settings
+from acsard.host.errors import InUseError, NotPermittedError, UsageError
+
+DEFAULT = "127.0.0.1:8765"
+"""The address that Foxglove and Lichtblick try by default."""
+
+
+def loopback(text: str) -> tuple[str, int]:
+    """Return host and port.
+
+    Raises `UsageError` for a malformed address and for one that other machines can reach.
+    """
+    host, _, digits = text.rpartition(":")
+    try:
+        address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)
+        port = int(digits)
+    except ValueError:
+        raise UsageError(f"{text} is no address: write it like {DEFAULT}") from None
+    if not 0 < port < 65536:
+        raise UsageError(f"{text}: a port is a number from 1 to 65535")
+    if not address.is_loopback:
+        raise UsageError(
+            f"{text} would be reached from the network, and this protocol asks nobody who he is: "
+            f"whoever connects may drive. Listen on {DEFAULT} and, from the other machine, "
+            f"tunnel: ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
+        )
+    return str(address), port
+
 
 BACKLOG = 256
 """Maximum number of waiting messages for a slow viewer; the oldest are dropped."""

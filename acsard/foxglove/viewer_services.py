@@ -1,16 +1,77 @@
-"""The viewers' parameters: reads and changes the robot's live settings."""
+"""The robot's services and live settings in the form that viewers call and change."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from threading import Lock
 from typing import Any
 
+import foxglove
+import msgspec
+
 from acsard.client import Client
-from acsard.foxglove import parameters
+from acsard.config.settings import RosConfig
+from acsard.foxglove import viewer_messages
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
+from acsard.messages.encodings import DecodeError, Decoder, encode
+from acsard.messages.json_schema import SCHEMAS
+from acsard.messages.schema import ServiceReply, SetPose
+from acsard.messages.topics import SERVICES
+from acsard.ros.names import full_name
 from acsard.values import NS_PER_S, AcsardError
+
+CALLED = tuple(verb for verb in SERVICES if verb != "set")
+"""Services that are offered; `set` is left out because viewers set parameters instead."""
+
+STOPS = ("stop",)
+"""Services that are offered without `--drive`. Any web page in a local browser can connect, and the
+browser does not identify the page, so only a stop is safe."""
+
+NOTHING = {"type": "object", "title": "std_srvs/srv/Trigger_Request", "properties": {}}
+
+_poses = Decoder(SetPose)
+
+
+def services(robot: Client, ros: RosConfig, verbs: Iterable[str]) -> list[foxglove.Service]:
+    """Return the services for these verbs under their ROS names, for example `/acsard/stop`."""
+    return [_service(robot, verb, full_name(ros.namespace, f"{ros.node}/{verb}")) for verb in verbs]
+
+
+def _service(robot: Client, verb: str, name: str) -> foxglove.Service:
+    posed = verb == "set_pose"
+
+    def answer(request: foxglove.ServiceRequest) -> bytes:
+        return encode(called(robot, verb, request.payload), "json")
+
+    schema = foxglove.ServiceSchema(
+        "acsard/srv/SetPose" if posed else "std_srvs/srv/Trigger",
+        request=_schema(SCHEMAS["SetPose"] if posed else NOTHING),
+        response=_schema(SCHEMAS["ServiceReply"]),
+    )
+    return foxglove.Service(name, schema=schema, handler=answer)
+
+
+def called(robot: Client, verb: str, payload: bytes) -> ServiceReply:
+    """Call a service. An error becomes a negative reply."""
+    try:
+        fields: dict[str, float] = {}
+        if verb == "set_pose":
+            fields = msgspec.structs.asdict(_poses.decode("application/json", payload))
+        return robot.call(verb, **fields)
+    except DecodeError as error:
+        return ServiceReply(False, f"{verb} wants {{x, y, yaw}}, m and rad: {error}")
+    except AcsardError as error:
+        return ServiceReply(False, str(error))
+
+
+def _schema(schema: dict[str, Any]) -> foxglove.MessageSchema:
+    data = msgspec.json.encode(schema)
+    return foxglove.MessageSchema(
+        encoding="json",
+        schema=foxglove.Schema(name=schema["title"], encoding="jsonschema", data=data),
+    )
+
 
 OLD_NS = NS_PER_S
 """Age at which the settings are read again for a viewer that asks."""
@@ -38,9 +99,9 @@ class Settings:
 
         `tables` is None if this program may not read the configuration.
         """
-        now = {} if tables is None else parameters.values(tables)
+        now = {} if tables is None else viewer_messages.parameter_values(tables)
         with self._lock:
-            news = parameters.news(self._known, now)
+            news = viewer_messages.changed(self._known, now)
             self._known, self._read_ns = now, clock.mono_ns()
             self._asked, self._readable = False, tables is not None
         return news
@@ -49,7 +110,7 @@ class Settings:
         """Return the settings with these names, or all, as last read."""
         with self._lock:
             self._asked = True
-            return parameters.asked(self._known, names)
+            return viewer_messages.selected(self._known, names)
 
     def follow(self, names: Collection[str]) -> None:
         """Record that a viewer follows these settings."""
@@ -77,7 +138,7 @@ class Settings:
             said, done = str(error), False
         self._notices.say("info" if done else "error", "set", said if done else f"not set: {said}")
         with self._lock:
-            return parameters.asked(self._known, wishes.keys()) if wishes else {}
+            return viewer_messages.selected(self._known, wishes.keys()) if wishes else {}
 
     def refresh(self) -> dict[str, Any]:
         """Read the settings again if a viewer needs them; return the settings that changed."""

@@ -1,18 +1,25 @@
-"""Tests of the viewer's messages that are sent to the robot, and of their times."""
+"""Tests of a viewer's commands: decoding, their times, and the reasons why they do not drive."""
 
 from __future__ import annotations
 
 import pytest
 
-from acsard.foxglove.hand import (
+from acsard.foxglove.viewer_commands import (
     DRIVES_NS,
     HEAP_NS,
     LONGEST_NS,
+    OBJECTS_NS,
     SILENCE_NS,
     STALE_NS,
     Hand,
+    Objections,
     Wish,
+    encoding_of,
+    wish,
 )
+from acsard.messages.encodings import DecodeError, encode
+from acsard.messages.schema import Header, Time, TwistStamped, Vector3
+from acsard.messages.schema import Twist as Message
 from acsard.values import NS_PER_S, REST, Twist
 
 AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)
@@ -164,3 +171,95 @@ def test_who_stamps_no_more_has_zeros_without_a_stamp(panel: Panel) -> None:
     panel.hand.take(Wish(AHEAD, 1000), panel.now)
     panel.hand.take(Wish(AHEAD), panel.now)
     assert panel.hand.send(panel.now) == Wish(REST)
+
+
+MESSAGE = Message(Vector3(x=0.3), Vector3(z=-0.2))
+STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
+
+
+@pytest.mark.parametrize("name", ["geometry_msgs/Twist", "geometry_msgs/msg/Twist"])
+@pytest.mark.parametrize("form", ["json", "cdr"])
+def test_a_panel_s_twist_is_read(name: str, form: str) -> None:
+    encoding = encoding_of(form, name)
+    found = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
+    assert found == Wish(Twist(0.3, -0.2))
+
+
+@pytest.mark.parametrize("form", ["json", "cdr"])
+def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
+    encoding = encoding_of(form, "geometry_msgs/msg/TwistStamped")
+    found = wish(encoding, encode(STAMPED, "json" if form == "json" else "cdr"))
+    assert found == Wish(Twist(0.3, -0.2), 5 * NS_PER_S)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [
+        ("json", "std_msgs/msg/String"),
+        ("json", "Twist"),
+        ("json", ""),
+        ("ros1", "geometry_msgs/Twist"),
+        ("", "geometry_msgs/Twist"),
+    ],
+)
+def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> None:
+    with pytest.raises(DecodeError, match="wanted"):
+        encoding_of(form, name)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{}",
+        b'{"linear": {"x": 1}}',
+        b'{"linear": {"x": "fast"}, "angular": {}}',
+        b'{"linear": {"x": NaN}, "angular": {}}',
+        b'{"linear": {"x": 1}, "angular": {}, "more": 1}',
+        b"\xff" * 60,
+        b'{"linear": {"x": 1}, "angular": {}}' + b" " * 5000,
+    ],
+)
+def test_what_is_no_twist_is_refused(payload: bytes) -> None:
+    for encoding in (encoding_of("json", "geometry_msgs/Twist"),):
+        with pytest.raises(DecodeError):
+            wish(encoding, payload)
+
+
+@pytest.mark.parametrize("cut", range(0, 52, 4))
+def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
+    with pytest.raises(DecodeError):
+        wish(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])
+
+
+WHY = "stopped by request"
+
+
+def test_the_first_moment_is_no_news() -> None:
+    told = Objections()
+    assert not told.look(WHY, 0)
+    assert not told.look(WHY, OBJECTS_NS - 1)
+    assert told.look(WHY, OBJECTS_NS)
+    assert told.told == WHY
+
+
+def test_it_is_told_once_and_taken_back_when_over() -> None:
+    told = Objections()
+    changes = [told.look(WHY if n < 20 else "", n * OBJECTS_NS) for n in range(30)]
+    assert changes.count(True) == 2
+    assert changes[1]
+    assert changes[20]
+    assert told.told == ""
+
+
+def test_another_reason_is_told_at_once() -> None:
+    told = Objections()
+    told.look(WHY, 0)
+    told.look(WHY, OBJECTS_NS)
+    assert told.look("fault", OBJECTS_NS + 1)
+    assert told.told == "fault"
+
+
+def test_what_is_over_soon_is_never_told() -> None:
+    told = Objections()
+    assert not any(told.look(WHY if n % 2 else "", n * (OBJECTS_NS - 1)) for n in range(20))
