@@ -295,7 +295,7 @@ READS_KEYS = {"error_budget/feed.py", "web/page/main.js"}
         ("simulated fault", "stuck_encoder", "config/named_faults.py", set()),
         ("setting", "angular_jerk", "config/motion_rules.py", {"drive/limits.py"}),
         ("ROS topic", "cmd_vel_teleop", "ros/transports.py", set()),
-        ("ROS topic", "sensor_msgs/(msg/)?JointState", "ros/definitions.py", set()),
+        ("ROS topic", "sensor_msgs/(msg/)?JointState", "ros/channels.py", set()),
         ("firmware dialect", "trailing_comma", "mcu/codec.py", set()),
     ],
 )

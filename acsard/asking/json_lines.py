@@ -29,8 +29,8 @@ from acsard.host.errors import MendableError
 from acsard.web.lines import Doing, Found, Progress, Question, Result, Subject, Told
 
 if TYPE_CHECKING:
+    from acsard.checkup.checkup_report import Report
     from acsard.checkup.findings import Finding
-    from acsard.checkup.report import Report
 
 T = TypeVar("T")
 
@@ -290,7 +290,7 @@ class JsonPerson(JsonLines):
 
     def result(self, found: Report, where: str) -> None:
         """Send the summary of all findings."""
-        from acsard.checkup.report import summary
+        from acsard.checkup.checkup_report import summary
 
         self.progress(1.0)
         self.shows(summary(found, where))

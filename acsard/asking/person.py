@@ -19,8 +19,8 @@ from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson
+    from acsard.checkup.checkup_report import Report
     from acsard.checkup.findings import Finding
-    from acsard.checkup.report import Report
 
 SIMULATOR = "sim"
 
@@ -53,7 +53,7 @@ class Screen:
 
     def found(self, finding: Finding) -> None:
         """Print a finding as it is made."""
-        from acsard.checkup.report import row
+        from acsard.checkup.checkup_report import row
         from acsard.terminal.output import SENTENCES, show
 
         if not self._as_json:
@@ -64,7 +64,7 @@ class Screen:
         """Print the summary of all findings."""
         import msgspec
 
-        from acsard.checkup.report import summary
+        from acsard.checkup.checkup_report import summary
 
         self.clear()
         print(msgspec.json.encode(found).decode() if self._as_json else summary(found, where))

@@ -29,8 +29,8 @@ import zenoh
 from acsard.bench.far_end import Part
 from acsard.bench.matching import Record, Sample, Seen, Sent
 from acsard.bus.outlets import direct
-from acsard.bus.session import client_session
 from acsard.bus.subscription import encoded
+from acsard.bus.zenoh_sessions import client_session
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.drive.kinematics import Kinematics

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from msgspec import ValidationError, convert
 
-from acsard.bus.session import reachable
+from acsard.bus.zenoh_sessions import reachable
 from acsard.config.parsing import ConfigError, parse
 from acsard.config.settings import TLS, Config, Name
 from acsard.host.errors import UsageError

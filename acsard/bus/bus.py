@@ -13,11 +13,10 @@ from types import TracebackType
 import zenoh
 from msgspec.structs import replace
 
-from acsard.bus.inbox import Inbox
+from acsard.bus.inbox import Inbox, Replies
 from acsard.bus.links import Links
 from acsard.bus.outlets import Outlets, direct
-from acsard.bus.replies import Replies
-from acsard.bus.session import daemon_session
+from acsard.bus.zenoh_sessions import daemon_session
 from acsard.config.settings import BusConfig, RosConfig
 from acsard.host import clock
 from acsard.host.errors import InUseError
@@ -29,7 +28,7 @@ from acsard.messages.encodings import encoding_name
 from acsard.messages.schema import Message
 from acsard.messages.signature import Signature
 from acsard.messages.topics import IMU, Topic, full_key, json_key
-from acsard.ros.tokens import gid
+from acsard.ros.names import gid
 from acsard.ros.transports import Endpoint, claims, command_keys, endpoints, node_tokens
 from acsard.values import NS_PER_S
 

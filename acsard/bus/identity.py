@@ -15,7 +15,7 @@ import zenoh
 from msgspec import Struct
 
 from acsard.bus.access import MAY, least_role
-from acsard.bus.certificates import common_name
+from acsard.bus.tls import common_name
 from acsard.host import clock
 from acsard.messages.topics import full_key, whoami_key
 from acsard.values import NS_PER_S, ROLES, Role

@@ -4,19 +4,19 @@ Each step of the check is an experiment. It sends lines for some time, all repli
 recording, `replies`, and the step judges the recording. Speeds belong to motors, not to wheels: the
 check has to find out which wheel a motor turns. Three events end any experiment at once, with zeros
 and then silence: a motor runs away, the MCU falls silent while a motor turns, or the board
-restarts.
+restarts. The wire and the operator are the two parts outside the check.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import ceil
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from acsard.checkup import limits, manual, motion
+from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import StoppedError, WireLostError, motor_name, motor_names
 from acsard.checkup.lateness import Lateness
 from acsard.checkup.motion import ZERO, Reply
-from acsard.checkup.outside import Wire
 from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.config.motion_rules import LONGEST_REPLY_S
 from acsard.config.settings import McuConfig, WheelMap
@@ -28,10 +28,49 @@ from acsard.mcu.hearing import Heard
 from acsard.mcu.lines import LineReader
 from acsard.values import NS_PER_S, WheelSpeeds
 
+
+class Wire(Protocol):
+    """A serial line."""
+
+    def open(self, baud_rate: int) -> None:
+        """Open the line, or continue at another rate. Raises a `MendableError`."""
+
+    def close(self) -> None:
+        """Send the last bytes and close the line."""
+
+    def now_ns(self) -> int:
+        """Return the monotonic time, ns."""
+
+    def send(self, data: bytes) -> None:
+        """Send bytes now. Raises `WireLostError`."""
+
+    def late_ns(self) -> int:
+        """Return how long the board has waited for a processor since the last call, ns.
+
+        It is 0 unless the board is a program on this computer.
+        """
+
+    def listen(self, until_ns: int) -> Sequence[tuple[int, bytes]]:
+        """Wait until this time and return the received pieces with their times, ns.
+
+        Raises `WireLostError`.
+        """
+
+
+class Operator(Protocol):
+    """The operator at the robot."""
+
+    def say(self, text: str) -> None:
+        """Show a message about the present action."""
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        """Return one of the answers, or None if no person watches the robot."""
+
+
 LEAST_S = 0.001
 """Shortest time for which a line is sent, s."""
 
-BEAT_NS = int(limits.PERIOD_S * NS_PER_S)
+BEAT_NS = int(motion.PERIOD_S * NS_PER_S)
 """Interval at which the lateness of this computer is measured while listening, ns."""
 
 FAREWELL = 5
@@ -141,7 +180,7 @@ class Board:
                     break
                 self.zeros()
                 self.listen(2 * self.period_s)
-                self.fled = motion.fastest(self.replies, limits.RUNAWAY) is not None
+                self.fled = motion.fastest(self.replies, motion.RUNAWAY) is not None
         except WireLostError:
             pass  # nothing reaches the motors any more, so the MCU's own watchdog has to stop them
 
@@ -169,7 +208,7 @@ class Board:
     @property
     def period_s(self) -> float:
         """Time between two lines, s."""
-        return max(limits.PERIOD_S, self.line_s)
+        return max(motion.PERIOD_S, self.line_s)
 
     # Sending
 
@@ -223,7 +262,7 @@ class Board:
     ) -> list[tuple[float, Reply]]:
         """Send this many lines one by one, and return the first reply to each with its delay, s."""
         # Replies to earlier lines must not count for these.
-        self.listen(max(limits.GLANCE_S / 4, wait_s))
+        self.listen(max(motion.GLANCE_S / 4, wait_s))
         got: list[tuple[float, Reply]] = []
         for _ in range(lines):
             self.ask(max(wait_s, 1.5 * self.period_s), comma)
@@ -247,7 +286,7 @@ class Board:
             if self.armed and self._unanswered_s > WATCHDOG_S + 4 * self.gap_s:
                 self.zeros()
                 names = motor_names(self.mcu, [m for m in range(4) if motors[m]]) or "nothing"
-                found = manual.find("link: silent", motors=names, seconds=self._unanswered_s)
+                found = outcomes.find("link: silent", motors=names, seconds=self._unanswered_s)
                 raise StoppedError(found)
             got += answers
         return got
@@ -318,15 +357,15 @@ class Board:
         return self.now_s - self.replies[-1].at_s if self.replies and not self.fled else 0.0
 
     def _guard(self) -> None:
-        fastest = motion.fastest(self.replies, limits.RUNAWAY)
+        fastest = motion.fastest(self.replies, motion.RUNAWAY)
         if fastest is None:
             return
         motor, seen = fastest
         told = self._commanded[motor]
         self._flee()
         outcome = "runaway: against" if told * seen < 0 else "runaway: along"
-        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], limits.RUNAWAY
-        found = manual.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
+        name, letter, most = motor_name(self.mcu, motor), LETTERS[motor], motion.RUNAWAY
+        found = outcomes.find(outcome, motor=name, letter=letter, told=told, seen=seen, most=most)
         raise StoppedError(found)
 
     def _flee(self) -> None:
@@ -339,7 +378,7 @@ class Board:
     def turning(self) -> list[int]:
         """Return the motors that turn according to the last reply."""
         last = self.replies[-1].motors if self.replies else ZERO
-        return motion.moving(last, limits.STANDING)
+        return motion.moving(last, motion.STANDING)
 
     def rest(self) -> None:
         """Stop all motors and wait until they stand. Ends the check if they do not.
@@ -359,7 +398,7 @@ class Board:
         self._flee()
         motors = motor_names(self.mcu, turning, ", ") or "something"
         seconds = round(self.now_s - began_s, 1)
-        raise StoppedError(manual.find("stop: turns", motors=motors, seconds=seconds))
+        raise StoppedError(outcomes.find("stop: turns", motors=motors, seconds=seconds))
 
     def settles(self, comma: bool) -> bool:
         """Send zeros until two replies show that every motor stands.
@@ -369,9 +408,9 @@ class Board:
         began_s = self.now_s
         while True:
             last = motion.since(self.replies[-2:], began_s)
-            if len(last) == 2 and not any(motion.moving(r.motors, limits.STANDING) for r in last):
+            if len(last) == 2 and not any(motion.moving(r.motors, motion.STANDING) for r in last):
                 return True
-            patience_s = limits.PATIENCE_S if self._slows() else limits.MOTOR_S
+            patience_s = motion.PATIENCE_S if self._slows() else motion.MOTOR_S
             if self.now_s - began_s >= patience_s:
                 return False
             self.ask(comma=comma)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from acsard.checkup import manual
+from acsard.checkup import outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.checkup.limits import GLANCE_S, SPEED
-from acsard.checkup.motion import ZERO, moving
+from acsard.checkup.motion import GLANCE_S, SPEED, ZERO, moving
 from acsard.mcu.check import seal
 from acsard.mcu.codec import LETTERS
 
@@ -62,15 +61,15 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     `motors` are motors that turn as commanded. They stand before and after.
     """
     if not motors:
-        return manual.find("damaged lines: untested")
+        return outcomes.find("damaged lines: untested")
     lines = broken_lines(board.comma, board.sealed, motors)
     board.drive(ZERO, GLANCE_S)  # a coarse encoder may show only now that they ran on
     took = dict.fromkeys(what for what, line in lines if _moves(board, line))
     if not took:
-        return manual.find("damaged lines: right", lines=len(lines))
+        return outcomes.find("damaged lines: right", lines=len(lines))
     outcome, kinds = "lenient" if took.keys() <= WHOLE else "taken", {what for what, _ in lines}
     seen = {"took": len(took), "kinds": len(kinds), "which": ", ".join(took)}
-    return manual.find(f"damaged lines: {outcome}", None, **seen)
+    return outcomes.find(f"damaged lines: {outcome}", None, **seen)
 
 
 def _moves(board: Board, line: bytes) -> bool:

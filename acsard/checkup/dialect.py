@@ -1,19 +1,22 @@
-"""The microcontroller's dialect: baud rate, identification, form of lines and the checked link.
+"""The microcontroller's dialect: baud rate, identification, form of lines, checked link and pace.
 
-These steps send only zeros and questions. Later steps use the results.
+The pace is how often the board answers, whether it reports by its own clock, and how soon. These
+steps send only zeros and questions. Later steps use the results.
 """
 
 from __future__ import annotations
 
 import re
+from itertools import pairwise
+from statistics import fmean, median
 from typing import get_args
 
-from acsard.checkup import manual
+from acsard.checkup import lateness, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
-from acsard.checkup.limits import BOOT_S, GLANCE_S
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.motion import BOOT_S, CUT_S, GLANCE_S, ZERO, Reply
 from acsard.config.settings import Baud
+from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.mcu.check import seal
 from acsard.mcu.session import IDENTITY
 
@@ -36,15 +39,15 @@ def baud(board: Board) -> Finding:
     if board.baud_rate != configured:
         board.open(configured)  # the board restarted while another rate was being tried
     if _knock(board, BOOT_S):  # the wait is long because opening the port resets many boards
-        return manual.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
+        return outcomes.find("baud rate: right", {"mcu.baud_rate": configured}, rate=configured)
     heard = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
         if _knock(board, OTHER_S):
             seen = {"rate": rate, "configured": configured, "heard": heard.counted}
-            return manual.find("baud rate: other", {"mcu.baud_rate": rate}, **seen)
+            return outcomes.find("baud rate: other", {"mcu.baud_rate": rate}, **seen)
     board.open(configured)
-    told = manual.find(f"baud rate: {heard.looks}", heard=heard.counted, configured=configured)
+    told = outcomes.find(f"baud rate: {heard.looks}", heard=heard.counted, configured=configured)
     raise StoppedError(told)
 
 
@@ -79,10 +82,10 @@ def identity(board: Board) -> Finding:
             text = line.decode("ascii", "replace").removeprefix("!")
             words = text.split()
             board.identity = dict(word.split("=", 1) for word in words[2:] if "=" in word)
-            return manual.find("identification: named", short=" ".join(words[:2]), text=text)
+            return outcomes.find("identification: named", short=" ".join(words[:2]), text=text)
     if b"?" in board.others:
-        raise StoppedError(manual.find("identification: echo"))
-    return manual.find("identification: none")
+        raise StoppedError(outcomes.find("identification: echo"))
+    return outcomes.find("identification: none")
 
 
 def form(board: Board) -> Finding | None:
@@ -110,9 +113,9 @@ def comma(board: Board, dead: bool) -> Finding:
     if board.comma != board.mcu.trailing_comma:
         return _comma_wrong(board, "latched" if board.latched and board.comma else "disobeyed")
     if dead:
-        return manual.find("trailing comma: dead")
+        return outcomes.find("trailing comma: dead")
     how = "sent" if board.comma else "not sent"
-    return manual.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})
+    return outcomes.find(f"trailing comma: {how}", {"mcu.trailing_comma": board.comma})
 
 
 def _comma_wrong(board: Board, how: str) -> Finding:
@@ -120,7 +123,7 @@ def _comma_wrong(board: Board, how: str) -> Finding:
 
     `board.comma` is already the right one.
     """
-    return manual.find(
+    return outcomes.find(
         f"trailing comma: {how}",
         {"mcu.trailing_comma": board.comma},
         figure="needed" if board.comma else "refused",
@@ -138,8 +141,8 @@ def replies(board: Board) -> Finding:
     if not all(re.search(rb"\.\d\d,? *\Z", line) for line in lines):
         found.append("other decimals")
     if not found:
-        return manual.find("reply form: right")
-    return manual.find("reply form: other", forms=", ".join(found), line=lines[-1].decode())
+        return outcomes.find("reply form: right")
+    return outcomes.find("reply form: other", forms=", ".join(found), line=lines[-1].decode())
 
 
 def check(board: Board) -> Finding:
@@ -153,9 +156,76 @@ def check(board: Board) -> Finding:
         board.sampled = False
         board.sealed = bool(_answers(board, board.comma))
     if not board.sealed and wanted == "require":
-        return manual.find("checked link: required", {"mcu.link_check": "auto"})
+        return outcomes.find("checked link: required", {"mcu.link_check": "auto"})
     if not board.sealed:
-        return manual.find("checked link: plain")
+        return outcomes.find("checked link: plain")
     outcome, use = ("off", "auto") if wanted == "off" else ("in use", wanted)
     figure = "checked, with samples" if board.sampled else "checked"
-    return manual.find(f"checked link: {outcome}", {"mcu.link_check": use}, figure=figure)
+    return outcomes.find(f"checked link: {outcome}", {"mcu.link_check": use}, figure=figure)
+
+
+ENOUGH_FOR_RATE = 10
+"""Number of replies that is enough for a rate."""
+
+ANSWERED = 0.8
+"""Fraction of answered lines below which lines are lost or remain unanswered."""
+
+SLOW_S = 0.008
+"""Round trip in addition to the lines' time on the wire that delays the control loop, s.
+
+An MCU usually takes 1 to 5 ms.
+"""
+
+TRIPS = 10
+
+
+def rate(board: Board) -> Finding:
+    """Measure how often the board answers at the host's rate, and whether it reports unasked."""
+    board.paced = True
+    board.listen(GLANCE_S / 4)
+    unasked = board.listen(CUT_S)
+    # Lines that were delayed here or at the board all arrive at once, so they span no time.
+    board.own_clock = bool(unasked) and unasked[-1].at_s - unasked[0].at_s > GLANCE_S
+    highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
+    period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
+    got = board.drive(ZERO, 0.5, period_s)
+    if len(got) < ENOUGH_FOR_RATE:
+        got += board.drive(ZERO, 1.0, period_s)
+    if len(got) < 2:
+        return outcomes.find("reply rate: none")
+    gaps = [after.at_s - one.at_s for one, after in pairwise(got)]
+    board.gap_s = gap_s = fmean(gaps)
+    configured, answered = board.mcu.reply_period, len(got) / (board.sent_lines - before)
+    unset_s = max(0.1, 4 * period_s)  # the silence that the host allows by default
+    quiet_s = max(unset_s, 3 * configured)
+    slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < ANSWERED
+    most_s = board.longest_reply_s
+    rare, period = slow and gap_s > most_s, min(float(f"{gap_s:.1g}"), most_s)
+    keys: dict[str, object] = {"mcu.reply_period": period if slow else configured}
+    outcome = "rare" if rare else "slow" if slow else "lossy" if lossy else "right"
+    return outcomes.find(
+        f"reply rate: {outcome}",
+        keys if 3 * gap_s > 1.1 * unset_s and not rare else {},
+        rate=1 / gap_s,
+        way="by its own clock" if board.own_clock else "when spoken to",
+        longest=max(gaps) * 1000,
+        answered=answered,
+        gap=gap_s * 1000,
+        quiet=quiet_s * 1000,
+        period=period,
+        most=most_s,
+    )
+
+
+def trip(board: Board) -> Finding:
+    """Measure how soon a line is answered."""
+    if not board.paced:
+        return lateness.finding("round trip", board.lateness.since(0.0))
+    if board.own_clock:
+        return outcomes.find("round trip: own clock")
+    trips = [trip_s for trip_s, _ in board.answers(TRIPS, GLANCE_S)]
+    if not trips:
+        return outcomes.find("round trip: none")
+    middle_s, longest_s = median(trips), max(trips)
+    pace = "slow" if middle_s > SLOW_S + 2 * board.line_s else "right"
+    return outcomes.find(f"round trip: {pace}", middle=middle_s * 1000, longest=longest_s * 1000)

@@ -18,7 +18,7 @@ REST = "the rest"
 
 
 class Finding(Struct, frozen=True):
-    """The result for one subject; `manual.py` has the words.
+    """The result for one subject; `outcomes.py` has the words.
 
     `figure` is the measurement, `text` its meaning, `mend` the remedy unless the subject passed,
     and `keys` the configuration values by dotted key, whether they are configured already or not.

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from acsard.checkup import limits, manual
+from acsard.checkup import motion, outcomes
 from acsard.checkup.findings import Finding
-from acsard.checkup.manual import Unsure
+from acsard.checkup.outcomes import Unsure
 
 LEAST_S = 0.005
 """Lateness below which nothing is recorded, s: every computer has as much now and then."""
 
-SPOILS_S = limits.PERIOD_S
+SPOILS_S = motion.PERIOD_S
 """Lateness from which on a fault may be this computer's, s: a whole line was late."""
 
-PAUSE_S = limits.WATCHDOG_LEAST_S
+PAUSE_S = motion.WATCHDOG_LEAST_S
 """Lateness from which on even a good result is doubtful, s.
 
 The motors may have stopped meanwhile by the MCU's watchdog.
@@ -57,12 +57,12 @@ def spoilt(found: Unsure, late_s: float) -> bool:
 
 def finding(name: str, late_s: float) -> Finding:
     """Return the finding that a step was not judged."""
-    return manual.find(LATE, name=name, late=late_s * 1000)
+    return outcomes.find(LATE, name=name, late=late_s * 1000)
 
 
 def judged(found: Finding) -> bool:
     """Return whether the finding says anything about the board."""
-    return found.figure != manual.MANUAL[LATE].figure
+    return found.figure != outcomes.MANUAL[LATE].figure
 
 
 def unjudged(findings: Iterable[Finding]) -> list[str]:

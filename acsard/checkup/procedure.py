@@ -8,23 +8,20 @@ from functools import partial
 from msgspec import structs
 
 from acsard.checkup import (
-    counts,
     damage,
     dialect,
+    encoder_counts,
     lateness,
-    loss,
-    lost_where,
-    manual,
-    pace,
+    line_loss,
+    outcomes,
     restarts,
-    turning,
     watchdog,
+    wheels,
 )
-from acsard.checkup.board import Board
+from acsard.checkup.board import Board, Operator, Wire
 from acsard.checkup.findings import REST, Finding, StoppedError, WireLostError, motor_name
-from acsard.checkup.limits import BOOT_S, GLANCE_S
-from acsard.checkup.manual import Unsure
-from acsard.checkup.outside import Operator, Wire
+from acsard.checkup.motion import BOOT_S, GLANCE_S
+from acsard.checkup.outcomes import Unsure
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.config.motion_rules import longest_reply
@@ -49,12 +46,12 @@ STEPS = (
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
     ("asking who it is", dialect.identity),
-    ("listening how often it answers", pace.rate),
-    ("measuring how soon it answers", pace.trip),
+    ("listening how often it answers", dialect.rate),
+    ("measuring how soon it answers", dialect.trip),
     ("trying the comma at the end of the line", dialect.form),
     ("looking at its replies", dialect.replies),
     ("asking for the check", dialect.check),
-    ("counting lost lines, 3 s and more", loss.finding),
+    ("counting lost lines, 3 s and more", line_loss.finding),
 )
 """Steps that send only zeros and questions, with the message that the operator sees meanwhile."""
 
@@ -88,7 +85,7 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
         if finding.name not in told or (judged and finding.name in unjudged):
             (unjudged.discard if judged else unjudged.add)(finding.name)
             told.update((finding.name, "motors") if "motor " in finding.name else (finding.name,))
-            tell(manual.plain(finding))
+            tell(outcomes.plain(finding))
 
     why = ""
     seen: list[Restart] = []
@@ -97,13 +94,13 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
         with Board(wire, config.mcu, config.rate_hz, longest_s) as board:
             board.zeros()
             if operator.ask(CONFIRM, (LIFTED,)) != LIFTED:
-                raise StoppedError(manual.find("wheels: not lifted"))
+                raise StoppedError(outcomes.find("wheels: not lifted"))
             _Steps(board, operator, once, seen).all()
     except StoppedError as end:
         once(end.finding)
         why = f"the check ended early: {end.finding.name}"
     except WireLostError as lost:
-        once(manual.find("serial line: lost", error=lost))
+        once(outcomes.find("serial line: lost", error=lost))
         why = "the check ended early: the serial line was lost"
     if seen:
         once(restarts.finding(config.mcu, seen))
@@ -140,8 +137,8 @@ class _Steps:
         self._take("", lambda: dialect.comma(board, channels[-1].kind in ("dead", "late")))
         self._take("", lambda: wheel_map(board.mcu, channels))
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
-        self._measure("", lambda: lost_where.finding(board, operator, right))
-        self._take("", lambda: counts.finding(board, right))
+        self._measure("", lambda: line_loss.direction(board, operator, right))
+        self._take("", lambda: encoder_counts.finding(board, right))
         together = "the motors turn together, then the host falls silent, several times perhaps"
         self._measure(together, lambda: watchdog.finding(board, right))
         broken = "broken lines go out; nothing may turn"
@@ -157,14 +154,14 @@ class _Steps:
         operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
 
         def looked() -> Finding:
-            channels[motor:] = [turning.channel(board, motor)]
+            channels[motor:] = [wheels.channel(board, motor)]
             return encoder_finding(board.mcu, channels[motor])
 
         found = self._in_time(looked)
         if found is not None and not lateness.judged(found):
             channels[motor] = structs.replace(channels[motor], judged=False)
             return found
-        channels[motor] = turning.seen(board, operator, channels[motor])
+        channels[motor] = wheels.seen(board, operator, channels[motor])
         return encoder_finding(board.mcu, channels[motor])
 
     def _measure(self, doing: str, step: Step) -> None:

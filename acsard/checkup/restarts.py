@@ -13,10 +13,9 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from acsard.checkup import manual
+from acsard.checkup import outcomes
 from acsard.checkup.findings import Finding, motor_names
-from acsard.checkup.limits import BOOT_S, GLANCE_S
-from acsard.checkup.motion import ZERO, Reply
+from acsard.checkup.motion import BOOT_S, GLANCE_S, ZERO, Reply
 from acsard.config.settings import McuConfig
 from acsard.mcu.codec import Motors
 from acsard.mcu.session import IDENTITY
@@ -165,7 +164,7 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
         "silent": min(one.silent_s for one in restarts),
         "patience": BOOT_S,
     }
-    return manual.find(f"restarts: {_outcome(restarts) if back else 'gone'}", None, **seen)
+    return outcomes.find(f"restarts: {_outcome(restarts) if back else 'gone'}", None, **seen)
 
 
 def _outcome(restarts: Sequence[Restart]) -> str:

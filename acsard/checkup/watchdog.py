@@ -18,11 +18,11 @@ from itertools import cycle
 
 from msgspec import Struct
 
-from acsard.checkup import counts, damage, limits, manual, motion
+from acsard.checkup import damage, encoder_counts, motion, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import Reply
-from acsard.checkup.turning import run_up
+from acsard.checkup.wheels import run_up
 from acsard.config.wire_time import FIELD
 from acsard.mcu.codec import LETTERS, Motors
 
@@ -82,7 +82,7 @@ class Run(Struct, frozen=True):
 def finding(board: Board, motors: Sequence[int]) -> Finding:
     """Measure the watchdog with motors that turn as commanded. They stand again afterwards."""
     if not motors:
-        return manual.find("watchdog: untested")
+        return outcomes.find("watchdog: untested")
     stop = run(board, motors, 0.0)
     least_s, most_s = measured(board, motors, stop)
     judged = _judged(least_s, most_s)
@@ -90,44 +90,44 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
         return judged
     lines = damage.broken_lines(board.comma, board.sealed, motors)
     broken = cycle(line for what, line in lines if what in FEEDING)
-    fed = run(board, motors, max(limits.CUT_S, 2 * most_s) + stop.slow_s, broken)
+    fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
     if fed.ran_s >= FED * fed.silent_s:
         # A watchdog that was not fed had cut them by then.
         beyond_s = fed.ran_s - stop.ran_s - most_s
-        return manual.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
+        return outcomes.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
 
 
 def _judged(least_s: float, most_s: float) -> Finding:
     if most_s == UNKNOWN:
-        return manual.find("watchdog: none", seconds=least_s)
+        return outcomes.find("watchdog: none", seconds=least_s)
     middle_s, half_s = (least_s + most_s) / 2, (most_s - least_s) / 2
     figure = f"{middle_s * 1000:.0f} ms" + (f" ± {half_s * 1000:.0f}" if half_s >= 0.005 else "")
     # The measurement is no more accurate than this.
     least_s, most_s = round(least_s, 2), round(most_s, 2)
-    if least_s > limits.WATCHDOG_MOST_S:
+    if least_s > motion.WATCHDOG_MOST_S:
         outcome = "late"
-    elif most_s < limits.WATCHDOG_LEAST_S:
+    elif most_s < motion.WATCHDOG_LEAST_S:
         outcome = "early"
-    elif most_s > limits.WATCHDOG_MOST_S:
+    elif most_s > motion.WATCHDOG_MOST_S:
         outcome = "unclear"
     else:
         outcome = "right"
-    beyond_s = least_s - limits.WATCHDOG_MOST_S if outcome == "late" else 0.0
-    return manual.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s, margin_s=beyond_s)
+    beyond_s = least_s - motion.WATCHDOG_MOST_S if outcome == "late" else 0.0
+    return outcomes.find(f"watchdog: {outcome}", figure=figure, seconds=middle_s, margin_s=beyond_s)
 
 
 def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
     """Return how long these motors run on in a silence. `stop` is their ordinary stop."""
     least_s = 0.0
-    for length_s in (limits.CUT_S + stop.slow_s, limits.STOOD_S + stop.slow_s):
+    for length_s in (motion.CUT_S + stop.slow_s, motion.STOOD_S + stop.slow_s):
         found = run(board, motors, length_s)
         ran_on_s = found.ran_s - stop.ran_s
         if ran_on_s < 0.95 * found.silent_s:
             break
         least_s = found.silent_s
     else:
-        return limits.STOOD_S, UNKNOWN
+        return motion.STOOD_S, UNKNOWN
     by_counts = _per_turn(board, motors) > 0
     if not (board.own_clock or by_counts or found.first >= STOPPED):
         return _asked(board, motors, stop, (least_s, found.silent_s))
@@ -148,7 +148,7 @@ def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> 
             most_s = min(most_s, answer.silent_s)
     # The deciding reply describes a moment after the silence, as that of the ordinary stop does.
     least_s -= stop.slow_s - board.period_s + 2 * stop.grain_s
-    most_s -= stop.slow_s - board.period_s - limits.PERIOD_S - 2 * stop.grain_s
+    most_s -= stop.slow_s - board.period_s - motion.PERIOD_S - 2 * stop.grain_s
     return max(0.0, least_s), max(0.0, most_s)
 
 
@@ -159,10 +159,10 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     """
     began_s = board.now_s
     full = run_up(board, command(motors))
-    if max(abs(full[motor]) for motor in motors) < limits.SPEED / 2:
+    if max(abs(full[motor]) for motor in motors) < motion.SPEED / 2:
         board.rest()
         letters = ", ".join(LETTERS[motor] for motor in motors)
-        raise StoppedError(manual.find("watchdog: weak", letters=letters))
+        raise StoppedError(outcomes.find("watchdog: weak", letters=letters))
     # The ramp is over by the second half of the time.
     grain_s = motion.grain_s(motion.since(board.replies, (began_s + board.now_s) / 2), motors)
     told_s, lines = board.sent_s, iter(instead)
@@ -177,19 +177,19 @@ def run(board: Board, motors: Sequence[int], length_s: float, instead: Iterable[
     first, second = (_share(reply, motors) for reply in board.replies[before : before + 2])
     course = motion.since(board.replies, told_s)
     slow_s = next(
-        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), limits.PATIENCE_S
+        (r.at_s - told_s for r in course if _share(r, motors) < STOPPED), motion.PATIENCE_S
     )
     # The reply to the last line contains a measurement from the time when that line took effect.
-    answered = not board.own_clock and course[0].at_s < told_s + limits.PERIOD_S + 2 * board.gap_s
+    answered = not board.own_clock and course[0].at_s < told_s + motion.PERIOD_S + 2 * board.gap_s
     since_s = course[0].at_s if answered else told_s
     ran = motion.covered(board.replies, since_s, _per_turn(board, motors))
-    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= limits.SPEED / 2)
+    ran_s = max(abs(ran[m] / full[m]) for m in motors if abs(full[m]) >= motion.SPEED / 2)
     return Run(silent_s, ran_s, slow_s, first, second, grain_s)
 
 
 def command(motors: Sequence[int]) -> Motors:
     """Return the command that turns all of these motors."""
-    return motion.each(lambda motor: limits.SPEED if motor in motors else 0.0)
+    return motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
 
 
 def _per_turn(board: Board, motors: Sequence[int]) -> float:
@@ -197,11 +197,11 @@ def _per_turn(board: Board, motors: Sequence[int]) -> float:
 
     Returns 0 if the counts stand, or if they can wrap round during the longest silence.
     """
-    per_turn = counts.per_turn(board.replies, motors) or 0.0
-    wraps = per_turn * limits.RUNAWAY / math.tau * limits.STOOD_S >= FIELD / 2
+    per_turn = encoder_counts.per_turn(board.replies, motors) or 0.0
+    wraps = per_turn * motion.RUNAWAY / math.tau * motion.STOOD_S >= FIELD / 2
     return 0.0 if wraps or per_turn < 1 else per_turn
 
 
 def _share(reply: Reply, motors: Sequence[int]) -> float:
     """Return the speed of the fastest of these motors as a fraction of the commanded speed."""
-    return max(abs(reply.motors[motor]) for motor in motors) / limits.SPEED
+    return max(abs(reply.motors[motor]) for motor in motors) / motion.SPEED

@@ -1,19 +1,21 @@
-"""Judges the motors' behaviour: motor and encoder of each channel, and its wheel.
+"""Turns one motor at a time forth and back, asks the operator which wheel turned, and judges both.
 
-These are plain functions of the measurements; `turning.py` turns the motors.
+The judgement finds motor, encoder and wheel of each channel. Its functions are plain functions of
+the measurements.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
-from acsard.checkup import manual
+from acsard.checkup import motion, outcomes
+from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, motor_name, wheel_of, words
-from acsard.checkup.limits import GLANCE_S, PROBE_MOVES, SPEED
-from acsard.checkup.motion import moving
+from acsard.checkup.motion import GLANCE_S, PROBE_MOVES, SPEED, ZERO, moving
 from acsard.config.settings import McuConfig
 from acsard.mcu.codec import LETTERS, Motors
 from acsard.values import WHEELS
@@ -92,7 +94,7 @@ def encoder_finding(mcu: McuConfig, channel: Channel) -> Finding:
     # Lateness that would explain the error: the motor would have seemed to stand meanwhile, in half
     # of the measurements.
     beyond_s = 2 * GLANCE_S * (channel.error - TOLERANCE) if channel.kind == "size" else 0.0
-    return manual.find(
+    return outcomes.find(
         f"motor: {channel.kind}{_whose(mcu, channel)}",
         name=motor_name(mcu, motor),
         figure=f"{forth:+.2f} {'rad/s, probed' if channel.probed else f'{back:+.2f} rad/s'}",
@@ -134,19 +136,199 @@ def wheel_map(mcu: McuConfig, found: Sequence[Channel]) -> Finding:
     Channels that have to be repaired first keep their configured entry.
     """
     if any(channel.wheel is None for channel in found):
-        return manual.find("wheel map: not seen")
+        return outcomes.find("wheel map: not seen")
     entries: dict[str, str] = {}
     for channel in found:
         wheel, sign = wheel_of(mcu, channel.motor)
         if channel.kind in ("right", "off", "size") and channel.wheel:
             wheel, sign = channel.wheel, 1 if channel.forward else -1
         if wheel in entries:
-            return manual.find("wheel map: twice", wheel=words(wheel))
+            return outcomes.find("wheel map: twice", wheel=words(wheel))
         entries[wheel] = f"{'+' if sign > 0 else '-'}{LETTERS[channel.motor]}"
     wrong = [wheel for wheel in WHEELS if entries[wheel] != getattr(mcu.wheels, wheel)]
-    return manual.find(
+    return outcomes.find(
         "wheel map: other" if wrong else "wheel map: right",
         {f"mcu.wheels.{wheel}": entries[wheel] for wheel in WHEELS},
         map=" ".join(entries[wheel] for wheel in WHEELS),
         wheels=", ".join(map(words, wrong)),
     )
+
+
+NEAR = 0.8
+"""Fraction of `OFF` above which a speed is measured again.
+
+A first measurement is no more accurate.
+"""
+
+LOOK_S = 0.75 * motion.MOTOR_S
+"""Time over which the speed is measured again, s."""
+
+LOOKS = 8
+"""Number of measurements that are averaged at most while an encoder is not steady."""
+
+ANSWERS = {
+    "fr": "front_right", "fl": "front_left", "rl": "rear_left", "rr": "rear_right", "none": "",
+}  # fmt: skip
+
+
+def one(motor: int, speed: float) -> Motors:
+    """Return the command that turns only this motor."""
+    return motion.each(lambda index: speed if index == motor else 0.0)
+
+
+def turn(board: Board, motor: int, speed: float) -> tuple[Motors, float]:
+    """Bring a motor to speed.
+
+    Returns each encoder's speed, rad/s, and the fraction by which the measured speed may err
+    because encoder counts are whole numbers.
+    """
+    means = run_up(board, one(motor, speed))
+    unsure = _unsure(board, motor, 2 * _look_s(board))
+    if NEAR * OFF + unsure < abs(means[motor] / speed - 1) <= TOLERANCE:
+        # The motor is weak, or heavy and not yet at its speed. A longer measurement decides.
+        board.drive(one(motor, speed), motion.MOTOR_S)
+        means = motion.mean(motion.since(board.replies, board.now_s - LOOK_S))
+        unsure = _unsure(board, motor, LOOK_S)
+    return means, unsure
+
+
+def _unsure(board: Board, motor: int, seconds: float) -> float:
+    look = motion.since(board.replies, board.now_s - seconds / 2)  # the ramp is over by then
+    return motion.grain_s(look, [motor]) / seconds
+
+
+def _look_s(board: Board) -> float:
+    return max(motion.GLANCE_S / 2, 2.5 * board.gap_s)
+
+
+def run_up(board: Board, motors: Motors) -> Motors:
+    """Ramp up and hold until the encoders show a steady speed, which is returned in rad/s."""
+    steps = max(1, int(motion.GLANCE_S / board.period_s))
+    for step in range(1, steps + 1):
+        a, b, c, d = (round(speed * step / steps, 2) for speed in motors)
+        board.drive((a, b, c, d), board.period_s)
+    began_s, look_s = board.now_s, _look_s(board)
+    told = [motor for motor in range(4) if motors[motor]]
+    means, looks, steady = ZERO, 0, 0
+    while steady < 2 and board.now_s - began_s < _patience_s(board, told):
+        board.drive(motors, look_s)
+        looks += 1
+        # A coarse encoder needs more measurements; a fine one is steady sooner.
+        last = min(LOOKS, max(1, looks - 1))
+        means = motion.mean(motion.since(board.replies, board.now_s - last * look_s))
+        near = [m for m in moving(means) if abs(abs(means[m]) / motion.SPEED - 1) < 0.4 * TOLERANCE]
+        steady = steady + 1 if len(near) >= len(told) else 0
+        if looks * look_s >= motion.CUT_S and not moving(means, motion.STANDING):
+            break  # do not hold it longer: a control loop without an encoder may be winding up
+    return means
+
+
+def _patience_s(board: Board, told: list[int]) -> float:
+    """Return how long motors are held, s: longer while one of them still speeds up."""
+    shares = motion.trend(board.replies, board.now_s, board.gap_s)
+    rises = any(shares[motor] > 1 / motion.FALLS for motor in told)
+    return motion.PATIENCE_S if rises else motion.MOTOR_S
+
+
+def channel(board: Board, motor: int) -> Channel:
+    """Turn a motor forth and back."""
+    found = _both_ways(board, motor)
+    if motor == 3 and found.kind == "dead" and not board.latched:
+        found = _with_other_comma(board, found)
+    return found
+
+
+def _both_ways(board: Board, motor: int) -> Channel:
+    """Return the movement of a motor, which turns only as far as its own encoder follows.
+
+    It stands afterwards.
+    """
+    shown = probe(board, motor)
+    if shown is not None:
+        return Channel(motor, shown, ZERO, probed=True)
+    (forth, unsure), back = turn(board, motor, motion.SPEED), ZERO
+    if motor in moving(forth):
+        board.rest()
+        back, other = turn(board, motor, -motion.SPEED)
+        unsure = max(unsure, other)
+    if motor not in moving(back):
+        board.let_go(motion.CUT_S)
+    board.rest()
+    return Channel(motor, forth, back, unsure=unsure)
+
+
+def probe(board: Board, motor: int) -> Motors | None:
+    """Turn a motor slowly and briefly.
+
+    Returns None if its own encoder follows; the motor then keeps turning. Otherwise returns the
+    speeds that the encoders showed, rad/s. The probe is so short that a motor without a working
+    encoder, which the firmware may drive to full speed, does not get far. A second try is for
+    coarse encoders: they may need more movement to show anything, and a single count backwards
+    proves nothing.
+    """
+    began_s = board.now_s
+    shown = _probe(board, motor, motion.SPEED / 2)
+    own = [reply.motors[motor] for reply in motion.since(board.replies, began_s)]
+    seen = [speed for speed in own if speed]
+    if shown is None or (len(seen) >= 3 and max(seen) < 0):
+        return shown  # a reversed motor need not run away twice
+    if not moving(shown, motion.PROBE_MOVES):
+        return _probe(board, motor, motion.SPEED)
+    again = _probe(board, motor, motion.SPEED / 2)
+    return shown if again is not None and not any(again) else again
+
+
+def _probe(board: Board, motor: int, speed: float) -> Motors | None:
+    coasting = board.replies[-1].motors if board.replies else ZERO
+    began_s = board.now_s
+
+    def shown() -> Motors:
+        """Return each angle, less the possible coasting, divided by the probe's time, rad/s."""
+        seconds = board.now_s - began_s
+        ran = motion.covered(board.replies, began_s)
+        sure = [max(0.0, abs(ran[m]) - abs(coasting[m]) * seconds) for m in range(4)]
+        return motion.each(lambda m: math.copysign(sure[m], ran[m]) / motion.GLANCE_S)
+
+    own = 0.0
+    while board.now_s < began_s + motion.GLANCE_S and own > -4 * motion.PROBE_MOVES:
+        board.drive(one(motor, speed), board.period_s)
+        own = shown()[motor]
+    if own >= motion.PROBE_MOVES:
+        return None
+    # The firmware may drive a motor to full speed on zeros until its watchdog cuts it. A motor that
+    # was seen to turn must stand before the next zeros are sent.
+    moved = moving(shown(), motion.PROBE_MOVES)
+    board.let_go(motion.STOOD_S if moved else motion.CUT_S)
+    board.rest()
+    seen = shown()
+    return None if seen[motor] >= motion.PROBE_MOVES else seen
+
+
+def _with_other_comma(board: Board, dead: Channel) -> Channel:
+    """Try the other form of the comma at the line's end on a last motor that does nothing."""
+    configured, board.comma = board.comma, not board.comma
+    channel = _both_ways(board, dead.motor)
+    if channel.probed or dead.motor not in moving(channel.forth):
+        board.comma = configured
+        return dead
+    turn(board, dead.motor, motion.SPEED)
+    board.latched = not board.settles(configured)
+    board.rest()
+    return channel
+
+
+def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
+    """Ask the operator which wheel turned. The wheels stand by now."""
+    question = (
+        f"which wheel did motor {LETTERS[channel.motor]} turn? front right, front left, "
+        "rear left, rear right, none; or show it again"
+    )
+    while (which := operator.ask(question, (*ANSWERS, "again"))) == "again":
+        _both_ways(board, channel.motor)
+    if which is None:
+        return channel
+    if wheel := ANSWERS[which]:
+        question = "which way did it turn first: forward (as when the robot drives ahead) or back?"
+        way = operator.ask(question, ("forward", "back"))
+        return structs.replace(channel, wheel=wheel, forward=way != "back")
+    return structs.replace(channel, wheel="")

@@ -200,7 +200,7 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
     """Return a separate session for positions that the daemon does not publish, or None."""
     if not args.positions_at:
         return None
-    from acsard.bus.session import client_session
+    from acsard.bus.zenoh_sessions import client_session
 
     session = client_session(args.positions_at, tls)
     stack.callback(session.close)

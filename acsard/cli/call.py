@@ -88,15 +88,15 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    from acsard.bus import fleet
-    from acsard.bus.fleet import ALL, present, seen
+    from acsard.bus import robot_discovery
+    from acsard.bus.robot_discovery import ALL, present, seen
     from acsard.cli.echo import of_robot
     from acsard.messages.encodings import encode
     from acsard.messages.schema import ServiceReply
     from acsard.values import AcsardError
 
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
-    fleet.stop(robot.session, ids, robot.caller)
+    robot_discovery.stop(robot.session, ids, robot.caller)
     wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
 
     def stop(one: str) -> ServiceReply | AcsardError:

@@ -113,7 +113,7 @@ def robot_address(args: argparse.Namespace) -> Address:
 
 def require_one(args: argparse.Namespace) -> None:
     """Raise `UsageError` if `--id` names several robots."""
-    from acsard.bus.fleet import named
+    from acsard.bus.robot_discovery import named
 
     if named(args.id or ""):
         raise UsageError(
@@ -127,7 +127,7 @@ def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
 
     The ids are `("*",)` for all robots and `()` for a single robot.
     """
-    from acsard.bus.fleet import named
+    from acsard.bus.robot_discovery import named
 
     many = named(args.id or "")
     _, config = load(args.config)

@@ -31,7 +31,7 @@ def main(args: argparse.Namespace) -> int:
     """Run the gateway until a signal ends it or until it must be restarted."""
     import os
 
-    from acsard.bus.session import log_from_environment
+    from acsard.bus.zenoh_sessions import log_from_environment
     from acsard.door.supervision import Watched
     from acsard.door.tls_gateway import Door
     from acsard.host.logs import Log

@@ -60,7 +60,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, a count or a timeout ends it."""
-    from acsard.bus.fleet import follow
+    from acsard.bus.robot_discovery import follow
     from acsard.cli.waiting import explained, lost_by, nothing, waits_for
     from acsard.client import connect
 
@@ -110,7 +110,7 @@ def _print(
         of_many: whether each line names its robot.
         heard: called for each message.
     """
-    from acsard.bus.fleet import robot_of
+    from acsard.bus.robot_discovery import robot_of
     from acsard.bus.subscription import encoded
 
     try:
@@ -198,7 +198,7 @@ def _record(
 
 def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
     """Print which robots are present now, because a silent robot looks like a missing one."""
-    from acsard.bus.fleet import ALL, present
+    from acsard.bus.robot_discovery import ALL, present
     from acsard.host.errors import NoAnswerError
 
     try:

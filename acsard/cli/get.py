@@ -29,7 +29,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Query the key and print its answer, or one answer per robot."""
 
-    from acsard.bus.fleet import present
+    from acsard.bus.robot_discovery import present
     from acsard.cli.echo import json_line, of_robot
     from acsard.client import connect
 

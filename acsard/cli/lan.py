@@ -8,7 +8,7 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from acsard.bus.certificates import CA, CERTIFICATE, KEY
+from acsard.bus.tls import CA, CERTIFICATE, KEY
 from acsard.cli.common import add_config, load
 from acsard.config.settings import Config
 from acsard.config.validation import write

@@ -17,8 +17,8 @@ from acsard.host.errors import Exit, MendableError, UsageError
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson
+    from acsard.checkup.board import Wire
     from acsard.checkup.findings import Finding
-    from acsard.checkup.outside import Wire
     from acsard.config.settings import Config
 
 DESCRIPTION = """\
@@ -74,7 +74,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the check and print its result."""
-    from acsard.checkup.advice import withheld
+    from acsard.checkup.checkup_report import withheld
 
     given: Overrides = {}
     for key, value in (("port", args.port), ("baud_rate", args.baud_rate)):
@@ -92,8 +92,8 @@ def main(args: argparse.Namespace) -> int:
 def _checked(
     args: argparse.Namespace, config: Config, where: str, person: Person | Nobody | JsonPerson
 ) -> int:
-    from acsard.checkup import advice, procedure
-    from acsard.checkup.report import report
+    from acsard.checkup import checkup_report, procedure
+    from acsard.checkup.checkup_report import report
 
     _, configured = load(args.config)
     port, simulated = config.mcu.port, config.mcu.simulated
@@ -114,8 +114,8 @@ def _checked(
             raise
         trouble = error  # with --json, print the report before the error
     named = args.port if args.write or (args.json_lines and not simulated) else ""
-    withheld = advice.withheld(simulated, configured)
-    changes = {} if withheld else advice.changes(findings, configured, named)
+    withheld = checkup_report.withheld(simulated, configured)
+    changes = {} if withheld else checkup_report.changes(findings, configured, named)
     written = ""
     if args.write and changes and not trouble:
         try:

@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
     """Supervise a router until a signal, or be the supervised router (`--held`)."""
     import os
 
-    from acsard.bus.session import log_from_environment
+    from acsard.bus.zenoh_sessions import log_from_environment
     from acsard.config.settings import LogConfig
     from acsard.door.fleet_router import Router
     from acsard.door.supervision import Watched

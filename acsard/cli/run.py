@@ -140,7 +140,7 @@ def page(config: Config, where: str) -> list[str] | None:
     there = find_spec("aiohttp") and find_spec("segno")
     if not (config.web.page and looked_at and there):
         return None
-    from acsard.bus.session import reachable
+    from acsard.bus.zenoh_sessions import reachable
 
     words = ["web", "--id", config.robot.id]
     if Path(where).is_file():
@@ -162,7 +162,7 @@ def _bus(config: Config) -> str:
 
 def reach(args: argparse.Namespace) -> str:
     """Return the options that other tools need to find this daemon, as text for the banner."""
-    from acsard.bus.session import reachable
+    from acsard.bus.zenoh_sessions import reachable
 
     listens = args.listen and reachable(args.listen)
     given = (("--config", args.config), ("--connect", listens), ("--id", args.id))

@@ -128,7 +128,7 @@ def _tell(config: object, as_json: bool) -> None:
 
     from acsard.config.live import flat, live
     from acsard.config.validation import show
-    from acsard.ros.descriptors import described
+    from acsard.ros.parameters import described
 
     now = {key: value for key, value in flat(config) if live(key)}
     if as_json:

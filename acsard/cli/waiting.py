@@ -63,8 +63,8 @@ def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
     """Return a function that explains why nothing has arrived on a key."""
 
     def look() -> str:
-        from acsard.bus.fleet import around
         from acsard.bus.quiet import why
+        from acsard.bus.robot_discovery import around
 
         seen = around(robot.session, where.robot_id, where.endpoint)
         if seen is None:
@@ -103,7 +103,7 @@ def of_link(where: Address) -> str:
 
     A certificate may have expired while the tool followed the robot.
     """
-    from acsard.bus.tls_trouble import trouble
+    from acsard.bus.tls import trouble
     from acsard.config.settings import TLS
 
     secured = where.tls and where.endpoint.startswith(TLS)

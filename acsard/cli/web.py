@@ -92,7 +92,7 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
     import asyncio
 
     from acsard.bus.address import address_of
-    from acsard.bus.session import log_from_environment
+    from acsard.bus.zenoh_sessions import log_from_environment
     from acsard.host.logs import Log
     from acsard.web import server, tokens
     from acsard.web.listen import opened_by

@@ -13,11 +13,11 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.bus.certificates import shown_at
-from acsard.bus.fleet import around
 from acsard.bus.identity import Identity, identity
 from acsard.bus.quiet import why as why_quiet
+from acsard.bus.robot_discovery import around
 from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.bus.tls import shown_at
 from acsard.client.commander import SPACING_S, Sender
 from acsard.client.driving import UnheardError, drive
 from acsard.host import clock

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from acsard.bus.address import Address
-from acsard.bus.session import reachable
+from acsard.bus.zenoh_sessions import reachable
 from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, answers, asked

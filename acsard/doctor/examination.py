@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from acsard.bus.address import Address, address_of
-from acsard.bus.certificates import CA, CERTIFICATE, KEY, ends_ns, require_usable
+from acsard.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
 from acsard.config.contradictions import warnings
 from acsard.config.parsing import ConfigError, parse
 from acsard.config.settings import Config

@@ -11,7 +11,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.bus.address import Address
-from acsard.bus.session import no_endpoint, reachable
+from acsard.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.client import Client, connect
 from acsard.config.live import flat, live
 from acsard.config.parsing import effective, from_builtins

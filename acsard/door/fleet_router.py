@@ -13,7 +13,7 @@ from pathlib import Path
 
 import zenoh
 
-from acsard.bus.session import first_line
+from acsard.bus.zenoh_sessions import first_line
 from acsard.door.watch import Events, Look, Watch
 from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError

@@ -15,8 +15,8 @@ import zenoh
 from zenoh.handlers import Callback
 
 from acsard.bus.access import door_access
-from acsard.bus.certificates import ends_ns, require_usable
-from acsard.bus.session import MAX_SESSIONS, door_session, reachable
+from acsard.bus.tls import ends_ns, require_usable
+from acsard.bus.zenoh_sessions import MAX_SESSIONS, door_session, reachable
 from acsard.config.settings import Config
 from acsard.door.watch import DOOR_EVENTS, Look, Watch
 from acsard.host import clock

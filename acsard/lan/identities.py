@@ -15,7 +15,7 @@ from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.bus.certificates import CA
+from acsard.bus.tls import CA
 from acsard.config.settings import Config
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import msgspec
 from msgspec import Struct
 
-from acsard.ros.tokens import Qos
+from acsard.ros.names import Qos
 
 VERSION = 5
 

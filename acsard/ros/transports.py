@@ -15,8 +15,16 @@ from msgspec import Struct
 from acsard.config.settings import Config, RosConfig
 from acsard.messages.encodings import encoding_name
 from acsard.messages.topics import IMU, Direction, service_key
-from acsard.ros.names import bridge_key, full_name, rmw_key
-from acsard.ros.tokens import Kind, Node, Qos, bridge_presence, bridge_token
+from acsard.ros.names import (
+    Kind,
+    Node,
+    Qos,
+    bridge_key,
+    bridge_presence,
+    bridge_token,
+    full_name,
+    rmw_key,
+)
 from acsard.values import ROOT
 
 Transport = Literal["bridge", "rmw"]

@@ -20,9 +20,9 @@ from typing import Any
 from acsard import __version__
 from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus
-from acsard.bus.certificates import ends_ns as ends_ns_of
-from acsard.bus.certificates import require_usable
-from acsard.bus.session import log_from_environment
+from acsard.bus.tls import ends_ns as ends_ns_of
+from acsard.bus.tls import require_usable
+from acsard.bus.zenoh_sessions import log_from_environment
 from acsard.config.settings import TLS, Config
 from acsard.host import clock, real_time
 from acsard.host.logs import Log

@@ -10,7 +10,7 @@ from threading import Lock
 
 import zenoh
 
-from acsard.bus.fleet import ALL, follow, nobody, robot_of, seen
+from acsard.bus.robot_discovery import ALL, follow, nobody, robot_of, seen
 from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
 from acsard.client.follower import FLEET_ASK_S, Follower

@@ -9,7 +9,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
-from acsard.bus import fleet
+from acsard.bus import robot_discovery
 from acsard.bus.access import MAY, SERVICE_ROLES
 from acsard.bus.address import require_id
 from acsard.client import Client
@@ -135,7 +135,10 @@ class Calls:
             finally:
                 self._elsewhere -= 1
         await in_thread(
-            lambda: fleet.stop(client.session, [robot], _named(client, robot, who).caller), ANSWER_S
+            lambda: robot_discovery.stop(
+                client.session, [robot], _named(client, robot, who).caller
+            ),
+            ANSWER_S,
         )
         return ServiceReply(False, f"{robot} was told to stop; look at it: {BUSY}")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from acsard.bus.fleet import ALL, robot_of
+from acsard.bus.robot_discovery import ALL, robot_of
 from acsard.bus.subscription import encoded
 from acsard.client import Client
 from acsard.host import clock

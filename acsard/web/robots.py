@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.bus.address import Address
-from acsard.bus.certificates import shown_at
+from acsard.bus.tls import shown_at
 from acsard.client import Client
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError

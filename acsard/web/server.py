@@ -17,8 +17,8 @@ from aiohttp import web
 from msgspec import Struct
 
 from acsard.bus.address import Address
-from acsard.bus.certificates import CERTIFICATE, KEY, names_in
-from acsard.bus.session import client_session
+from acsard.bus.tls import CERTIFICATE, KEY, names_in
+from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
 from acsard.config.settings import Config
 from acsard.host.logs import Log

@@ -8,7 +8,7 @@ from typing import Any
 from msgspec import UNSET, Struct, UnsetType, inspect
 
 from acsard.config.live import WHEN, flat, live
-from acsard.ros.descriptors import kind_of
+from acsard.ros.parameters import kind_of
 
 
 class Row(Struct, frozen=True, omit_defaults=True):

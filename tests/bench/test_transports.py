@@ -25,7 +25,7 @@ from acsard.bus import outlets
 from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus
 from acsard.bus.outlets import direct
-from acsard.bus.session import client_session
+from acsard.bus.zenoh_sessions import client_session
 from acsard.config.settings import SIMULATOR, Config
 from acsard.host import clock
 from acsard.messages import encodings

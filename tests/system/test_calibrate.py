@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from acsard.bus.session import client_session
+from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.guided.recorder import Recorder, Sample
 from acsard.calibration.guided.steps import Ask, GuideError
 from acsard.client import legs

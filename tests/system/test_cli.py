@@ -23,8 +23,8 @@ from typing import Any
 
 import pytest
 
-from acsard.bus.fleet import around
 from acsard.bus.quiet import Around
+from acsard.bus.robot_discovery import around
 from acsard.client import connect
 from tests.system.bystander import lost
 from tests.system.harness import (

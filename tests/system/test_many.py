@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard.bus.fleet import ALL, stop
+from acsard.bus.robot_discovery import ALL, stop
 from acsard.cli import main
 from acsard.client import connecting
 from tests.pages import blocks

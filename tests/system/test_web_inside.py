@@ -13,7 +13,7 @@ import pytest
 from aiohttp.test_utils import TestServer
 
 from acsard.bus.address import Address
-from acsard.bus.session import client_session
+from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
 from acsard.config.settings import Config
 from acsard.host.errors import UnreachableError

@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from acsard.checkup import advice, procedure
+from acsard.checkup import checkup_report, procedure
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.config.named_faults import named
@@ -180,7 +180,7 @@ class Checked:
         with robot.faulty():
             procedure.run(robot, operator, robot.config, self.findings.append)
             self.left_turning = any(robot.later())
-        self.changes = advice.changes(self.findings, robot.config)
+        self.changes = checkup_report.changes(self.findings, robot.config)
 
     def __getitem__(self, name: str) -> Finding:
         """Return the finding whose name starts with this text."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup.board import Board
+from acsard.checkup.board import Board, Operator, Wire
 from acsard.checkup.findings import StoppedError
-from acsard.checkup.limits import MOTOR_S, PATIENCE_S, SPEED
-from acsard.checkup.motion import ZERO
+from acsard.checkup.motion import MOTOR_S, PATIENCE_S, SPEED, ZERO
 from acsard.config.settings import Config, McuConfig, SimConfig
 from acsard.host.errors import MendableError
+from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
-from tests.unit.checkup.robots import Robot
+from tests.unit.checkup.robots import Nobody, Robot
 
 
 def test_a_line_that_does_not_open_is_sent_nothing() -> None:
@@ -165,3 +165,11 @@ def test_the_wait_for_wheels_that_slow_down_has_an_end() -> None:
         assert PATIENCE_S * 1e9 < robot.now_ns() - began < 2 * PATIENCE_S * 1e9
         assert not board.latched
         assert not board.comma
+
+
+def test_the_virtual_wire_is_a_wire_and_nobody_an_operator() -> None:
+    wire: Wire = VirtualWire(FakeMcu(Config()))
+    operator: Operator = Nobody()
+    assert wire.now_ns() == 0
+    assert operator.ask("lifted?", ("lifted",)) == "lifted"
+    assert operator.ask("which?", ("this", "that")) is None

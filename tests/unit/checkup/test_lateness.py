@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from acsard.checkup.lateness import LEAST_S, PAUSE_S, SPOILS_S, Lateness, finding, judged, spoilt
-from acsard.checkup.limits import PERIOD_S
-from acsard.checkup.manual import Unsure, find
+from acsard.checkup.motion import PERIOD_S
+from acsard.checkup.outcomes import Unsure, find
 from tests.unit.checkup.robots import Busy, Robot, Starved
 
 

@@ -12,7 +12,7 @@ import pytest
 from acsard.checkup import procedure
 from acsard.checkup.board import FAREWELL
 from acsard.checkup.findings import REST, Finding, WireLostError
-from acsard.checkup.limits import SPEED
+from acsard.checkup.motion import SPEED
 from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
 from acsard.mcu.codec import Codec
 from acsard.sim import protocol

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.checkup import dialect, pace, watchdog
+from acsard.checkup import dialect, watchdog
 from acsard.checkup.findings import StoppedError
-from acsard.checkup.limits import SPEED
-from acsard.checkup.turning import turn
+from acsard.checkup.motion import SPEED
 from acsard.checkup.watchdog import UNKNOWN, Between, run
+from acsard.checkup.wheels import turn
 from acsard.config.settings import Config, SimConfig
 from acsard.sim import protocol
 from tests.unit.checkup.robots import Robot
@@ -26,7 +26,7 @@ class ByItsOwnClock(Robot):
 
 def measured(robot: Robot, *motors: int) -> tuple[str, str]:
     with robot.board() as board:
-        pace.rate(board)
+        dialect.rate(board)
         dialect.check(board)
         for motor in range(4):
             turn(board, motor, 3.0)
@@ -133,7 +133,7 @@ SLACK_S = 0.02
 
 def silence(robot: Robot) -> Between:
     with robot.board() as board:
-        pace.rate(board)
+        dialect.rate(board)
         dialect.check(board)
         for motor in ALL:
             turn(board, motor, 3.0)

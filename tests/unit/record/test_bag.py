@@ -9,7 +9,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from acsard.record.bag import Topic, metadata, offered
-from acsard.ros.tokens import Qos
+from acsard.ros.names import Qos
 
 
 def loaded(text: str) -> Any:

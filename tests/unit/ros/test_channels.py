@@ -14,10 +14,25 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from acsard.messages.cdr_types import plain
 from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
-from acsard.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG, STATE, Channel, said
+from acsard.ros.channels import (
+    BY_KEY,
+    CHANNELS,
+    CMD_VEL_IN,
+    DEFINITIONS,
+    LOG,
+    OURS,
+    RULE,
+    STATE,
+    Channel,
+    nested,
+    said,
+    schema_text,
+)
+from acsard.ros.names import TYPE_HASHES
 from acsard.ros.shapes import log
 from acsard.ros.transports import PUBLISHED
 from acsard.values import Event
+from tests.unit.ros.test_names import rihs01
 from tests.unit.ros.test_shapes import STATE as ROBOT_STATE
 
 
@@ -86,3 +101,34 @@ def test_events_and_commands_have_a_channel_beside_the_keys() -> None:
     twist = TwistStamped(Header(Time(1)), Twist(Vector3(x=0.5), Vector3()))
     assert LOG.encode(log(Event("started", "up"), Time())).startswith(b"\0\1\0\0")
     assert len(CMD_VEL_IN.encode(twist)) == 68
+
+
+THEIRS = [name for name in DEFINITIONS if not name.startswith(OURS)]
+
+
+@pytest.mark.parametrize("name", DEFINITIONS)
+def test_the_text_alone_is_enough_for_another_program(name: str) -> None:
+    assert {name, *nested(name)} == set(get_types_from_msg(schema_text(name), name))
+
+
+@pytest.mark.parametrize("name", THEIRS)
+def test_another_program_makes_the_same_hash_of_the_text(name: str) -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema_text(name), name))
+    known = TYPE_HASHES.get(name, rihs01(name))
+    assert store.hash_rihs01(name) == known == get_typestore(Stores.ROS2_JAZZY).hash_rihs01(name)
+
+
+def test_a_text_has_each_type_once_after_the_type_itself() -> None:
+    text = schema_text("nav_msgs/msg/Odometry")
+    first, *others = text.split(f"{RULE}\nMSG: ")
+    assert first == (
+        "std_msgs/Header header\nstring child_frame_id\n"
+        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
+    )
+    assert [other.partition("\n")[0] for other in others] == [
+        "std_msgs/Header", "builtin_interfaces/Time",
+        "geometry_msgs/PoseWithCovariance", "geometry_msgs/Pose", "geometry_msgs/Point",
+        "geometry_msgs/Quaternion",
+        "geometry_msgs/TwistWithCovariance", "geometry_msgs/Twist", "geometry_msgs/Vector3",
+    ]  # fmt: skip

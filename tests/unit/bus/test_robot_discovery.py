@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.bus.fleet import named, nobody, robot_of
+from acsard.bus.robot_discovery import named, nobody, robot_of
 from acsard.host.errors import UsageError
 
 

@@ -13,8 +13,7 @@ import sys
 
 import zenoh
 
-from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
-from acsard.bus.tls_trouble import trouble
+from acsard.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble
 from acsard.config.settings import TLS, BusConfig
 from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
 from acsard.host.terminal import coloured

@@ -1,15 +1,18 @@
-"""The files of a TLS directory are checked before a session is opened with them."""
+"""Tests of the certificate files, and of the sentence for each way in which TLS fails."""
 
 from __future__ import annotations
 
+import errno
 import os
+import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cryptography.hazmat.primitives import serialization
 
-from acsard.bus.certificates import common_name, ends_ns, require_usable
+from acsard.bus.tls import common_name, ends_ns, require_usable, trouble
 from acsard.host.errors import CertificateError, NotPermittedError
 from acsard.lan.authority import Authority
 from acsard.values import NS_PER_S
@@ -91,3 +94,40 @@ def test_it_ends_when_the_first_of_certificate_and_authority_does(
 
 def test_files_that_are_none_end_at_no_time(tmp_path: Path) -> None:
     assert ends_ns(str(tmp_path)) is None
+
+
+@pytest.mark.parametrize(
+    ("number", "told", "untold"),
+    [
+        (errno.EHOSTUNREACH, "robot.local is not there (No route to host)", "listens"),
+        (errno.ENETUNREACH, "robot.local is not there (Network is unreachable)", "listens"),
+        (errno.ECONNREFUSED, "nobody listens on port 7449 of robot.local", "not there"),
+    ],
+)
+def test_a_host_that_is_not_there_is_not_one_on_which_nobody_listens(
+    number: int, told: str, untold: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def connection(*_: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(socket, "create_connection", connection)
+    found = trouble("tls/robot.local:7449", "")
+    assert told in found
+    assert untold not in found
+
+
+@pytest.mark.parametrize("options", ["?prio=0-5", "#iface=eth0", "?prio=0-5#iface=eth0"])
+def test_the_options_of_an_endpoint_are_not_part_of_its_port(
+    options: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def connection(address: tuple[str, int], *_: Any) -> None:
+        asked.append(address)
+        raise TimeoutError
+
+    monkeypatch.setattr(socket, "create_connection", connection)
+    assert trouble(f"tls/robot.local:7449{options}", "") == (
+        "robot.local is silent on port 7449: is it on, and does a firewall drop connections?"
+    )
+    assert asked == [("robot.local", 7449)]

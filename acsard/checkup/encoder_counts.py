@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from acsard.checkup import loss, manual
+from acsard.checkup import line_loss, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.checkup.limits import GLANCE_S
-from acsard.checkup.motion import Reply, steps
+from acsard.checkup.motion import GLANCE_S, Reply, steps
 
 LEAST_ANGLE = 2.0
 """Smallest angle for a measurement of the counts, rad.
@@ -45,33 +44,33 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     `motors` are motors that have turned as commanded.
     """
     if not board.sampled:
-        return manual.find("encoder counts: none")
-    if board.lost > loss.MOST:
-        return manual.find("encoder counts: damaged", share=board.lost)
+        return outcomes.find("encoder counts: none")
+    if board.lost > line_loss.MOST:
+        return outcomes.find("encoder counts: damaged", share=board.lost)
     said = board.identity.get("counts", "")
     named = int(said) if said.isdigit() and len(said) < 9 else 0
     measured, configured = per_turn(board.replies, motors), board.mcu.encoder_counts
     unused: dict[str, object] = {"mcu.encoder_counts": 0} if configured else {}
     if measured is None and not named:
-        return manual.find("encoder counts: not turned")
+        return outcomes.find("encoder counts: not turned")
     if measured is not None and measured < 1:
-        return manual.find("encoder counts: backward", unused, measured=measured)
+        return outcomes.find("encoder counts: backward", unused, measured=measured)
     if measured is None:
         counts, how = named, "by its identification; not measured"
     elif not named:
         near = abs(measured - configured) <= AGREES * configured
         if board.lost and not near:
-            return manual.find("encoder counts: damaged", share=board.lost)
+            return outcomes.find("encoder counts: damaged", share=board.lost)
         counts = configured if near else round(measured)
         how = f"measured against its speeds, {measured:.0f} within {AGREES:.0%}"
     elif abs(measured - named) > AGREES * named:
-        return manual.find("encoder counts: misnamed", named=named, measured=measured)
+        return outcomes.find("encoder counts: misnamed", named=named, measured=measured)
     else:
         counts, how = named, f"by its identification; measured {measured:.0f}"
     if counts > MOST_COUNTS:
-        return manual.find("encoder counts: many", unused, counts=counts, most=MOST_COUNTS)
+        return outcomes.find("encoder counts: many", unused, counts=counts, most=MOST_COUNTS)
     right, off = configured in (0, counts), abs(configured / counts - 1)
-    return manual.find(
+    return outcomes.find(
         "encoder counts: right" if right else "encoder counts: wrong",
         {"mcu.encoder_counts": counts},
         counts=counts,

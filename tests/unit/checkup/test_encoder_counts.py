@@ -6,10 +6,10 @@ import math
 
 import pytest
 
-from acsard.checkup import counts, loss
+from acsard.checkup import encoder_counts, line_loss
 from acsard.checkup.dialect import check, identity
 from acsard.checkup.motion import Reply
-from acsard.checkup.turning import turn
+from acsard.checkup.wheels import turn
 from acsard.config.settings import Config, SimConfig
 from acsard.mcu.check import Reading
 from tests.unit.checkup.robots import Robot
@@ -29,14 +29,14 @@ def replies(per_turn: float, speed: float = 3.0, start: int = 65000) -> list[Rep
 def test_counts_per_turn_come_out_over_wraps_of_clock_and_counts(
     per_turn: int, speed: float
 ) -> None:
-    measured = counts.per_turn(replies(per_turn, speed), [0])
+    measured = encoder_counts.per_turn(replies(per_turn, speed), [0])
     assert measured == pytest.approx(per_turn, rel=0.02)
 
 
 def test_too_little_turned_says_nothing() -> None:
-    assert counts.per_turn(replies(3200)[:20], [0]) is None
-    assert counts.per_turn(replies(3200), [1]) is None
-    assert counts.per_turn(replies(3200), []) is None
+    assert encoder_counts.per_turn(replies(3200)[:20], [0]) is None
+    assert encoder_counts.per_turn(replies(3200), [1]) is None
+    assert encoder_counts.per_turn(replies(3200), []) is None
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_what_is_said_of_the_configured_counts(
         for motor in range(4):
             turn(board, motor, 3.0)
             board.rest()
-        finding = counts.finding(board, [0, 1, 2, 3])
+        finding = encoder_counts.finding(board, [0, 1, 2, 3])
     assert (finding.verdict, finding.keys) == (verdict, keys)
 
 
@@ -68,7 +68,7 @@ def test_counts_that_are_not_as_identified_are_a_fault() -> None:
         board.identity = {"counts": "3200"}
         turn(board, 0, 3.0)
         turn(board, 0, 3.0)
-        finding = counts.finding(board, [0])
+        finding = encoder_counts.finding(board, [0])
     assert finding.verdict == "FAIL"
     assert not finding.keys
 
@@ -79,13 +79,13 @@ def test_counts_against_the_speeds_are_a_fault() -> None:
         board.sampled = True
         board.replies = [Reply(r.at_s, (-3.0, 0.0, 0.0, 0.0), b"", r.reading)
                          for r in replies(3200)]  # fmt: skip
-        assert "against" in counts.finding(board, [0]).text
+        assert "against" in encoder_counts.finding(board, [0]).text
 
 
 def test_more_counts_than_the_host_takes_are_a_warning() -> None:
     with Robot().board() as board:
         board.sampled, board.identity = True, {"counts": "400000"}
-        assert counts.finding(board, []).verdict == "WARN"
+        assert encoder_counts.finding(board, []).verdict == "WARN"
 
 
 @pytest.mark.parametrize("configured", [1600, 2700, 3700, 12800])
@@ -93,7 +93,7 @@ def test_a_wrong_key_is_found_by_the_speeds_alone_and_mended(configured: int) ->
     with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
         board.sampled = True
         board.replies = replies(3200)
-        finding = counts.finding(board, [0])
+        finding = encoder_counts.finding(board, [0])
     assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
     assert finding.figure == f"3200, not {configured}"
     assert "every distance would be off by" in finding.text
@@ -104,7 +104,7 @@ def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None
         board.sampled = True
         board.replies = [Reply(r.at_s, r.motors, b"", Reading(20 * n % 65536, (7, 7, 7, 7)))
                          for n, r in enumerate(replies(3200))]  # fmt: skip
-        finding = counts.finding(board, [0])
+        finding = encoder_counts.finding(board, [0])
     assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 0})
 
 
@@ -120,12 +120,12 @@ def test_where_lines_are_lost_no_counts_are_proposed_but_those_that_are_configur
     configured: int, verdict: str, keys: dict[str, object]
 ) -> None:
     with Robot("no_sample", link_check="auto", encoder_counts=configured).board() as board:
-        board.sampled, board.lost = True, loss.MOST / 4
+        board.sampled, board.lost = True, line_loss.MOST / 4
         board.replies = replies(3200)
-        finding = counts.finding(board, [0])
+        finding = encoder_counts.finding(board, [0])
         assert (finding.verdict, finding.keys) == (verdict, keys)
         if verdict == "SKIPPED":
             assert "0.5% of the lines are lost" in finding.text
         # a count that the board states itself needs no measurement
         board.identity = {"counts": "3200"}
-        assert counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}
+        assert encoder_counts.finding(board, [0]).keys == {"mcu.encoder_counts": 3200}

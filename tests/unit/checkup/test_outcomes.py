@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from acsard.checkup.limits import WATCHDOG_MOST_S
-from acsard.checkup.manual import MANUAL, find
-from acsard.checkup.outcomes import OUTCOMES
+from acsard.checkup.motion import WATCHDOG_MOST_S
+from acsard.checkup.outcomes import MANUAL, OUTCOMES, find
 from acsard.checkup.procedure import STEPS
 from acsard.mcu.contract import WATCHDOG_S
 

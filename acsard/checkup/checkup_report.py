@@ -1,0 +1,162 @@
+"""The result of the check as text and as an object, and its changes to `acsard.toml`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import reduce
+from operator import attrgetter, getitem
+from typing import Any
+
+from msgspec import Struct, ValidationError
+from rich.table import Table
+from rich.text import Text
+
+from acsard.checkup import lateness
+from acsard.checkup.findings import REST, Finding
+from acsard.config.contradictions import contradictions
+from acsard.config.parsing import effective, from_builtins
+from acsard.config.settings import Config
+from acsard.config.writing import excerpt
+from acsard.terminal.tables import table
+
+Changes = dict[str, object]
+"""New values by dotted key, in the order of the file."""
+
+OPTIONAL = ("mcu.encoder_counts", "mcu.link_check")
+"""Keys that improve the link but are not necessary.
+
+They are left out if the wire has no room for the longer lines.
+"""
+
+
+def answered(findings: Iterable[Finding]) -> bool:
+    """Return whether a board answered at the port, that is, whether its baud rate was found."""
+    return any(finding.name == "baud rate" and finding.keys for finding in findings)
+
+
+def changes(findings: Sequence[Finding], config: Config, port: str = "") -> Changes:
+    """Return the keys that should differ from the configuration.
+
+    `port` is included if it is not "" and a board answered there.
+    """
+    wanted: Changes = {"mcu.port": port} if port and answered(findings) else {}
+    for finding in findings:
+        wanted |= finding.keys
+    differing = {key: value for key, value in wanted.items() if attrgetter(key)(config) != value}
+
+    def fits(given: Changes) -> bool:
+        changed = applied(given, config)
+        return changed is not None and not contradictions(changed)
+
+    # Longer or slower lines may leave no room for the control rate. Give up the least important
+    # first.
+    for optional in ("", *OPTIONAL):
+        if optional and attrgetter(optional)(config) in (0, "off"):
+            differing.pop(optional, None)
+        if fits(differing):
+            return differing
+    slower: Changes = {**differing, "control.rate": "auto"}
+    return slower if fits(slower) else differing
+
+
+def withheld(simulated: bool, config: Config) -> str:
+    """Return why the findings do not apply to this configuration, or "" if they do.
+
+    Findings about the simulator do not apply to the configuration of a real robot.
+    """
+    if not simulated or config.mcu.simulated:
+        return ""
+    return (
+        f"the simulator was checked, and mcu.port here is {config.mcu.port}: what the simulator "
+        "likes says nothing of that robot"
+    )
+
+
+def applied(given: Changes, config: Config) -> Config | None:
+    """Return the configuration with these keys, or None if a value is not permitted."""
+    plain: Any = effective(config)
+    for key, value in given.items():
+        where, _, name = key.rpartition(".")
+        reduce(getitem, where.split("."), plain)[name] = value
+    try:
+        return from_builtins(plain)
+    except ValidationError:
+        return None
+
+
+COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
+
+
+class Report(Struct, frozen=True):
+    """A check that has ended.
+
+    `written` is the file that the changes were written to, and `error` a failure that is not about
+    the board.
+    """
+
+    port: str
+    passed: bool
+    findings: Sequence[Finding]
+    changes: Changes
+    toml: str
+    written: str | None = None
+    error: str | None = None
+    withheld: str | None = None
+    """Why no finding applies to the configuration file, or None."""
+
+
+def report(
+    port: str,
+    findings: Sequence[Finding],
+    changes: Changes,
+    written: str,
+    error: str,
+    withheld: str = "",
+) -> Report:
+    """Return the report of a check.
+
+    A check has passed only if the board answered, every step was reached and judged, and none
+    failed.
+    """
+    ended = not any(finding.name == REST for finding in findings)
+    judged = ended and not lateness.unjudged(findings)
+    passed = answered(findings) and judged and not failed(findings)
+    toml = "\n".join(excerpt(changes))
+    return Report(
+        port,
+        passed,
+        findings,
+        changes,
+        toml,
+        written or None,
+        error or None,
+        withheld or None,
+    )
+
+
+def failed(findings: Sequence[Finding]) -> bool:
+    """Return whether any finding failed."""
+    return any(finding.verdict == "FAIL" for finding in findings)
+
+
+def row(finding: Finding) -> Table:
+    """Return the verdict with name and figure, then the meaning and the remedy."""
+    verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
+    below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
+    head = f"{finding.name:<22} {finding.figure}"
+    return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
+
+
+def summary(found: Report, where: str) -> str:
+    """Return the number of each verdict and of unjudged findings, and the lines for `where`."""
+    verdicts = [finding.verdict for finding in found.findings]
+    counts = ", ".join(f"{verdicts.count(v)} {v}" for v in COLOURS if v in verdicts)
+    if late := lateness.unjudged(found.findings):
+        again = "so it has not passed: try again when this computer is free"
+        counts += f"\n{len(late)} not judged, {again}"
+    if found.withheld:
+        return f"\n{counts}\nnothing is for {where}: {found.withheld}"
+    if not found.toml:
+        return f"\n{counts}\nacsard.toml: nothing to change"
+    head = f"{where}: written" if found.written else "for acsard.toml:"
+    return f"\n{counts}\n\n{head}\n{found.toml}"

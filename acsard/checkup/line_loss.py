@@ -1,0 +1,255 @@
+"""Counts lines that are lost or damaged, finds long silences of the board, and the way of a loss.
+
+A line that arrives damaged was damaged on the way back. An unanswered line may have been lost in
+either direction, and the motors show the direction. Single lines turn standing motors for a moment,
+again and again. A line that the motors obeyed has arrived, so its answer was the one that got lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from statistics import fmean, median
+
+from msgspec import Struct
+
+from acsard.checkup import lateness, motion, outcomes
+from acsard.checkup.board import Board, Operator
+from acsard.checkup.findings import Finding, StoppedError
+from acsard.checkup.motion import ZERO, Reply
+from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.mcu.hearing import printable
+from acsard.mcu.session import IDENTITY
+
+MOST = 0.02
+"""Largest fraction of lines that may be lost. A sound link loses none."""
+
+FEW = 2
+"""Number of lost lines from which on the loss is not a coincidence."""
+
+LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
+"""Number of lines that show a loss of 2 %, and shortest and longest duration of the count, s.
+
+The count ends early if no line is lost, and takes longer on a slow wire.
+"""
+
+OWN_PACE = 1.5
+"""Gap between answers, in periods, above which the board answers at its own, slower pace."""
+
+SILENT = 2.0
+"""Multiple of the usual gap above which a gap between two answers counts as a silence."""
+
+
+class Count(Struct, frozen=True):
+    """Counts of lines. The `damaged` ones, which arrived damaged, are among the `lost` ones."""
+
+    lines: int
+    lost: int
+    damaged: int
+
+    @property
+    def share(self) -> float:
+        """Fraction of lost lines; 0 if the loss may be a coincidence."""
+        return self.lost / self.lines if self.lost >= FEW else 0.0
+
+
+def finding(board: Board) -> Finding:
+    """Send zeros at the host's rate, judge the replies, and set `board.lost`.
+
+    Ends the check if plain lines arrive damaged: lines to the board may then be damaged too, and
+    could tell a motor any speed. The loss cannot be determined if the board's pace is unknown.
+    """
+    if not board.paced:
+        return lateness.finding("lost lines", board.lateness.since(0.0))
+    board.listen(motion.GLANCE_S)  # later replies answer the lines that are sent now
+    began_s, sent, others = board.now_s, board.sent_lines, len(board.others)
+    board.drive(ZERO, LEAST_S, _period_s(board))
+    silent_s = _silence_s(board, motion.since(board.replies, began_s))
+    while True:
+        board.listen(motion.GLANCE_S)
+        count = _counted(board, began_s, board.sent_lines - sent, others)
+        if not count.lost or count.lines >= LINES or board.now_s - began_s > MOST_S:
+            break
+        board.drive(ZERO, 0.5, _period_s(board))
+    board.lost = count.share
+    if board.lost <= MOST:
+        return _sound(count, silent_s)
+    last = printable(board.others[-1]) if count.damaged else ""
+    seen = {"share": board.lost, "lines": count.lines, "damaged": count.damaged, "last": last}
+    if not count.damaged:
+        return outcomes.find(
+            f"lost lines: {'silent' if board.own_clock else 'either'}", None, **seen
+        )
+    found = outcomes.find(
+        f"lost lines: {'back' if 2 * count.damaged > count.lost else 'both'}", None, **seen
+    )
+    if not board.sealed:
+        raise StoppedError(found)
+    return found
+
+
+def _sound(count: Count, silent_s: float) -> Finding:
+    if silent_s:
+        return outcomes.find("lost lines: late", lines=count.lines, silent=silent_s * 1000)
+    outcome = "few" if count.lost else "none"
+    return outcomes.find(f"lost lines: {outcome}", lines=count.lines, lost=count.lost)
+
+
+def _period_s(board: Board) -> float:
+    """Return the host's period, or a longer one if the board answers less often."""
+    longest = line_bytes(board.comma, board.sealed, board.sampled)
+    period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
+    if not board.own_clock and board.gap_s > OWN_PACE * period_s:
+        return 1.25 * board.gap_s
+    return period_s
+
+
+def _counted(board: Board, began_s: float, lines: int, others: int) -> Count:
+    damaged = sum(not line.startswith(IDENTITY) for line in board.others[others:])
+    got = motion.since(board.replies, began_s)
+    if not board.own_clock:
+        return Count(lines, max(damaged, lines - len(got)), damaged)
+    lost = max(damaged, _left_out(got))
+    return Count(len(got) + lost, lost, damaged)
+
+
+def _gaps(replies: Sequence[Reply]) -> list[float]:
+    return [after.at_s - before.at_s for before, after in pairwise(replies)]
+
+
+def _left_out(replies: Sequence[Reply]) -> int:
+    """Return the number of missing replies among evenly spaced ones.
+
+    It is computed over the whole time: a reply that is received late makes one gap longer and the
+    next one shorter.
+    """
+    gaps = _gaps(replies)
+    usual = median(gaps) if gaps else 0.0
+    alike = [gap for gap in gaps if abs(gap - usual) < usual / 2]
+    return max(0, round(sum(gaps) / fmean(alike)) - len(gaps)) if alike else 0
+
+
+def _silence_s(board: Board, replies: Sequence[Reply]) -> float:
+    """Return the longest gap that the host would take for a lost link, s, or 0 if there is none."""
+    longest = max(_gaps(replies), default=0.0)
+    quiet_s = max(0.1, 4 / board.rate_hz, 3 * board.mcu.reply_period)
+    return longest if longest > max(quiet_s, SILENT * board.gap_s) else 0.0
+
+
+PULSE_S = 0.08
+"""Time for which a single line turns the motors, s.
+
+It is long enough to see and shorter than the watchdog.
+"""
+
+TOLD, PULSES_S = 8, 20.0
+"""Number of unanswered pulses that shows the direction, and longest time to wait for them, s."""
+
+OWN_CLOCK_S = 10.0
+"""Duration for a board that reports by its own clock, s.
+
+Such a board answers no line, so nothing has shown yet whether any line is lost.
+"""
+
+SPREAD, STRIDE = 12, 5
+"""Number of different pauses between pulses, and the stride by which they are ordered.
+
+With equal pauses, losses at regular intervals could miss every pulse.
+"""
+
+OBEYED = 0.5
+"""Fraction of the usual angle of a pulse above which the motors obeyed it."""
+
+SEEN, GRAINS = 0.02, 4
+"""Smallest usable angle of a pulse, in rad and in smallest steps of the encoders."""
+
+WHOLE = 1.5
+"""Multiple of the usual gap between a board's own reports above which one is missing."""
+
+
+class Ways(Struct, frozen=True):
+    """Counts of pulses: lost on the way `there`, and obeyed with the answer lost (`back`)."""
+
+    sent: int
+    there: int
+    back: int
+
+
+def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Finding | None:
+    """Judge the direction with motors that turn as commanded.
+
+    Returns None if no line is known to be lost.
+    """
+    if not (board.own_clock or board.lost > MOST):
+        return None
+    operator.say("the motors turn for a moment each time, to tell on which way lines are lost")
+    ways = pulsed(board, motors) if motors else None
+    if ways is None:
+        return outcomes.find("lost where: untold")
+    if ways.there + ways.back < FEW:
+        return outcomes.find("lost where: not seen", sent=ways.sent)
+    outcome = "there" if ways.there > ways.back else "back"
+    if min(ways.there, ways.back) >= FEW:
+        outcome = "both"
+    seen = {"sent": ways.sent, "there": ways.there, "back": ways.back}
+    return outcomes.find(f"lost where: {outcome}", None, **seen)
+
+
+def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
+    """Send pulses to these standing motors and count the losses.
+
+    Returns None if the motors are too slow or too coarse to tell.
+    """
+    on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
+    end_s = board.now_s + (OWN_CLOCK_S if board.own_clock else PULSES_S)
+    every: list[float] = []
+    unanswered: list[float] = []
+    count = 0
+    while len(unanswered) < TOLD and board.now_s < end_s:
+        # An answer to an earlier line must not count for this one.
+        board.listen(motion.GLANCE_S / 4)
+        since_s, coasting = board.now_s, board.replies[-1].motors
+        answered = bool(board.drive(on, PULSE_S, PULSE_S))
+        board.drive(ZERO, 2 * board.gap_s + (4 + STRIDE * count % SPREAD) * board.period_s)
+        if not _stand(board):
+            return None
+        count += 1
+        if board.own_clock and not _whole(board, since_s):
+            continue
+        ran, passed_s = motion.covered(board.replies, since_s), board.now_s - since_s
+        every.append(max(abs(ran[m]) - abs(coasting[m]) * passed_s for m in motors))
+        if not (answered or board.own_clock):
+            unanswered.append(every[-1])
+    usual = median(every) if every else 0.0
+    if usual < max(SEEN, GRAINS * _grain(board, motors)):
+        return None
+    if board.own_clock and len(every) < TOLD:
+        return None
+    if board.own_clock:
+        return Ways(len(every), sum(angle < OBEYED * usual for angle in every), 0)
+    back = sum(angle >= OBEYED * usual for angle in unanswered)
+    return Ways(len(every), len(unanswered) - back, back)
+
+
+def _whole(board: Board, since_s: float) -> bool:
+    """Return whether none of the board's own reports since then is missing."""
+    times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
+    return all(after - before < WHOLE * board.gap_s for before, after in pairwise(times))
+
+
+def _grain(board: Board, motors: Sequence[int]) -> float:
+    """Return the smallest angle that these encoders showed between two replies, rad."""
+    course = motion.steps(board.replies)
+    shown = [abs(step.speeds[m]) * step.seconds for step in course for m in motors]
+    return min((angle for angle in shown if angle), default=0.0)
+
+
+def _stand(board: Board) -> bool:
+    """Wait until the motors stand. Return False if they are too slow for pulses."""
+    began_s = board.now_s
+    while board.turning():
+        if board.now_s - began_s > motion.MOTOR_S / 2:
+            board.rest()
+            return False
+        board.ask()
+    return True

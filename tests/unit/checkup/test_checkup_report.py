@@ -1,0 +1,105 @@
+"""Tests of the printed findings, and of the lines of acsard.toml that they suggest."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.checkup import checkup_report, lateness
+from acsard.checkup.checkup_report import report, row, summary
+from acsard.checkup.findings import REST, Finding
+from acsard.config.contradictions import contradictions
+from acsard.config.parsing import parse
+from acsard.config.settings import Config
+from acsard.terminal.output import plain
+from tests.unit.checkup.robots import configured
+
+RATE = Finding("baud rate", "PASS", keys={"mcu.baud_rate": 57600})
+
+
+def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
+    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
+    head, *rest = plain(row(finding), width=100).splitlines()
+    assert head == "FAIL    watchdog               none"
+    assert all(line.startswith(" " * 8) for line in rest)
+    assert rest[-1] == "        -> give it one"
+
+
+def test_a_board_passes_that_answered_and_failed_in_nothing() -> None:
+    late = Finding("watchdog", "FAIL")
+    assert report("sim", [RATE], {}, "", "").passed
+    assert not report("sim", [RATE, late], {}, "", "").passed
+    assert not report("sim", [], {}, "", "no such port").passed
+
+
+@pytest.mark.parametrize(
+    ("more", "passed"),
+    [
+        ([lateness.finding("watchdog", 0.08)], False),
+        ([Finding(REST, "SKIPPED", "2 steps", "the check ended early: link")], False),
+        ([lateness.finding("trailing comma", 0.08), Finding("trailing comma", "PASS")], True),
+        ([Finding("round trip", "SKIPPED")], True),
+    ],
+)
+def test_what_was_not_judged_or_not_tried_has_not_passed(more: list[Finding], passed: bool) -> None:
+    assert report("sim", [RATE, *more], {}, "", "").passed is passed
+
+
+def test_the_end_says_how_many_were_not_judged_and_what_to_do() -> None:
+    late = [lateness.finding(name, 0.08) for name in ("watchdog", "lost lines")]
+    told = summary(report("sim", [RATE, *late], {}, "", ""), "acsard.toml").splitlines()
+    assert told[1:3] == [
+        "1 PASS, 2 WARN",
+        "2 not judged, so it has not passed: try again when this computer is free",
+    ]
+
+
+def test_the_end_counts_the_verdicts_and_has_the_lines_of_toml() -> None:
+    found = report("sim", [RATE, Finding("watchdog", "FAIL")], {"mcu.baud_rate": 57600}, "", "")
+    told = "\n1 PASS, 1 FAIL\n\nfor acsard.toml:\n[mcu]\nbaud_rate = 57600"
+    assert summary(found, "acsard.toml") == told
+    assert "nothing to change" in summary(report("sim", [RATE], {}, "", ""), "acsard.toml")
+
+
+def found(**keys: object) -> list[Finding]:
+    return [Finding(k, "PASS", keys={f"mcu.{k}": v}) for k, v in keys.items()]
+
+
+def test_only_what_differs_is_to_be_written() -> None:
+    findings = found(baud_rate=115200, trailing_comma=True, reply_period=0.0)
+    assert checkup_report.changes(findings, Config()) == {"mcu.trailing_comma": True}
+
+
+def test_longer_lines_are_not_advised_where_the_wire_has_no_room() -> None:
+    wanted = found(link_check="auto", encoder_counts=3200)
+    assert len(checkup_report.changes(wanted, Config())) == 2
+    slow = configured(Config(), baud_rate=57600)
+    assert checkup_report.changes(wanted, slow) == {"mcu.link_check": "auto"}
+    slower = configured(Config(), baud_rate=38400)
+    assert checkup_report.changes(wanted, slower) == {}
+
+
+def test_a_slow_wire_takes_the_rate_with_it() -> None:
+    keys = checkup_report.changes(found(baud_rate=9600, link_check="auto"), Config())
+    assert keys == {"mcu.baud_rate": 9600, "control.rate": "auto"}
+    config = checkup_report.applied(keys, Config())
+    assert config is not None
+    assert contradictions(config) == []
+
+
+def test_what_is_in_use_is_not_taken_away() -> None:
+    text = b'[mcu]\nlink_check = "require"\nencoder_counts = 3200\n'
+    keys = checkup_report.changes(found(baud_rate=38400, link_check="require", encoder_counts=3200),
+                          parse(text))  # fmt: skip
+    assert keys == {"mcu.baud_rate": 38400, "control.rate": "auto"}
+
+
+def test_a_value_that_no_key_takes_is_seen() -> None:
+    assert checkup_report.applied({"mcu.baud_rate": 300}, Config()) is None
+
+
+def test_a_port_is_written_that_a_board_answered_at() -> None:
+    assert checkup_report.changes(found(trailing_comma=True), Config(), "/dev/one") == {
+        "mcu.trailing_comma": True
+    }
+    answered = [Finding("baud rate", "PASS", keys={"mcu.baud_rate": 115200})]
+    assert checkup_report.changes(answered, Config(), "/dev/one") == {"mcu.port": "/dev/one"}

@@ -1,0 +1,203 @@
+"""Lost and damaged lines are counted, and the motors show the direction in which they are lost.
+
+A rate is given only for enough lines. No direction is stated if the motors cannot show it.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.checkup import dialect, encoder_counts, line_loss
+from acsard.checkup.board import Board
+from acsard.checkup.findings import Finding, StoppedError
+from acsard.config.settings import Config, SimConfig
+from tests.unit.checkup.robots import Checked, Nobody, Robot, check, configured
+
+
+def known(board: Board) -> None:
+    """Run the steps of the check that come before the count."""
+    for step in (dialect.baud, dialect.rate, dialect.check):
+        step(board)
+
+
+@pytest.mark.parametrize(
+    ("faults", "outcome", "share"),
+    [
+        (("plain_only",), "PASS", 0.0),
+        (("no_sample", "slow_reply"), "PASS", 0.0),
+        (("ftdi",), "PASS", 0.0),
+        (("sparse_replies",), "PASS", 0.0),
+        (("unprompted",), "PASS", 0.0),
+        (("lost_replies",), "FAIL", 0.2),
+        (("lost_commands", "plain_only"), "FAIL", 0.2),
+        (("lost_replies", "unprompted"), "FAIL", 0.2),
+        (("bit_errors",), "FAIL", 0.25),
+    ],
+)
+def test_lost_lines_are_counted_and_other_ways_of_answering_are_none(
+    faults: tuple[str, ...], outcome: str, share: float
+) -> None:
+    with Robot(*faults).board() as board:
+        known(board)
+        found = line_loss.finding(board)
+        assert found.verdict == outcome
+        assert board.lost == pytest.approx(share, abs=0.03)
+        assert bool(found.mend) is (outcome == "FAIL")
+
+
+@pytest.mark.parametrize(("every", "verdict"), [(25, "FAIL"), (40, "FAIL"), (70, "PASS")])
+@pytest.mark.parametrize("way", ["lose_reply", "lose_command"])
+def test_above_two_in_a_hundred_it_fails(way: str, every: int, verdict: str) -> None:
+    robot = Robot()
+    setattr(robot.mcu, way, every)
+    with robot.board() as board:
+        known(board)
+        assert line_loss.finding(board).verdict == verdict
+
+
+@pytest.mark.parametrize("baud", [9600, 19200])
+def test_a_slow_wire_loses_nothing(baud: int) -> None:
+    with Robot(config=configured(Config(), baud_rate=baud)).board() as board:
+        known(board)
+        assert (line_loss.finding(board).verdict, board.lost) == ("PASS", 0.0)
+
+
+def test_plain_lines_that_come_damaged_turn_no_motor() -> None:
+    class Noisy(Robot):
+        pieces = 0
+
+        def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+            got = super().listen(until_ns)
+            self.pieces += len(got)
+            return [(at, d[:9] + b"\xae" + d[10:] if self.pieces % 9 == 0 else d) for at, d in got]
+
+    robot = Noisy("plain_only")
+    with robot.board() as board:
+        known(board)
+        with pytest.raises(StoppedError) as end:
+            line_loss.finding(board)
+    assert "came damaged from the board, the last `" in end.value.finding.text
+    assert "ground" in end.value.finding.mend
+    assert robot.mcu.vehicle.angles == [0.0] * 4
+
+
+def test_silences_are_told_for_what_they_are() -> None:
+    with Robot("stalls=1:0.2").board() as board:
+        known(board)
+        found = line_loss.finding(board)
+    assert found.verdict == "WARN"
+    assert "silent for" in found.figure
+    assert "USB" in found.mend
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("fault", ["lost_replies", "lost_commands", "bit_errors"])
+def test_a_link_that_loses_lines_proposes_no_counts(fault: str) -> None:
+    checked = check(fault)
+    assert "lost lines" in checked.failed
+    assert checked["encoder counts"].verdict == "SKIPPED"
+    assert "mcu.encoder_counts" not in checked.changes
+
+
+def test_counts_are_measured_where_nothing_is_lost() -> None:
+    with Robot().board() as board:
+        known(board)
+        board.lost = line_loss.MOST
+        assert encoder_counts.finding(board, []).verdict == "SKIPPED"
+        board.identity = {"counts": "3200"}
+        assert encoder_counts.finding(board, []).keys == {"mcu.encoder_counts": 3200}
+        board.lost = 2 * line_loss.MOST
+        assert encoder_counts.finding(board, []).keys == {}
+
+
+ALL = [0, 1, 2, 3]
+
+
+def found(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
+    board.lost = lost
+    return line_loss.direction(board, Nobody(), motors)
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("firmware", ["no_sample", "plain_only", "comma_latched"])
+@pytest.mark.parametrize(
+    ("command", "reply", "figure", "mend"),
+    [
+        (5, 0, "0 back", "the computer's TX to the board's RX"),
+        (0, 5, "0 of", "the board's TX to the computer's RX"),
+        (4, 3, "", "the ground of board and computer first"),
+    ],
+)
+def test_the_way_is_told_by_what_the_motors_did(
+    firmware: str, command: int, reply: int, figure: str, mend: str
+) -> None:
+    robot = Robot(firmware, trailing_comma=firmware == "comma_latched")
+    robot.mcu.lose_command, robot.mcu.lose_reply = command, reply
+    checked = Checked(robot)
+    finding = checked["lost where"]
+    assert finding.verdict == "FAIL"
+    assert figure in finding.figure
+    assert mend in finding.mend
+    assert not checked.left_turning
+
+
+@pytest.mark.parametrize(
+    ("fault", "verdict"),
+    [("lost_commands", "FAIL"), ("lost_replies", "SKIPPED"), ("spaces", "PASS")],
+)
+def test_commands_lost_to_a_board_that_reports_by_its_own_clock_are_seen(
+    fault: str, verdict: str
+) -> None:
+    assert check("unprompted", fault, reply_period=0.1)["lost where"].verdict == verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("earlier", range(1, 5))
+def test_it_does_not_matter_which_of_the_lines_is_the_first_that_is_lost(earlier: int) -> None:
+    class Spoken(Robot):
+        def open(self, baud_rate: int) -> None:
+            super().open(baud_rate)
+            for _ in range(earlier):
+                self.mcu.receive(self.now_ns(), b"ap00.00,bp00.00,cp00.00,dp00.00\r\n")
+
+    checked = Checked(Spoken("unprompted", "lost_commands", reply_period=0.1))
+    assert checked["lost where"].verdict == "FAIL"
+
+
+@pytest.mark.parametrize(
+    ("lag", "per_turn"), [(0.0, 3200), (0.3, 3200), (1.0, 3200), (2.0, 3200), (0.05, 16)]
+)
+@pytest.mark.parametrize(
+    ("fault", "right"), [("lost_replies", "the board's TX"), ("lost_commands", "the computer's TX")]
+)
+def test_slow_motors_and_coarse_encoders_blame_no_wrong_way(
+    lag: float, per_turn: int, fault: str, right: str
+) -> None:
+    config = Config(sim=SimConfig(motor_time_constant=lag, encoder_counts=per_turn))
+    with Robot(fault, config=config).board() as board:
+        finding = found(board, ALL)
+        assert finding is not None
+        assert finding.verdict == "SKIPPED" or f"the lead from {right}" in finding.mend
+        assert not board.turning()
+
+
+def test_without_a_motor_that_turns_the_way_is_not_told() -> None:
+    with Robot("lost_replies").board() as board:
+        finding = found(board, [])
+    assert finding is not None
+    assert finding.verdict == "SKIPPED"
+
+
+def test_where_nothing_is_lost_nothing_is_turned() -> None:
+    robot = Robot()
+    with robot.board() as board:
+        assert found(board, ALL, line_loss.MOST) is None
+    assert robot.mcu.vehicle.angles == [0.0] * 4
+
+
+def test_no_pulse_feeds_a_motor_for_longer_than_the_watchdog_allows() -> None:
+    robot = Robot("lost_commands", "no_watchdog")
+    with robot.board() as board:
+        assert found(board, ALL) is not None
+        assert not board.turning()
+    assert not any(robot.later())
