@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -149,6 +151,37 @@ def test_every_second_that_was_synced_can_be_read_before_its_chunk_ends(
     writing.finish()
     assert len(chunks(path.read_bytes())) == 1
     assert numbers(path) == list(range(len(tape.taken)))
+
+
+SECTOR = 512
+"""Bytes that a disk writes at once."""
+
+
+def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
+    tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any sectors of a sync may reach the disk, also at the end of a chunk or of the file."""
+    path, cut, now = tmp_path / "part.mcap", tmp_path / "cut.mcap", tape.taken[0].inputs.now
+    monkeypatch.setattr("acsard.record.file.CHUNK_NS", 3 * NS_PER_S)
+    synced: list[bytes] = []
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(path.read_bytes()))
+    config = "\n".join(document(effective(Config())))
+    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config))
+    for at in range(0, len(tape.taken), BATCH):
+        batch = tape.taken[at : at + BATCH]
+        writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
+        writing.flush()
+    writing.finish()
+    assert len(chunks(synced[-1])) > 1
+    dice = random.Random(7)
+    for before, after in pairwise(synced[1:]):
+        path.write_bytes(before)
+        safe = numbers(path)
+        for _ in range(20):
+            old = before.ljust(len(after), b"\0")
+            sectors = range(0, dice.choice([len(before), len(after)]), SECTOR)
+            cut.write_bytes(b"".join(dice.choice([old, after])[at : at + SECTOR] for at in sectors))
+            assert numbers(cut)[: len(safe)] == safe
 
 
 def test_a_chunk_covers_about_ten_seconds_and_a_clock_that_is_set_ends_it(tmp_path: Path) -> None:
