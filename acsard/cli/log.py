@@ -129,7 +129,7 @@ def _bracketed(text: str) -> str:
 
 def _state(recording: Recording) -> str:
     """Describe the missing parts of a recording, once it has been read completely."""
-    damaged = f"{recording.damaged} damaged chunks are left out" if recording.damaged else ""
+    damaged = f"{recording.damaged} damaged places are left out" if recording.damaged else ""
     return _bracketed("; ".join(filter(None, [damaged, _ending(recording)])))
 
 

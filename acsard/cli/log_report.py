@@ -133,7 +133,7 @@ def _drawn(
             tell(step.inputs.now.wall_ns)
         course.step(step, outputs, robot)
         if course.over:
-            # Read the rest, so that the notes count every damaged chunk.
+            # Read the rest, so that the notes count every damaged place.
             deque(recording.messages(), maxlen=0)
             break
     if course.began is None:

@@ -113,7 +113,7 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 def _instants(data: bytes) -> list[Instant]:
     """Return the time of each step in a message."""
-    from acsard.record.batch import BatchError, decode
+    from acsard.record.rows import BatchError, decode
 
     try:
         return [step.inputs.now for step in decode(data)]

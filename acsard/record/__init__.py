@@ -2,13 +2,12 @@
 
 The pure modules:
 - `steps`: one step as a recording stores it.
-- `batch`, `layout`, `columns`: the encoding of many steps.
-- `plausible`: refuses a batch with values that no daemon records.
+- `rows`: the encoding of many steps; it refuses values that no daemon records.
 - `replay`: runs recorded inputs through `Robot.step` again and compares the outputs.
 - `merge`: applies another configuration to a recorded robot state.
 - `unpickling`: rebuilds a robot from bytes that a stranger may have written.
 - `story`: describes a recording in sentences.
-- `room`, `around`: decide which recordings are deleted and which are retained.
+- `room`: decides which recordings are deleted and which are retained.
 - `published`: rebuilds the messages that were published.
 - `table`: writes the lines of a CSV file.
 - `bag`: writes the `metadata.yaml` of a ROS bag.
@@ -16,7 +15,7 @@ The pure modules:
 The modules that do I/O:
 - `recorder`: takes steps from the control loop; `disk` writes them in a thread.
 - `directory`: bounds the directory of recordings.
-- `file`, `walk`, `closing`: write and read one MCAP file and its end.
+- `file`, `chunks`, `walk`, `closing`: write and read one MCAP file, its chunks and its end.
 - `recovery`: finishes a file that was cut off.
 - `state`: encodes a robot as bytes, and decodes it.
 - `replayed`: replays a file and describes the result.

@@ -18,11 +18,11 @@ from acsard import __version__
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
-from acsard.record.around import Around
-from acsard.record.batch import encode
 from acsard.record.directory import Ring, Run, leave
 from acsard.record.file import About, Writing
 from acsard.record.recovery import FULL
+from acsard.record.room import Around
+from acsard.record.rows import encode
 from acsard.record.steps import Start, Taken, runs
 from acsard.record.story import told
 from acsard.values import NS_PER_S, Event, Instant
@@ -73,8 +73,6 @@ class OnDisk:
         self._around = Around[Path]()
         self._number = self._began_ns = 0
         self._last = Instant(0, 0)
-        self._reason: str | None = None
-        """Status reason of the last step that was written to this file."""
         self._told = self._refused = False
         self._looked_back = False
         """True once the files of the previous run have been examined."""
@@ -148,10 +146,7 @@ class OnDisk:
         assert self._writing is not None
         for at in range(0, len(steps), BATCH):
             batch = steps[at : at + BATCH]
-            self._writing.add(
-                "steps", batch[0].inputs.now.wall_ns, encode(self._number, batch, self._reason)
-            )
-            self._reason = batch[-1].outputs.reason
+            self._writing.add("steps", batch[0].inputs.now.wall_ns, encode(self._number, batch))
             self._number += len(batch)
             self._handed += len(batch)
             self._last = batch[-1].inputs.now
@@ -175,7 +170,7 @@ class OnDisk:
             config="\n".join(document(effective(start.config))) + "\n",
         )
         self._writing, self._start = ring.begin(about), None
-        self._began_ns, self._reason = now.mono_ns, None
+        self._began_ns = now.mono_ns
         if self._cut_ns is not None:
             since_ns, self._cut_ns = now.wall_ns - self._cut_ns, None
             self._around.earlier_happened(now.mono_ns - max(0, since_ns))

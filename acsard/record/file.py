@@ -1,41 +1,58 @@
-"""One recording as an MCAP file: written chunk by chunk, and readable even if cut off or damaged.
+"""One recording as an MCAP file: written second by second, and readable if cut off or damaged.
 
 A file has four channels:
-- `steps`: batches of steps, as `batch.py` encodes them.
+- `steps`: batches of steps, as `rows.py` encodes them.
 - `events`: one event per message, in JSON.
 - `state`: a robot, as `state.py` writes it. It comes first if the file begins after the daemon.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
 A metadata record says which robot and which version recorded it, and an attachment holds its
-`acsard.toml`. A file that was cut off has no end. Its whole chunks can still be read, and `rewrite`
-makes a finished file of them.
+`acsard.toml`. The messages are in chunks of about ten seconds, which grow as `chunks.py` says. A
+file that was cut off has no end. Everything that was synced can still be read, and `rewrite` makes
+a finished file of it.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
 import msgspec
-from mcap.records import Attachment, Footer, Message, Metadata
-from mcap.writer import IndexType, Writer
+from mcap.data_stream import RecordBuilder
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
-from acsard.record.batch import first_of
+from acsard.record.chunks import GROWING, Growing, Message
 from acsard.record.closing import END, Closing, Ns, fields
-from acsard.record.layout import FORMAT
+from acsard.record.rows import FORMAT, first_of
 from acsard.record.steps import UnfinishedError, unfinished
 from acsard.record.story import NEWS, Told, summary
-from acsard.record.walk import walk
+from acsard.record.walk import MAGIC, walk
 from acsard.values import NS_PER_S
 
-CHUNK_BYTES = 32 * 1024
-"""Uncompressed size at which a chunk is written if no flush comes before."""
+CHUNK_NS = 10 * NS_PER_S
+"""Longest time that a chunk covers. More saves little space, and damage costs more."""
+
+CHUNK_BYTES = 1 << 20
+"""Uncompressed size at which a chunk ends. Ten seconds of driving have 160 000 bytes."""
 
 MODE = 0o640
 """Mode of a recording: the service's group may read it."""
@@ -43,9 +60,14 @@ MODE = 0o640
 Topic = Literal["steps", "events", "state", "unfinished"]
 
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-"""Channels in the order of their numbers, from 1. The first chunk defines the channels, but it
-may be damaged, so the reader relies on this order.
+"""Channels in the order of their numbers, from 1. The records that define the channels may be
+damaged, so the reader relies on this order.
 """
+
+NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
+
+EVENTS_SCHEMA = 1
+"""Number of the schema of the events. The other channels have none."""
 
 
 class About(Struct, frozen=True):
@@ -108,6 +130,16 @@ class Writing:
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
         self._gist = Gist(about)
+        self._indexes: list[McapRecord] = []
+        self._counts: Counter[int] = Counter()
+        self._first_ns, self._last_ns = 1 << 63, 0
+        self._chunks = 0
+        """Number of complete chunks."""
+        self._chunk: Growing | None = None
+        self._chunk_at: int | None = None
+        """Offset of the chunk's head in the file; None if nothing of it is written yet."""
+        self._waits = False
+        """True if the chunk has messages that are not in the file yet."""
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -118,25 +150,31 @@ class Writing:
     def _open(self, about: About) -> None:
         # The umask may have removed bits of the mode.
         os.fchmod(self._file.fileno(), self._mode)
-        self._writer = Writer(
-            self._file, CHUNK_BYTES, index_types=IndexType.ATTACHMENT | IndexType.METADATA
-        )
-        self._writer.start("acsard", f"acsard {about.version}")
+        self._file.write(MAGIC)
+        self._write(Header("acsard", f"acsard {about.version}"))
         meta = msgspec.to_builtins(about)
         del meta["config"]
-        self._writer.add_metadata("acsard", {key: str(value) for key, value in meta.items()})
-        self._writer.add_attachment(
-            about.wall_ns, about.wall_ns, "acsard.toml", "text/plain", about.config.encode()
-        )
-        schema = msgspec.json.encode(msgspec.json.schema(Told))
-        of_events = self._writer.register_schema("acsard.Told", "jsonschema", schema)
-        self._channels = {
-            topic: self._writer.register_channel(
-                topic, *(("json", of_events) if topic == "events" else (f"acsard-{topic}", 0))
-            )
-            for topic in CHANNELS
-        }
+        self._add_metadata("acsard", {key: str(value) for key, value in meta.items()})
+        self._add_attachment("acsard.toml", about.wall_ns, about.config.encode())
+        for record in _definitions():
+            self._write(record)
         self.flush()
+
+    def _write(self, record: McapRecord) -> tuple[int, int]:
+        """Write a record, and return its offset and its length."""
+        builder = RecordBuilder()
+        record.write(builder)
+        at = self._file.tell()
+        return at, self._file.write(builder.end())
+
+    def _add_metadata(self, name: str, content: dict[str, str]) -> None:
+        at, length = self._write(Metadata(name, content))
+        self._indexes.append(MetadataIndex(at, length, name))
+
+    def _add_attachment(self, name: str, wall_ns: int, data: bytes) -> None:
+        kind = "text/plain"
+        at, length = self._write(Attachment(wall_ns, wall_ns, name, kind, data))
+        self._indexes.append(AttachmentIndex(at, length, wall_ns, wall_ns, len(data), name, kind))
 
     @property
     def size(self) -> int:
@@ -144,9 +182,20 @@ class Writing:
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message. It reaches the file when its chunk is full, or by `flush`."""
+        """Add a message. It reaches the file by `flush`, or when its chunk ends."""
         self._gist.message(topic, wall_ns, data)
-        self._writer.add_message(self._channels[topic], max(0, wall_ns), data, max(0, wall_ns))
+        wall_ns = max(0, wall_ns)
+        chunk = self._chunk
+        if chunk is not None and (
+            chunk.size >= CHUNK_BYTES or abs(wall_ns - chunk.first_ns) >= CHUNK_NS
+        ):
+            self.end_chunk()
+        self._chunk = self._chunk or Growing()
+        self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
+        self._counts[NUMBERS[topic]] += 1
+        self._first_ns = min(self._first_ns, wall_ns)
+        self._last_ns = max(self._last_ns, wall_ns)
+        self._waits = True
 
     def event(self, told: Told) -> None:
         """Add an event, and take it for the summary."""
@@ -155,20 +204,66 @@ class Writing:
         self._gist.event(told)
 
     def flush(self) -> None:
-        """Write the messages added so far as a whole chunk, and sync it to the disk."""
-        self._writer.flush()
-        os.fsync(self._file.fileno())
+        """Write the messages added so far, so that each can be read, and sync them to the disk."""
+        if self._chunk is not None and self._waits:
+            self._put(self._chunk.take())
+        self._sync()
         # The disk accepts the data, but nobody can find a file without a name.
         if not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
-    def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
-        self._writer.add_metadata(END, fields(self._gist.closing(cut, why)))
-        self._writer.finish()
+    def _put(self, data: bytes) -> None:
+        """Write compressed bytes of the chunk, after its head if they are the first."""
+        if self._chunk_at is None:
+            self._chunk_at = self._file.tell()
+            self._file.write(GROWING)
+        self._file.write(data)
+        self._waits = False
+
+    def _sync(self) -> None:
         self._file.flush()
         os.fsync(self._file.fileno())
+
+    def end_chunk(self) -> None:
+        """End the chunk, if there is one. The next message begins another."""
+        if self._chunk is None:
+            return
+        last, head = self._chunk.end()
+        self._put(last)
+        end = self._file.tell()
+        assert self._chunk_at is not None
+        self._file.seek(self._chunk_at)
+        self._file.write(head)
+        self._file.seek(end)
+        self._chunk = self._chunk_at = None
+        self._chunks += 1
+
+    def finish(self, cut: str = "", why: str = "") -> None:
+        """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
+        self.end_chunk()
+        self._add_metadata(END, fields(self._gist.closing(cut, why)))
+        self._write(DataEnd(0))
+        summary_at = self._file.tell()
+        for record in (*_definitions(), self._statistics(), *self._indexes):
+            self._write(record)
+        # A checksum of 0 says that there is none.
+        self._write(Footer(summary_at, 0, 0))
+        self._file.write(MAGIC)
+        self._sync()
         self._file.close()
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=1,
+            channel_count=len(CHANNELS),
+            channel_message_counts=dict(self._counts),
+            chunk_count=self._chunks,
+            message_count=self._counts.total(),
+            message_start_time=self._first_ns if self._counts else 0,
+            message_end_time=self._last_ns,
+            metadata_count=2,
+            schema_count=1,
+        )
 
     def close(self) -> None:
         """Close the file without writing an end."""
@@ -177,6 +272,15 @@ class Writing:
         except OSError:
             # A disk that refuses to write does not take the rest of a buffer either.
             pass
+
+
+def _definitions() -> Iterator[McapRecord]:
+    """Yield the schema and the channels, as they are at the beginning and in the summary."""
+    schema = msgspec.json.encode(msgspec.json.schema(Told))
+    yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.Told")
+    for topic, number in NUMBERS.items():
+        encoding, of = ("json", EVENTS_SCHEMA) if topic == "events" else (f"acsard-{topic}", 0)
+        yield Channel(number, topic, encoding, {}, of)
 
 
 class Recording:
@@ -216,7 +320,7 @@ class Recording:
         """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
-        topics: dict[int, Topic] = dict(enumerate(CHANNELS, 1))
+        topics = {number: topic for topic, number in NUMBERS.items()}
         for found in walk(self._data):
             record = found.record
             if isinstance(record, Footer):
@@ -224,22 +328,23 @@ class Recording:
             elif isinstance(record, Metadata) and record.name == END:
                 self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
             self.damaged += found.damaged
-            for one in found.inside:
-                if isinstance(one, Message) and one.channel_id in topics:
-                    topic = topics[one.channel_id]
+            for channel, wall_ns, data in found.messages:
+                if channel in topics:
+                    topic = topics[channel]
                     if topic == "unfinished":
-                        self.unfinished = one.data
-                    yield topic, one.log_time, one.data
+                        self.unfinished = data
+                    yield topic, wall_ns, data
 
     def _about(self) -> About:
         found: dict[str, str] = {}
         config = None
-        for record, inside, _ in walk(self._data):
+        for place in walk(self._data):
+            record = place.record
             if isinstance(record, Metadata) and record.name == "acsard":
                 found = record.metadata
             elif isinstance(record, Attachment) and record.name == "acsard.toml":
                 config = record.data.decode(errors="replace")
-            elif inside:
+            elif place.messages:
                 break
         try:
             if config is None:

@@ -16,6 +16,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.host.errors import RecordingError
+from acsard.record.chunks import LAST_BLOCK
 from acsard.record.closing import END, Closing, fields
 from acsard.record.file import Gist, Recording, event_of, rewrite
 from acsard.record.walk import MAGIC, walk
@@ -24,7 +25,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a disk without room."""
 
 NOTHING_BYTES = 64 << 10
-"""A file above this size is more than a header and one chunk, so it held data, even if this
+"""A file above this size is more than a header and one second, so it held data, even if this
 version cannot read it.
 """
 
@@ -68,7 +69,7 @@ def _begins(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    return any(found.inside for found in walk(part.read_bytes()))
+    return any(found.messages for found in walk(part.read_bytes()))
 
 
 def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
@@ -87,10 +88,11 @@ def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 
 
 def _in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the end behind the last whole chunk, over the torn part.
+    """Write the end behind the last whole second, over the torn part.
 
-    Returns False if the disk has no room; then the file is as it was. No chunk is given up to gain
-    room: some disks give none back, and then all chunks would be lost.
+    A chunk that was cut gets its true head. Returns False if the disk has no room; then the file is
+    as it was. No second is given up to gain room: some disks give none back, and then all would be
+    lost.
     """
     gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -99,23 +101,28 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
             gist.event(event_of(recording, data))
     if recording.ended:
         return True
-    end = _end(gist.closing(cut))
-    before = part.read_bytes()
-    at = max((found.end for found in walk(before) if found.inside), default=0)
+    before, end = part.read_bytes(), _end(gist.closing(cut))
+    *_, chunk = (None, *[found.chunk for found in walk(before) if found.chunk and found.messages])
     # Another process has changed the file since it was read.
-    if not at:
+    if chunk is None:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+    puts = [(chunk.end, end)]
+    if not chunk.complete:
+        puts = [(chunk.end, LAST_BLOCK + end), (chunk.begin, chunk.head())]
     with part.open("r+b", buffering=0) as stream:
         try:
-            _put(stream, at, end)
+            for at, data in puts:
+                _put(stream, at, data)
         except OSError as error:
             with suppress(OSError):
                 stream.truncate(len(before))
-                _put(stream, at, before[at : at + len(end)])
+                for at, data in puts:
+                    _put(stream, at, before[at : at + len(data)])
             if error.errno not in FULL:
                 raise
             return False
-        stream.truncate(at + len(end))
+        at, data = puts[0]
+        stream.truncate(at + len(data))
         os.fsync(stream.fileno())
     return True
 

@@ -13,10 +13,10 @@ from acsard.config.validation import show
 from acsard.formatting import listed, many, printable
 from acsard.guard import Memory
 from acsard.host.errors import RecordingError
-from acsard.record.batch import BatchError, decode
 from acsard.record.file import Recording
 from acsard.record.merge import adopt
 from acsard.record.replay import Difference, Replay, Seen, Tally, fastest
+from acsard.record.rows import BatchError, decode
 from acsard.record.state import State, StateError, short, thaw
 from acsard.record.steps import MICRO, Step, UnfinishedError, unfinished
 from acsard.robot import Robot
@@ -66,16 +66,14 @@ def config_of(recording: Recording) -> Config:
 
 def steps(recording: Recording) -> Iterator[Step]:
     """Yield every step that can be read, in order. A gap shows in the steps' numbers."""
-    reason = ""
     for topic, _, data in recording.messages():
         if topic == "steps":
             try:
-                batch = decode(data, reason)
+                batch = decode(data)
             except BatchError:
                 recording.damaged += 1
                 continue
             yield from batch
-            reason = batch[-1].said.status[1] if batch else reason
 
 
 class Course:

@@ -1,6 +1,6 @@
 """One control step as a recording stores it: all of its inputs, and its outputs.
 
-Poses are stored in um and urad. A checksum covers every bit of all estimates. `batch.py` encodes
+Poses are stored in um and urad. A checksum covers every bit of all estimates. `rows.py` encodes
 many steps.
 """
 

@@ -1,23 +1,21 @@
 """Yields the records of an MCAP file one after the other, and skips damaged places.
 
-A chunk's length and end are known twice: from the head of its record and from its own content. A
-damaged head therefore costs nothing. If a chunk is damaged, or a record's length leads nowhere, the
-reader searches for the next sound chunk.
+If a chunk is damaged, or a record's length leads nowhere, the reader takes the chunk's first
+messages as far as they are whole, and searches for the next complete chunk.
 """
 
 from __future__ import annotations
 
 import io
-import re
 import struct
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Chunk, DataEnd, Footer, Header, McapRecord, Metadata
-from mcap.stream_reader import breakup_chunk
+from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metadata
 
+from acsard.record.chunks import Content, Message, content, places
 from acsard.record.closing import DAMAGE
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -25,12 +23,6 @@ MAGIC = b"\x89MCAP0\r\n"
 
 HEAD = struct.Struct("<BQ")
 """Head of a record: its opcode and the number of bytes after the head."""
-
-BEFORE = HEAD.size + 28
-"""Number of bytes in a chunk's record, with its head, before the name of its compression."""
-
-COMPRESSED = re.compile(rb"\x04\0\0\0zstd")
-"""The name of the compression in every recording, with its length."""
 
 READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.ATTACHMENT: Attachment.read,
@@ -49,64 +41,42 @@ class Found(NamedTuple):
 
     record: McapRecord | None
     """The record; None for a chunk and for damage."""
-    inside: list[McapRecord]
-    """Records in a chunk; empty otherwise."""
+    chunk: Content | None
+    """The chunk, as far as it is whole, or None."""
     end: int
     """Offset of the record's end in the file, bytes. After damage, reading goes on there."""
+    damaged: bool = False
+    """True for damage before other records. The end of a file that was cut is not damage."""
 
     @property
-    def damaged(self) -> bool:
-        return self.record is None and not self.inside
+    def messages(self) -> list[Message]:
+        """Messages of the chunk; empty for other records."""
+        return self.chunk.messages if self.chunk else []
 
 
 def walk(data: bytes) -> Iterator[Found]:
     """Yield the records up to the footer, or to the end of the data."""
-    at, stream = len(MAGIC), io.BytesIO(data)
+    at, stream, later = len(MAGIC), io.BytesIO(data), _Later(data)
     if not data.startswith(MAGIC):
         return
     while at + HEAD.size <= len(data):
         opcode, length = HEAD.unpack_from(data, at)
         claimed = at + HEAD.size + length
-        found = _chunk(data, stream, at, claimed) or _read(stream, at, opcode, claimed, len(data))
-        if found is None and opcode in OTHERS and claimed <= len(data):
+        chunk = content(data, at)
+        found = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
+        if chunk is not None and chunk.complete:
+            found = Found(None, chunk, chunk.end)
+        elif found is None and opcode in OTHERS and claimed <= len(data):
             at = claimed
             continue
         if found is None:
-            after = _next(data, stream, at + 1)
-            if after is None and (not opcode or claimed > len(data)):
-                return
-            found = Found(None, [], after or claimed)
+            after = later.chunk(at + 1)
+            cut = after is None and (not opcode or claimed > len(data))
+            found = Found(None, chunk, len(data) if cut else after or claimed, not cut)
         yield found
         if isinstance(found.record, Footer):
             return
         at = found.end
-
-
-def _chunk(data: bytes, stream: io.BytesIO, at: int, claimed: int) -> Found | None:
-    """Return the sound chunk whose record begins at `at`, even if its head is damaged, or None.
-
-    If the head and the content disagree about the chunk's end, the next sound chunk decides.
-    Compressed data decodes even if its recorded length is too great, and such a length would
-    otherwise swallow the records after it.
-    """
-    found = _sound(data, stream, at)
-    if found is None or found.end == claimed:
-        return found
-    after = _next(data, stream, at + 1)
-    if after is not None:
-        return found._replace(end=min(found.end, after))
-    return found._replace(end=claimed) if claimed < found.end == len(data) else found
-
-
-def _sound(data: bytes, stream: io.BytesIO, at: int) -> Found | None:
-    if data[at] != Opcode.CHUNK and not COMPRESSED.match(data, at + BEFORE):
-        return None
-    stream.seek(at + HEAD.size)
-    try:
-        inside = breakup_chunk(Chunk.read(ReadDataStream(stream)), validate_crc=True)
-    except DAMAGE:
-        return None
-    return Found(None, inside, stream.tell()) if inside else None
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
@@ -120,12 +90,31 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
     except DAMAGE:
         return None
     end = stream.tell()
-    return Found(record, [], end) if end < size or end == claimed else None
+    return Found(record, None, end) if end < size or end == claimed else None
 
 
-def _next(data: bytes, stream: io.BytesIO, begin: int) -> int | None:
-    """Return the offset of the next sound chunk, or None."""
-    for match in COMPRESSED.finditer(data, begin + BEFORE):
-        if _sound(data, stream, match.start() - BEFORE):
-            return match.start() - BEFORE
-    return None
+class _Later:
+    """Search for the next complete chunk. No place is searched twice."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._searched = 0
+        """Offset up to which no complete chunk begins, apart from those that were passed."""
+        self._found: int | None = None
+
+    def chunk(self, begin: int) -> int | None:
+        """Return the offset of the next complete chunk from `begin` on, or None.
+
+        `begin` never decreases.
+        """
+        if self._found is not None and self._found >= begin:
+            return self._found
+        self._found = None
+        for at in places(self._data, max(begin, self._searched)):
+            self._searched = at + 1
+            chunk = content(self._data, at)
+            if chunk is not None and chunk.complete and chunk.messages:
+                self._found = at
+                return at
+        self._searched = len(self._data)
+        return None

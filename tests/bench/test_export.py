@@ -19,8 +19,8 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.guard import Guard
-from acsard.record.batch import encode
 from acsard.record.file import About, Writing
+from acsard.record.rows import encode
 from acsard.record.steps import Taken
 from acsard.robot import Robot
 from acsard.values import Inputs, Instant, Outputs, Recording

@@ -60,7 +60,7 @@ def main() -> None:
         drive(world)
         path = HERE / f"{name}.mcap"
         path.unlink(missing_ok=True)
-        tape.write(path, config)
+        tape.write(path, config, apart=False)
         print(f"{path.name}: {path.stat().st_size} bytes, {len(tape.taken)} steps")
 
 

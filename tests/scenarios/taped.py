@@ -12,9 +12,9 @@ from acsard.config.parsing import effective
 from acsard.config.settings import Config
 from acsard.config.writing import document
 from acsard.guard import Guard
-from acsard.record.batch import decode, encode
 from acsard.record.file import About, Writing
 from acsard.record.replay import Replay
+from acsard.record.rows import decode, encode
 from acsard.record.state import freeze, thaw
 from acsard.record.steps import Step, Taken
 from acsard.record.story import told
@@ -65,8 +65,11 @@ class Tape:
         starts = range(first, len(self.taken), BATCH)
         return [s for at in starts for s in decode(encode(at, self.taken[at : at + BATCH]))]
 
-    def write(self, path: Path, config: Config, first: int = 0) -> None:
-        """Return the file that the daemon would have written, from the start or from a state."""
+    def write(self, path: Path, config: Config, first: int = 0, apart: bool = True) -> None:
+        """Write the file that the daemon would have written, from the start or from a state.
+
+        With `apart` each second has a chunk of its own, which the daemon does not do.
+        """
         now = self.taken[first].inputs.now
         text = "\n".join(document(effective(config))) + "\n"
         about = About(
@@ -83,12 +86,13 @@ class Tape:
             writing.add("state", now.wall_ns, self.states[first])
         for at in range(first, len(self.taken), BATCH):
             batch = self.taken[at : at + BATCH]
-            before = self.taken[at - 1].outputs.reason if at else None
-            writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch, before))
+            writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
             for _, outputs, _ in batch:
                 for event in outputs.events:
                     writing.event(told(event, outputs.now.wall_ns))
             writing.flush()
+            if apart:
+                writing.end_chunk()
         writing.finish()
 
 

@@ -147,13 +147,18 @@ def fill(where: Path, content: bytes, names: Iterator[str]) -> None:
 @contextmanager
 def records(where: Path, record: Path) -> Iterator[Daemon]:
     """Run a daemon that drives for a while, until a second of it is on the disk."""
+    before = set(record.glob("*.part"))
+
+    def sizes() -> list[int]:
+        return [path.stat().st_size for path in set(record.glob("*.part")) - before]
+
     with (
         Daemon(where, words=["--record", str(record)]) as daemon,
         Bus(daemon.endpoint) as bus,
     ):
         bus.linked()
         with bus.commanding(0.3):
-            until(lambda: sum(p.stat().st_size for p in record.glob("*.part")) > 9000, 30.0, "it")
+            until(lambda: any(size > 9000 for size in sizes()), 30.0, "it")
         assert bus.state()["recording"] == ""
         yield daemon
 

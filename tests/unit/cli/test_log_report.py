@@ -16,9 +16,11 @@ from acsard.cli import main
 from acsard.record.file import Recording
 from acsard.record.replayed import steps
 from acsard.record.steps import MICRO
+from tests.scenarios.taped import chunks
 from tests.unit.report.seen import column
 
-QUIET = Path(__file__).parents[2] / "recordings" / "quiet.mcap"
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+QUIET = RECORDINGS / "quiet.mcap"
 
 
 def report(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
@@ -114,15 +116,16 @@ def test_what_is_damaged_is_left_out_and_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bad, new = tmp_path / "bad.mcap", tmp_path / "bad.html"
-    data = bytearray(QUIET.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 20] = bytes(20)
+    data = bytearray((RECORDINGS / "faults.mcap").read_bytes())
+    (begin, end), _ = chunks(data)
+    data[(begin + end) // 2 : (begin + end) // 2 + 20] = bytes(20)
     bad.write_bytes(data)
     code, _, err = report(capsys, bad, new)
     assert code == 0
-    assert "1 damaged chunks are left out" in err
+    assert "1 damaged places are left out" in err
     assert "steps are missing" in err
     text = new.read_text(encoding="utf-8")
-    assert "1 damaged chunks are left out" in text
+    assert "1 damaged places are left out" in text
     assert "steps are missing" in text
 
 

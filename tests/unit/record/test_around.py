@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.record.around import Around
-from acsard.record.room import AROUND_NS, Kind
+from acsard.record.room import AROUND_NS, Around, Kind
 
 
 def kind(around: Around[str]) -> Kind:

@@ -21,7 +21,6 @@ from msgspec.structs import replace
 from acsard.config.settings import Config, RecordConfig
 from acsard.incoming.commands import Arrival
 from acsard.mcu.gate import Offered
-from acsard.record import around, disk
 from acsard.record import recorder as module
 from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import KEPT, Ring, listed

@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from acsard.config.settings import Config
+from acsard.record.chunks import GROWING, LAST_BLOCK
 from acsard.record.closing import closing
 from acsard.record.file import Recording
 from acsard.record.recovery import NOTHING_BYTES, recover
@@ -27,6 +28,17 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     world.run(0.5)
     tape.write(path, Config())
     return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def growing(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A file whose only chunk still grows, as a crash leaves it."""
+    tape, path = Tape(), tmp_path_factory.mktemp("record") / "part.mcap"
+    World(recorder=tape).drive(0.5, 0.2, seconds=8.0)
+    tape.write(path, Config(), apart=False)
+    data = path.read_bytes()
+    ((begin, end),) = chunks(data)
+    return data[:begin] + GROWING + data[begin + len(GROWING) : end - len(LAST_BLOCK)]
 
 
 def messages(path: Path) -> list[tuple[str, int, bytes]]:
@@ -125,6 +137,31 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
     assert part.stat().st_size < NOTHING_BYTES
     assert "stays so" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
+    growing: bytes, room: bool, tmp_path: Path
+) -> None:
+    part, whole, dice, counts = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(6), set()
+    begin = growing.index(GROWING) + len(GROWING)
+    for number in range(30):
+        tail = dice.choice([b"", bytes(700), dice.randbytes(64)])
+        size = dice.randrange(begin, len(growing)) if number else len(growing)
+        part.write_bytes(growing[:size] + tail)
+        before = messages(part)
+        recover(part, whole, "crash", room)
+        counts.add(len(before))
+        if before:
+            recording, last = Recording(whole), closing(whole)
+            assert list(recording.messages()) == before
+            assert last is not None
+            assert (recording.whole, recording.cut, last.cut) == (True, "crash", "crash")
+            with whole.open("rb") as stream:
+                assert len(list(make_reader(stream).iter_messages())) == len(before)
+            whole.unlink()
+        assert list(tmp_path.iterdir()) == []
+    assert len(counts) > 5
 
 
 def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from acsard.config.settings import Config
-from acsard.record.batch import decode, encode
 from acsard.record.replay import Replay
+from acsard.record.rows import decode, encode
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 

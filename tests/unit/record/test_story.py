@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.config.settings import Config, McuConfig
-from acsard.record.batch import decode, encode
+from acsard.record.rows import decode, encode
 from acsard.record.story import Story, Told, summary
 from acsard.record.story import told as once
 from tests.scenarios.taped import Tape

@@ -1,7 +1,11 @@
-"""A batch of steps reproduces exactly its inputs and outputs."""
+"""A batch of steps reproduces exactly its inputs and outputs.
+
+A batch of steps that no daemon can have recorded is refused.
+"""
 
 from __future__ import annotations
 
+import math
 import random
 
 import msgspec
@@ -9,9 +13,10 @@ import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from acsard.config.settings import Config
-from acsard.record.batch import BatchError, decode, encode, first_of
+from acsard.record.rows import MOST_ROWS, Batch, BatchError, Rare, decode, encode, first_of
 from acsard.record.steps import Taken, microposes, status_of
 from acsard.robot import Robot
 from acsard.values import (
@@ -106,20 +111,11 @@ def test_what_went_out_comes_back() -> None:
             assert said.events == outputs.events
 
 
-def test_a_reason_that_stays_is_told_once_and_comes_back() -> None:
-    for at in range(100, len(TAKEN), 100):
-        reason, batch = TAKEN[at - 1].outputs.reason, TAKEN[at : at + 100]
-        brief = encode(at, batch, reason)
-        assert decode(brief, reason) == decode(encode(at, batch))
-        if batch[0].outputs.reason == reason:
-            assert len(brief) < len(encode(at, batch))
-
-
 def test_a_second_at_rest_takes_little() -> None:
     tape = Tape()
     World(recorder=tape).run(3.0)
     batch = tape.taken[-200:]
-    assert len(zstandard.compress(encode(0, batch))) < 3 * len(batch)
+    assert len(zstandard.compress(encode(0, batch))) < 5 * len(batch)
 
 
 def test_steps_at_one_time_come_back_in_their_order() -> None:
@@ -150,3 +146,71 @@ def test_the_number_of_the_first_step_is_read_alone() -> None:
     World(recorder=tape).run(0.5)
     assert [first_of(encode(number, tape.taken)) for number in (0, 7)] == [0, 7]
     assert first_of(b"none") is None
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    return msgspec.msgpack.decode(encode(0, TAKEN[:100]), type=Batch)
+
+
+def steps_of(batch: Batch) -> int:
+    return len(decode(msgspec.msgpack.encode(batch)))
+
+
+def with_rare(batch: Batch, rare: Rare) -> Batch:
+    """Return the batch with these values in its fourth step."""
+    rows = list(batch.rows)
+    rows[3] = replace(rows[3], rare=rare)
+    return replace(batch, rows=tuple(rows))
+
+
+@pytest.mark.parametrize("far", [1 << 62, (1 << 63) - 1, -(1 << 63)])
+@pytest.mark.parametrize("name", ["mono_ns", "offset_ns", "unit"])
+def test_a_time_that_no_clock_shows_is_refused(name: str, far: int, batch: Batch) -> None:
+    with pytest.raises(BatchError, match=r"no clock|>= 1"):
+        steps_of(replace(batch, **{name: far}))
+
+
+def test_a_read_of_an_age_that_no_clock_shows_is_refused(batch: Batch) -> None:
+    rows = list(batch.rows)
+    index = next(index for index, row in enumerate(rows) if row.reads)
+    read = rows[index].reads[0]
+    rows[index] = replace(rows[index], reads=(read._replace(age=(1 << 61) // batch.unit + 1),))
+    with pytest.raises(BatchError, match="no clock"):
+        steps_of(replace(batch, rows=tuple(rows)))
+
+
+@pytest.mark.parametrize(
+    "rare",
+    [
+        Rare(requests=(Request("set_pose", pose=Pose(0.0, math.inf)),)),
+        Rare(gyro=(GyroSample(1, None, -math.inf),)),
+        Rare(gyro=(GyroSample(1, None, 0.0, math.nan),)),
+    ],
+    ids=["pose", "rate", "variance"],
+)
+def test_a_number_that_no_step_gets_is_refused(rare: Rare, batch: Batch) -> None:
+    with pytest.raises(BatchError, match="no number"):
+        steps_of(with_rare(batch, rare))
+
+
+def test_a_command_that_the_robot_refuses_itself_is_recorded(batch: Batch) -> None:
+    rare = Rare(commands=(Command("app", Twist(math.nan, 0.0), 1),))
+    assert steps_of(with_rare(batch, rare)) == steps_of(batch) == 100
+
+
+def test_a_batch_without_what_every_first_step_has_or_of_too_many_steps_is_refused(
+    batch: Batch,
+) -> None:
+    assert batch.rows[0].rare is not None
+    for rows in ((), batch.rows[1:], (batch.rows[1],) * (MOST_ROWS + 1)):
+        with pytest.raises(BatchError):
+            steps_of(replace(batch, rows=rows))
+
+
+def test_a_line_in_whose_place_none_or_another_was_sent_comes_back() -> None:
+    tick = Inputs(Instant(5, 5), True, True)
+    outputs = Robot(Config()).step(tick)
+    sent = [None, b"", outputs.line, b"other"]
+    steps = decode(encode(0, [Taken(tick, outputs, left) for left in sent]))
+    assert [step.said.left for step in steps] == sent
