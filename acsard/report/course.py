@@ -17,8 +17,8 @@ from acsard.record.steps import MICRO, Step
 from acsard.record.story import Story, Told
 from acsard.report.commanders import LOOK_S, MOST_TEXT, Commanders
 from acsard.report.line import Lateness, Link
-from acsard.report.thinning import Band, Curve, Place, Track
 from acsard.robot import Robot
+from acsard.thinning import Band, Curve, Place, Track
 from acsard.values import NS_PER_S, Outputs, Twist
 
 MODES = ("fault", "stopped", "leaving", "waiting", "inactive", "driving", "ready")

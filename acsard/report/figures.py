@@ -27,7 +27,7 @@ from acsard.report.drawing import (
     sentence,
 )
 from acsard.report.path import path
-from acsard.report.thinning import Point, Span
+from acsard.thinning import Point, Span
 from acsard.values import WHEELS
 
 ROW_PX, ROOM_PX = 54, 68

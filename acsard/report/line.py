@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from acsard.report.thinning import Curve, Point
+from acsard.thinning import Curve, Point
 from acsard.values import NS_PER_S
 
 GOOD = "lines"

@@ -19,7 +19,7 @@ from acsard.report.drawing import (
     numbers,
     sentence,
 )
-from acsard.report.thinning import Place
+from acsard.thinning import Place
 
 HEADINGS = 12
 """Approximate number of heading arrows along a path."""
