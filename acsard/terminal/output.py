@@ -6,6 +6,7 @@ No text is read as markup. A stranger's text must be made printable before.
 from __future__ import annotations
 
 import io
+import os
 import sys
 from typing import TextIO
 
@@ -17,6 +18,11 @@ WHOLE = 10_000
 
 SENTENCES = 100
 """Width in characters of output that has sentences."""
+
+
+def has_screen() -> bool:
+    """Return whether standard output is a terminal that can show a whole screen."""
+    return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
 
 
 def show(*parts: RenderableType, most: int = WHOLE) -> None:
