@@ -36,7 +36,11 @@ def show(*parts: RenderableType, most: int = WHOLE) -> None:
 
 def show_whole(text: Text) -> None:
     """Print a text without wrapping it, so that a command in it can be copied from the terminal."""
-    _console(sys.stdout).print(text, soft_wrap=True)
+    console = _console(sys.stdout)
+    if console.is_terminal:
+        console.print(text, soft_wrap=True)
+    else:
+        print(text.plain, flush=True)
 
 
 def plain(*parts: RenderableType, width: int = WHOLE) -> str:
