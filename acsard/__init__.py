@@ -16,6 +16,7 @@ Where to look: one room per concern, in the order they may import each other (P:
 and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-imports` checks it.
 
     values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
+    thinning.py    P  curves, bands and paths in bounded memory: a day in a minute's room
     formatting.py  P  safe text, signed figures, durations, counts and lists, for every message
     config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
     mcu/           P  the serial line: codec, the check, link (is the MCU there?), the port
@@ -43,8 +44,8 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     door/          S  `acsard door`: where TLS ends, a process of its own
     client/        S  drive and follow a robot from Python: synchronous, asynchronous; driving is
                       one drive, and what `state` says becomes of it
-    report/        P  `acsard log report`: course (what a recording shows), thinning (a day in a
-                      minute's room), account (words), figures, page
+    report/        P  `acsard log report`: course (what a recording shows), account (words),
+                      figures, page
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
     foxglove/      S  `acsard foxglove`, outside too: hand (what of a viewer's messages goes),
                       drives, relay (what comes), settings, services, bridge (goes round)

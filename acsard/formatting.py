@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from itertools import accumulate
 
 
 def printable(text: str) -> str:
@@ -19,6 +20,15 @@ def printable(text: str) -> str:
 def lines(text: str) -> str:
     """Make a text of several lines printable, and keep its line breaks."""
     return "\n".join(map(printable, text.split("\n")))
+
+
+def printable_bytes(data: bytes, most: int, last: bool = False) -> str:
+    r"""Return the first or `last` bytes in `most` characters. An unprintable byte is `\x00`."""
+    shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
+    ends = accumulate(map(len, shown))
+    kept = [text for text, end in zip(shown, ends, strict=True) if end <= most]
+    cut = "…" if len(kept) < len(shown) else ""
+    return cut + "".join(reversed(kept)) if last else "".join(kept) + cut
 
 
 _ABOVE_ASCII = re.compile(r"[^\x00-\x7e]")

@@ -29,7 +29,7 @@ def screens(width: int) -> dict[str, list[str]]:
     """Return the lines of each screen, by verb."""
     robots = [test_roster.ROW, replace(test_roster.ROW, robot_id="robot2", state=WAITING)]
     return {
-        "drive": [text for _, text in lines(replace(test_teleop.SEEN, state=WAITING), width)],
+        "drive": [one.plain for one in lines(replace(test_teleop.SEEN, state=WAITING), width)],
         "top": lines_of(replace(SEEN, state=WAITING, before=BEFORE), width),
         "fleet": table(robots, width),
         "echo state --short": [short(STATE), short(WAITING)],

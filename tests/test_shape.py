@@ -18,8 +18,8 @@ from tests.each import each
 PACKAGE = Path(__file__).parents[1] / "acsard"
 
 PURE_ROOMS = (
-    "values", "formatting", "config", "mcu", "drive", "messages", "ros", "incoming", "robot",
-    "guard", "sim", "checkup", "calibration", "error_budget", "report",
+    "values", "formatting", "thinning", "config", "mcu", "drive", "messages", "ros", "incoming",
+    "robot", "guard", "sim", "checkup", "calibration", "error_budget", "report",
 )  # fmt: skip
 """Modules without a clock, I/O, asyncio, logging or randomness."""
 
@@ -67,7 +67,6 @@ PURE_AMONG_SHELLS = (
     "web.openapi",
     "web.socket_schemas",
     "web.told",
-    "web.trail",
     "web.who",
 )
 """Pure modules in rooms that do I/O."""

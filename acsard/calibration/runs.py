@@ -14,6 +14,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.table import FOUR, TWO, Floats, LogError, Table
+from acsard.formatting import many
 
 Complexes = npt.NDArray[np.complex128]
 Rows = npt.NDArray[np.int64]
@@ -100,13 +101,14 @@ def runs(table: Table) -> Log:
         of = f"run {name}: " if name else ""
         parts = _restarts(t, rows, columns)
         if len(parts) > 1:
-            notes.append(f"{of}the time begins anew {len(parts) - 1} times: as many runs more")
+            again = many(len(parts) - 1, "time")
+            notes.append(f"{of}the time begins anew {again}: as many runs more")
         _in_seconds(name, t, parts, columns)
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
         if len(parts) > whole:
             notes.append(
-                f"{of}the wheels are silent for over {PAUSE_S:g} s {len(parts) - whole} times: "
-                "as many runs more"
+                f"{of}the wheels are silent for over {PAUSE_S:g} s "
+                f"{many(len(parts) - whole, 'time')}: as many runs more"
             )
         for at, part in enumerate(parts):
             label = name or str(len(found) + 1)

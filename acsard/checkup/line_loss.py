@@ -18,7 +18,8 @@ from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, Reply
 from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.mcu.hearing import printable
+from acsard.formatting import printable_bytes
+from acsard.mcu.hearing import SHOWN
 from acsard.mcu.session import IDENTITY
 
 MOST = 0.02
@@ -74,7 +75,7 @@ def finding(board: Board) -> Finding:
     board.lost = count.share
     if board.lost <= MOST:
         return _sound(count, silent_s)
-    last = printable(board.others[-1]) if count.damaged else ""
+    last = printable_bytes(board.others[-1], SHOWN) if count.damaged else ""
     seen = {"share": board.lost, "lines": count.lines, "damaged": count.damaged, "last": last}
     if not count.damaged:
         return outcomes.find(

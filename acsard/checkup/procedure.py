@@ -26,6 +26,7 @@ from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
 from acsard.config.motion_rules import longest_reply
 from acsard.config.settings import Config
+from acsard.formatting import many
 
 LIFTED = "lifted"
 
@@ -106,7 +107,8 @@ def run(wire: Wire, operator: Operator, config: Config, tell: Tell) -> None:
         once(restarts.finding(config.mcu, seen))
     rest = [step for step in STEPS if step not in told]
     if why and rest:
-        tell(Finding(REST, "SKIPPED", f"{len(rest)} steps", f"{why}; not tried: {', '.join(rest)}"))
+        left = f"{why}; not tried: {', '.join(rest)}"
+        tell(Finding(REST, "SKIPPED", many(len(rest), "step"), left))
 
 
 class _Steps:

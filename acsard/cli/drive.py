@@ -71,11 +71,11 @@ def main(args: argparse.Namespace) -> int:
 
 def _show(ride: Ride) -> None:
     """Run full-screen if the terminal can do it, else line by line."""
-    dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
-    if dumb or not sys.stdout.isatty():
-        return _plain(ride)
+    from acsard.terminal.output import has_screen
     from acsard.top.terminal import drive
 
+    if not has_screen():
+        return _plain(ride)
     return drive(ride.step, ride.seen)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import sys
 import time
@@ -46,15 +45,15 @@ def main(args: argparse.Namespace) -> int:
     """Show the robots until the operator leaves, or print one table."""
     from acsard.bus.robot_discovery import ALL
     from acsard.client import connect
+    from acsard.terminal.output import has_screen
     from acsard.top import terminal
     from acsard.top.fleet import Fleet
 
     (endpoint, robot_id, tls), many = robots_address(args)
     ids = (many or (robot_id,)) if args.id else (ALL,)
-    dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         fleet = Fleet(robot, ids, endpoint)
-        if args.once or dumb or not sys.stdout.isatty():
+        if args.once or not has_screen():
             return _once(fleet, robot.like(ids[0]) if tls and ids != (ALL,) else None)
         terminal.roster(fleet)
     return int(Exit.OK)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
-from acsard.formatting import json_line, printable
+from acsard.formatting import json_line, many, printable
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -129,7 +129,8 @@ def _bracketed(text: str) -> str:
 
 def _state(recording: Recording) -> str:
     """Describe the missing parts of a recording, once it has been read completely."""
-    damaged = f"{recording.damaged} damaged places are left out" if recording.damaged else ""
+    places = many(recording.damaged, "damaged place is", "damaged places are")
+    damaged = f"{places} left out" if recording.damaged else ""
     return _bracketed("; ".join(filter(None, [damaged, _ending(recording)])))
 
 
@@ -221,7 +222,7 @@ def recover_one(args: argparse.Namespace) -> int:
             count = rewrite(recording, part)
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
-    print(f"{count} messages in {new}{_state(recording)}")
+    print(f"{many(count, 'message')} in {new}{_state(recording)}")
     return int(Exit.OK)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 
 from acsard.cli.common import add_bus, robot_address
 
@@ -25,14 +23,14 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Show the robot until the operator leaves, or print one screen."""
     from acsard.client import connect
+    from acsard.terminal.output import has_screen
     from acsard.top import terminal
     from acsard.top.feed import Feed
 
     endpoint, robot_id, tls = robot_address(args)
-    dumb = os.environ.get("TERM", "dumb") in ("dumb", "unknown", "")
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         feed = Feed(robot, endpoint, robot_id)
-        if args.once or dumb or not sys.stdout.isatty():
+        if args.once or not has_screen():
             print(terminal.once(feed))
         else:
             terminal.live(feed)

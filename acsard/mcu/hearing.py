@@ -11,6 +11,7 @@ from typing import Literal
 
 from msgspec import Struct
 
+from acsard.formatting import many, printable_bytes
 from acsard.mcu.codec import TOKENS
 from acsard.mcu.whose_silence import BUSY, HOST
 from acsard.values import NS_PER_S
@@ -90,15 +91,16 @@ class Heard(Struct):
         if not self.size:
             return "nothing at all heard"
         if not self.lines:
-            last = printable(self.last, last=True)
-            return f"{self.size} bytes heard but no line end, the last `{last}`"
+            last = printable_bytes(self.last, SHOWN, last=True)
+            return f"{many(self.size, 'byte')} heard but no line end, the last `{last}`"
         good, which = "none good", "last"
         if self.good:
             good, which = f"only {self.good} good", "last other"
             if self.good == self.lines:
                 good = "all good, but too few"
-        last = f", the {which} `{printable(self.last)}`" if self.good < self.lines else ""
-        return f"{self.lines} lines heard, {good}{last}"
+        bad = printable_bytes(self.last, SHOWN)
+        last = f", the {which} `{bad}`" if self.good < self.lines else ""
+        return f"{many(self.lines, 'line')} heard, {good}{last}"
 
     @property
     def words(self) -> str:
@@ -107,18 +109,6 @@ class Heard(Struct):
             return f"{HOST} {self.late_s:.2f} s, and heard too little for a link: {BUSY}"
         mend = f"{MENDS[self.looks]} `acsard mcu check` looks closer"
         return f"the microcontroller: {self.counted}; {mend}"
-
-
-def printable(data: bytes, last: bool = False) -> str:
-    r"""Return the first or `last` bytes as text. An unprintable byte looks like `\x00`."""
-    shown = [repr(bytes([byte]))[2:-1] for byte in (reversed(data) if last else data)]
-    room = 0
-    for count, text in enumerate(shown):
-        room += len(text)
-        if room > SHOWN:
-            kept = shown[:count]
-            return "…" + "".join(reversed(kept)) if last else "".join(kept) + "…"
-    return "".join(reversed(shown) if last else shown)
 
 
 class Hearing:

@@ -9,8 +9,8 @@ from collections.abc import Iterator, Sequence
 from acsard.config.settings import Source
 from acsard.drive.words import REFUSED, waiting
 from acsard.record.steps import Step
-from acsard.report.thinning import Band
 from acsard.robot import Robot
+from acsard.thinning import Band
 from acsard.values import NS_PER_S, Command, Outputs, Twist
 
 DOES = ("refused", "waits", "sends", "drives")

@@ -18,8 +18,8 @@ from acsard.mcu.contract import WATCHDOG_S
 from acsard.record.steps import MICRO, Step
 from acsard.record.story import Story, Told
 from acsard.report.commanders import LOOK_S, MOST_TEXT, Commanders
-from acsard.report.thinning import Band, Curve, Place, Point, Track
 from acsard.robot import Robot
+from acsard.thinning import Band, Curve, Place, Point, Track
 from acsard.values import NS_PER_S, Outputs, Twist
 
 GOOD = "lines"

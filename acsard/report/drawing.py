@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from acsard.formatting import printable
 from acsard.report.course import Course, Mark, Marks
-from acsard.report.thinning import Place
+from acsard.thinning import Place
 
 WISHED, LIMITED, MEASURED = "#e08600", "#2f7ed8", "#159a6b"
 

@@ -27,7 +27,7 @@ from acsard.report.drawing import (
     path,
     sentence,
 )
-from acsard.report.thinning import Point, Span
+from acsard.thinning import Point, Span
 from acsard.values import WHEELS
 
 ROW_PX, ROOM_PX = 54, 68

@@ -6,6 +6,7 @@ No text is read as markup. A stranger's text must be made printable before.
 from __future__ import annotations
 
 import io
+import os
 import sys
 from typing import TextIO
 
@@ -19,6 +20,11 @@ SENTENCES = 100
 """Width in characters of output that has sentences."""
 
 
+def has_screen() -> bool:
+    """Return whether standard output is a terminal that can show a whole screen."""
+    return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
+
+
 def show(*parts: RenderableType, most: int = WHOLE) -> None:
     """Print each part on lines of its own, with whole rows or at most `most` characters wide."""
     console = _console(sys.stdout)
@@ -30,7 +36,11 @@ def show(*parts: RenderableType, most: int = WHOLE) -> None:
 
 def show_whole(text: Text) -> None:
     """Print a text without wrapping it, so that a command in it can be copied from the terminal."""
-    _console(sys.stdout).print(text, soft_wrap=True)
+    console = _console(sys.stdout)
+    if console.is_terminal:
+        console.print(text, soft_wrap=True)
+    else:
+        print(text.plain, flush=True)
 
 
 def plain(*parts: RenderableType, width: int = WHOLE) -> str:

@@ -6,6 +6,17 @@ from msgspec import Struct
 
 from acsard.messages.schema import Info, RobotState
 
+MODES = {
+    "driving": "bold white on green",
+    "ready": "bold white on blue",
+    "waiting": "bold black on yellow",
+    "leaving": "bold black on yellow",
+    "inactive": "bold black on white",
+    "stopped": "bold white on red",
+    "fault": "bold white on red",
+}
+"""Colours of the modes, in the words of the library rich."""
+
 
 class Seen(Struct, frozen=True):
     """Everything that the screen shows; `before` is an earlier state, used to compute rates."""

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from textwrap import wrap
-from typing import Literal
+from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
 from acsard.formatting import printable
 from acsard.messages.schema import RobotState
 from acsard.messages.short import place, speeds
+from acsard.top.seen import MODES
 
-NARROWEST = 40
+if TYPE_CHECKING:
+    from rich.text import Text
 
 HELP = (
     " u  i  o    arrows drive, too",
@@ -24,8 +26,6 @@ HELP = (
     " q/z  both speeds +/- 10 %",
     " w/x  linear only    e/c  angular only",
 )
-
-Look = Literal["head", "mode", "news", "trouble", "help"]
 
 
 class Teleop(Struct, frozen=True):
@@ -47,30 +47,35 @@ class Teleop(Struct, frozen=True):
     """Whether the robot counts as silent, so that the shown data is old."""
 
 
-def lines(seen: Teleop, width: int, height: int | None = None) -> list[tuple[Look, str]]:
-    """Return the screen as lines of at most `width` characters.
+def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
+    """Return the screen as lines of at most `width` characters."""
+    from rich.text import Text
 
-    The first "mode" line starts with the mode.
-    """
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
-    shown: list[tuple[Look, str]] = [
-        ("head", head if len(head) <= width else head[: width - 1] + "…")
-    ]
+    shown = [Text(head, "bold")]
     if seen.silent or seen.state is None:
-        shown += _wrapped("trouble", silence(seen), width)
+        shown += _wrapped(silence(seen), width, "bold red")
     if seen.state is not None:
         state = seen.state
-        shown += _wrapped("mode", f" {printable(state.mode).upper()}  {reason(state)}", width)
+        mode = f" {printable(state.mode).upper()} "
+        told = _wrapped(f"{mode} {reason(state)}", width, "bold")
+        for first in told[:1]:
+            first.stylize(MODES.get(state.mode, "reverse"), 0, len(mode))
+        shown += told
         if seen.objection:
             words = f"your keys do not drive: {printable(seen.objection)}"
-            shown += _wrapped("trouble", words, width)
-        shown += [("news", line) for line in flow(measured(state), width)]
-    shown += [("news", line) for line in flow([f"keys ask {asked(seen)}"], width)]
-    below: list[tuple[Look, str]] = [("help", line[:width]) for line in HELP]
-    if height is None or len(shown) + len(below) < height:
-        return [*shown, ("help", ""), *below]
-    return [*shown[: max(1, height - len(below))], *below][:height]
+            shown += _wrapped(words, width, "bold red")
+        shown += map(Text, flow(measured(state), width))
+    shown += map(Text, flow([f"keys ask {asked(seen)}"], width))
+    below = [Text(line, "dim") for line in HELP]
+    if height is not None and len(shown) + len(below) >= height:
+        shown = [*shown[: max(1, height - len(below))], *below][:height]
+    else:
+        shown += [Text(), *below]
+    for line in shown:
+        line.truncate(width, overflow="ellipsis")
+    return shown
 
 
 def news(seen: Teleop, width: int) -> list[str]:
@@ -140,6 +145,7 @@ def _words(told: Sequence[str], width: int, figures: Sequence[str] = ()) -> list
     return [*lines, *(f"  {line}" for line in flow(figures, width - 2))]
 
 
-def _wrapped(look: Look, text: str, width: int) -> list[tuple[Look, str]]:
-    kept = wrap(text, width, subsequent_indent="  ", drop_whitespace=True, initial_indent="")
-    return [(look, one) for one in kept]
+def _wrapped(text: str, width: int, style: str) -> list[Text]:
+    from rich.text import Text  # here, so that `acsard --help` does not load rich for 20 ms
+
+    return [Text(line, style) for line in wrap(text, width, subsequent_indent="  ")]

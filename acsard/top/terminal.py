@@ -16,17 +16,9 @@ from acsard.top.fleet import Fleet
 from acsard.top.held import PERIOD_S, be_lenient, hold, steer
 from acsard.top.keys import keys
 from acsard.top.roster import table
-from acsard.top.teleop import Look, Teleop, lines
-from acsard.top.view import MODES, screen
+from acsard.top.teleop import Teleop, lines
+from acsard.top.view import screen
 from acsard.values import AcsardError
-
-LOOKS: dict[Look, str] = {
-    "head": "bold",
-    "mode": "bold",
-    "news": "",
-    "trouble": "bold red",
-    "help": "dim",
-}
 
 ONCE_S = 0.5
 """Time over which `--once` averages rates; a person waits for it."""
@@ -97,20 +89,7 @@ def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
 @contextmanager
 def _teleop(console: Console) -> Iterator[Callable[[Teleop], None]]:
     with _screen(console) as shown:
-        yield lambda seen: shown.update(teleop_screen(seen, *console.size), refresh=True)
-
-
-def teleop_screen(seen: Teleop, width: int, height: int) -> Group:
-    """Return the lines of `teleop.py` in colours."""
-    told = []
-    for look, text in lines(seen, width, height):
-        line = Text(text, LOOKS[look], no_wrap=True)
-        if look == "mode" and seen.state is not None and text.startswith(" "):
-            badge = len(seen.state.mode) + 2
-            line.stylize(MODES.get(seen.state.mode, "reverse"), 0, badge)
-        line.truncate(width, overflow="ellipsis")
-        told.append(line)
-    return Group(*told)
+        yield lambda seen: shown.update(Group(*lines(seen, *console.size)), refresh=True)
 
 
 def _screen(console: Console) -> Live:

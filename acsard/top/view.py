@@ -18,20 +18,10 @@ from acsard.messages.schema import RobotState
 from acsard.top import sections as beside
 from acsard.top import stacked
 from acsard.top.sections import WIDEST
-from acsard.top.seen import Seen
+from acsard.top.seen import MODES, Seen
 from acsard.top.text import clean, ends
 
 MOST_SOURCES = 32
-
-MODES = {
-    "driving": "bold white on green",
-    "ready": "bold white on blue",
-    "waiting": "bold black on yellow",
-    "leaving": "bold black on yellow",
-    "inactive": "bold black on white",
-    "stopped": "bold white on red",
-    "fault": "bold white on red",
-}
 
 
 def screen(seen: Seen, width: int, height: int | None = None) -> Group:

@@ -17,11 +17,11 @@ from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
+from acsard.thinning import Place, Track
 from acsard.values import NS_PER_S
 from acsard.web.counts import Counts
 from acsard.web.minute import Minute, Plotted
 from acsard.web.streams import UNREADY, Stream, Streams
-from acsard.web.trail import Trail
 
 LOOK_S = 0.1
 """Interval at which the newest state is checked."""
@@ -42,6 +42,12 @@ SILENT_S = 1.5
 WISHED_NS = 2 * NS_PER_S
 """Maximum age of a commanded twist in the plots."""
 
+PATH_S, PATH_POINTS, PATH_STEP_M = 600.0, 5000, 0.02
+"""Age and number of the points of a path at most, and the distance of two points at least."""
+
+JUMP_M = 1.0
+"""A longer step than any robot moves between two states, so the pose was set."""
+
 Connect = Callable[[], Client]
 """Opens the connection to the daemon or raises `UnreachableError`; it blocks."""
 
@@ -58,6 +64,10 @@ class About(Struct, frozen=True):
     state_hz: float
     recordings: str
     """Directory of the black box, "" if nothing is recorded."""
+
+
+def _path() -> Track:
+    return Track(PATH_POINTS, PATH_STEP_M, PATH_S, JUMP_M)
 
 
 class Robots:
@@ -78,7 +88,7 @@ class Robots:
         self.gone = f"no daemon answers at {address.endpoint} yet"
         """Reason why the robot is not reachable, in words; "" while it is."""
         self._connect, self._counts = connect, counts
-        self._trails = {"path": Trail(), "truth": Trail()}
+        self._paths = {"path": _path(), "truth": _path()}
         self._minute = Minute()
         self._states, self._poses = Decoder(RobotState), Decoder(PoseStamped)
         self._wishes = Decoder(TwistStamped)
@@ -100,7 +110,10 @@ class Robots:
 
     def way(self) -> dict[str, list[tuple[float, float]]]:
         """Return the robot's recent path in m, odom, and the true path of a simulator."""
-        return {name: trail.points() for name, trail in self._trails.items()}
+        return {
+            name: [(round(place.x, 3), round(place.y, 3)) for place in path.places()]
+            for name, path in self._paths.items()
+        }
 
     def minute(self) -> Plotted:
         """Return the plotted values of the last minute."""
@@ -151,8 +164,8 @@ class Robots:
             self._counts.add("unreadable")
             return
         if before is not None and state.counters.get("lines", 0) < before.counters.get("lines", 0):
-            self._trails = {name: Trail() for name in self._trails}  # the daemon was restarted
-        self._trails["path"].add(now_ns, state.x, state.y)
+            self._paths = {name: _path() for name in self._paths}  # the daemon was restarted
+        self._paths["path"].add(Place(now_ns / NS_PER_S, state.x, state.y, state.yaw))
         if self._minute.due(states.at_ns):
             self._minute.add(states.at_ns, state, self._wished(now_ns))
 
@@ -175,7 +188,7 @@ class Robots:
             at = self._poses.decode(*raw).pose.position
         except DecodeError:
             return
-        self._trails["truth"].add(now_ns, at.x, at.y)
+        self._paths["truth"].add(Place(now_ns / NS_PER_S, at.x, at.y, 0.0))
 
     async def _ask_again_and_again(self) -> None:
         while True:

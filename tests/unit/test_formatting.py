@@ -9,7 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.formatting import json_line, lasting, lines, listed, many, printable, rough, signed
+from acsard.formatting import (
+    json_line,
+    lasting,
+    lines,
+    listed,
+    many,
+    printable,
+    printable_bytes,
+    rough,
+    signed,
+)
+
+MOST = 64
 
 HOSTILE = "a\x1b]0;PWNED\x07b\x9b2J\u202ec\r\nd\te"
 
@@ -18,6 +30,21 @@ def test_nothing_that_a_terminal_obeys_is_left() -> None:
     assert printable(HOSTILE) == "a\ufffd]0;PWNED\ufffdb\ufffd2J\ufffdc  d e"
     assert lines(HOSTILE) == "a\ufffd]0;PWNED\ufffdb\ufffd2J\ufffdc \nd e"
     assert printable("Zürich, 8.5 °C") == "Zürich, 8.5 °C"
+
+
+@pytest.mark.parametrize("data", [bytes(range(256)), b"\r\n", "é→`".encode(), b""])
+def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
+    text = printable_bytes(data, MOST)
+    assert text.isprintable()
+    assert text.removesuffix("…").isascii()
+    assert len(text) <= MOST + 1
+    assert text.endswith("…") == (len(data) > MOST)
+
+
+def test_of_many_bytes_the_first_or_the_last_are_shown_and_none_in_half() -> None:
+    data = b"\xff" * MOST + b"end"
+    assert printable_bytes(data, MOST) == r"\xff" * (MOST // 4) + "…"
+    assert printable_bytes(data, MOST, last=True) == "…" + r"\xff" * ((MOST - 3) // 4) + "end"
 
 
 @given(st.text(alphabet=st.characters(exclude_categories=["Cs"], max_codepoint=0xFFFF)))

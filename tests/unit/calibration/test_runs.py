@@ -89,7 +89,7 @@ def test_a_pause_of_a_day_parts_two_drives() -> None:
     names, ends, notes = of(rows(0, 500) + rows(86_400, 300))
     assert names == ["1", "2"]
     assert ends == pytest.approx([4.99, 2.99])
-    assert any("silent for over 60 s 1 times" in note for note in notes)
+    assert any("silent for over 60 s 1 time:" in note for note in notes)
 
 
 def test_a_column_without_any_number_is_named() -> None:

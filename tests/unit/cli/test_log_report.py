@@ -122,10 +122,10 @@ def test_what_is_damaged_is_left_out_and_said(
     bad.write_bytes(data)
     code, _, err = report(capsys, bad, new)
     assert code == 0
-    assert "1 damaged places are left out" in err
+    assert "1 damaged place is left out" in err
     assert "steps are missing" in err
     text = new.read_text(encoding="utf-8")
-    assert "1 damaged places are left out" in text
+    assert "1 damaged place is left out" in text
     assert "steps are missing" in text
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.mcu.hearing import MENDS, PATIENCE_NS, SHOWN, Heard, Hearing, Look, printable
+from acsard.mcu.hearing import MENDS, PATIENCE_NS, Heard, Hearing, Look
 from acsard.mcu.lines import LineReader
 
 GOOD = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
@@ -42,21 +42,6 @@ def test_it_says_what_was_heard_how_that_looks_and_what_to_do(
     assert counted in found.counted
     assert found.words.startswith(f"the microcontroller: {found.counted}; {MENDS[looks]}")
     assert "`acsard mcu check`" in found.words
-
-
-@pytest.mark.parametrize("data", [bytes(range(256)), b"\r\n", "é→`".encode(), b""])
-def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
-    text = printable(data)
-    assert text.isprintable()
-    assert text.removesuffix("…").isascii()
-    assert len(text) <= SHOWN + 1
-    assert text.endswith("…") == (len(data) > SHOWN)
-
-
-def test_of_many_bytes_the_first_or_the_last_are_shown_and_none_in_half() -> None:
-    data = b"\xff" * SHOWN + b"end"
-    assert printable(data) == r"\xff" * (SHOWN // 4) + "…"
-    assert printable(data, last=True) == "…" + r"\xff" * ((SHOWN - 3) // 4) + "end"
 
 
 def test_it_is_told_after_three_seconds_and_again_only_when_it_looks_otherwise() -> None:

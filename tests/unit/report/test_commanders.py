@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.report.commanders import OTHERS
-from acsard.report.thinning import Span
+from acsard.thinning import Span
 from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two
 

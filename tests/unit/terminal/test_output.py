@@ -11,6 +11,8 @@ from rich.text import Text
 from acsard.terminal.output import plain, show, show_whole
 from acsard.terminal.tables import table
 
+COMMAND = "acsard set limits.linear_speed 0.8"
+
 ROWS = table([("odom", "1", "a long sentence " * 6), ("tf", "100", "short")], ("KEY", "N"), {1})
 
 
@@ -38,7 +40,7 @@ def test_a_pipe_gets_whole_rows_without_colours(
     monkeypatch.setenv("COLUMNS", "30")
     monkeypatch.setenv("FORCE_COLOR", "1")
     show(ROWS)
-    show_whole(Text("red " * 20, "red"))
+    show_whole(Text(COMMAND, "red"))
     text = capsys.readouterr().out
     assert "\x1b" not in text
     assert len(text.splitlines()) == 4
@@ -55,7 +57,7 @@ def test_a_terminal_wraps_sentences_in_its_width_but_no_row_of_a_table_and_no_co
         monkeypatch.setattr(sys, "stdout", stream)
         show("one two " * 10, table([(Text("mark", "red"), "")]), most=100)
         show(ROWS)
-        show_whole(Text("run this " * 6, "red"))
+        show_whole(Text(COMMAND, "red"))
         text = ""
         while text.count("\x1b[0m") < 2:
             text += os.read(ours, 4096).decode()
@@ -66,4 +68,4 @@ def test_a_terminal_wraps_sentences_in_its_width_but_no_row_of_a_table_and_no_co
         "\x1b[31mmark\x1b[0m",
     ]  # fmt: skip
     assert lines[4:7] == plain(ROWS).splitlines()
-    assert lines[7] == f"\x1b[31m{'run this ' * 6}\x1b[0m"
+    assert lines[7] == f"\x1b[31m{COMMAND}\x1b[0m"

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.drive.modes import Mode
+from acsard.top.seen import MODES
 from acsard.top.teleop import HELP, Teleop, lines, news, parting
 from tests.unit.top.screens import STATE
 
@@ -31,7 +32,7 @@ def told(lines: list[str]) -> str:
 
 
 def texts(seen: Teleop, width: int, height: int | None = 24) -> list[str]:
-    return [text for _, text in lines(seen, width, height)]
+    return [line.plain for line in lines(seen, width, height)]
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -45,6 +46,12 @@ def test_at_every_width_the_reason_is_whole_the_pose_has_units_and_the_help_is_t
     for told in (LONG, "WAITING", "x +1.500 m", "y -2.250 m", "yaw +57.3°", "m/s", "rad/s"):
         assert told in words
     assert shown[-len(HELP) :] == list(HELP)
+
+
+def test_only_the_mode_has_its_colour_and_not_the_reason_below_it() -> None:
+    shown = lines(of(mode="waiting", reason=LONG), 40)
+    coloured = [span for line in shown for span in line.spans if span.style == MODES["waiting"]]
+    assert [shown[1].plain[span.start : span.end] for span in coloured] == [" WAITING "]
 
 
 def test_the_screen_does_not_move_while_figures_change() -> None:

@@ -13,8 +13,7 @@ from rich.cells import cell_len
 from acsard.drive.modes import Mode
 from acsard.messages.schema import Figure, RobotState, SourceState, Spread, Time
 from acsard.runtime.latencies import NAMES
-from acsard.top.seen import Seen
-from acsard.top.view import MODES
+from acsard.top.seen import MODES, Seen
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
 ENOUGH = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"

@@ -1,13 +1,15 @@
-"""Containers that limit long series as they arrive, without losing a peak.
+"""Containers that limit curves, bands and paths as they arrive, without losing a peak; pure.
 
-Times are in s since the first step and never decrease. Each container holds a bounded number of
-entries. When it overflows, neighbouring entries are merged and the resolution is halved.
+Times are in s and never decrease. Each container holds a bounded number of entries. When it
+overflows, neighbouring entries are merged and the resolution is halved.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import NamedTuple
 
 MOST_BINS = 1500
@@ -164,16 +166,32 @@ class Place(NamedTuple):
 class Track:
     """A path, thinned so that each place of it is less than `stride` m from a kept one."""
 
-    def __init__(self, most: int = MOST_PLACES) -> None:
-        self._most, self._kept = most, list[Place]()
-        self.stride = FIRST_STRIDE
+    def __init__(
+        self,
+        most: int = MOST_PLACES,
+        stride: float = FIRST_STRIDE,
+        lasts: float = math.inf,
+        jump: float = math.inf,
+    ) -> None:
+        """Create an empty path.
+
+        A place that is `lasts` s older than the newest one is dropped. The path restarts after a
+        step of more than `jump` m.
+        """
+        self._most, self._lasts, self._jump = most, lasts, jump
+        self._kept = deque[Place]()
+        self.stride = stride
         self._last: Place | None = None
 
     def add(self, place: Place) -> None:
         """Append a place."""
+        kept, last = self._kept, self._last
         self._last = place
-        kept = self._kept
-        if kept and not place.new and not self._far(kept[-1], place):
+        if last is not None and _apart(last, place) > self._jump:
+            kept.clear()
+        while kept and place.t - kept[0].t > self._lasts:
+            kept.popleft()
+        if kept and not place.new and _apart(kept[-1], place) < self.stride:
             return
         kept.append(place)
         while len(kept) > self._most:
@@ -185,14 +203,15 @@ class Track:
         last = self._last
         return [*self._kept, *([last] if last and last != self._kept[-1] else [])]
 
-    def _far(self, one: Place, other: Place) -> bool:
-        return math.hypot(one.x - other.x, one.y - other.y) >= self.stride
-
-    def _wider(self, places: list[Place]) -> list[Place]:
-        found, broken = places[:1], False
-        for place in places[1:]:
+    def _wider(self, places: deque[Place]) -> deque[Place]:
+        found, broken = deque([places[0]]), False
+        for place in islice(places, 1, None):
             broken = broken or place.new
-            if self._far(found[-1], place):
+            if _apart(found[-1], place) >= self.stride:
                 found.append(place._replace(new=broken))
                 broken = False
         return found
+
+
+def _apart(one: Place, other: Place) -> float:
+    return math.hypot(one.x - other.x, one.y - other.y)

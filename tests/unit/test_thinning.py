@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import random
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.report.thinning import Band, Curve, Place, Point, Track
+from acsard.thinning import Band, Curve, Place, Point, Track
 
 
 def test_a_short_curve_is_kept_as_it_is() -> None:
@@ -109,3 +110,29 @@ def test_a_jump_of_the_pose_is_kept_as_one() -> None:
         track.add(Place(n / 100, n / 100 + (5.0 if n >= 500 else 0.0), 0.0, 0.0, new=n == 500))
     (jump,) = [place for place in track.places() if place.new]
     assert jump.x >= 10.0
+
+
+def test_a_robot_that_stands_is_one_place() -> None:
+    track = Track()
+    for n in range(1000):
+        track.add(Place(n / 10, 1.0, 2.0, 0.0))
+    assert {place[1:3] for place in track.places()} == {(1.0, 2.0)}
+    assert len(track.places()) <= 2
+
+
+def test_a_path_of_the_last_minutes_forgets_older_places() -> None:
+    track = Track(most=100, stride=0.02, lasts=10.0)
+    for n in range(1001):
+        track.add(Place(n / 10, n / 100, 0.0, 0.0))
+    places = track.places()
+    assert len(places) <= 101
+    assert places[0].t == pytest.approx(90.0, abs=0.5)
+    assert places[-1].t == 100.0
+
+
+def test_a_step_that_no_robot_drives_restarts_the_path() -> None:
+    track = Track(jump=1.0)
+    for n in range(10):
+        track.add(Place(n / 10, 0.1 * n, 0.0, 0.0))
+    track.add(Place(1.0, 50.0, 0.0, 0.0))
+    assert track.places() == [Place(1.0, 50.0, 0.0, 0.0)]
