@@ -70,7 +70,7 @@ PURE_AMONG_SHELLS = (
     "web.metrics",
     "web.minute",
     "web.openapi",
-    "web.socket_schemas",
+    "web.routes",
     "web.told",
     "web.trail",
     "web.who",

@@ -11,8 +11,8 @@ from typing import Any
 from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
+from acsard.web.answers import HEADERS, problem
 from acsard.web.counts import Counts
-from acsard.web.requests import HEADERS, problem
 from acsard.web.who import unmapped
 
 NO_HOST = "there is no `Host` in it: which name of this robot do you ask?"
