@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
+from pathlib import Path
+
+import pytest
 
 from acsard.bus.access import SERVICE_ROLES
-from acsard.messages.topics import SERVICES
+from acsard.messages.topics import SERVICES, row_of
+from acsard.values import ROLES, Role
 from acsard.web.app import ROUTES
+
+PAGE = (Path(__file__).parents[3] / "deploy/web/README.md").read_text()
 
 
 def test_each_method_of_a_path_has_one_row() -> None:
@@ -31,3 +38,26 @@ def test_a_parameter_is_one_part_of_a_path() -> None:
     for row in ROUTES:
         parts = [part for part in row.path.split("/") if "{" in part]
         assert parts == [f"{{{name}}}" for name in row.parameters], row.path
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_the_page_names_the_role_of_each_service_and_of_the_configuration(role: Role) -> None:
+    (row,) = re.findall(rf"^\| {role} \| .*$", PAGE, re.M)
+    told = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
+    assert told == {verb for verb, least in SERVICE_ROLES.items() if least == role}
+    assert ("and `set`, `set_pose`, `config`" in row) == (role == "maintainer")
+
+
+def named(cell: str) -> set[tuple[str, str]]:
+    """Return the method and the paths in the first cell of a line of the page's table."""
+    method = re.search("GET|POST", cell)
+    return {(method[0], path) for path in re.findall(r"(/\S+)`", cell)} if method else set()
+
+
+def test_the_page_has_a_row_for_each_path_that_programs_may_use() -> None:
+    table = PAGE.partition("| request | meaning |")[2].partition("Over the WebSocket")[0]
+    told = {one for line in table.splitlines() for one in named("".join(line.split("|")[1:2]))}
+    rows = {(row.method, row.path.replace("{name}", "NAME")) for row in ROUTES if row.summary}
+    of_the_bus = {one for one in rows if row_of(one[1].removeprefix("/api/")) is not None}
+    elsewhere = {("GET", "/api"), ("GET", "/report/NAME")}  # in a sentence, in another row
+    assert told - of_the_bus - {("GET", "/api/schema/Twist")} == rows - of_the_bus - elsewhere
