@@ -6,11 +6,8 @@ import re
 from collections import Counter
 from pathlib import Path
 
-import pytest
-
 from acsard.bus.access import SERVICE_ROLES
 from acsard.messages.topics import SERVICES, row_of
-from acsard.values import ROLES, Role
 from acsard.web.app import ROUTES
 
 PAGE = (Path(__file__).parents[3] / "deploy/web/README.md").read_text()
@@ -38,14 +35,6 @@ def test_a_parameter_is_one_part_of_a_path() -> None:
     for row in ROUTES:
         parts = [part for part in row.path.split("/") if "{" in part]
         assert parts == [f"{{{name}}}" for name in row.parameters], row.path
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_the_page_names_the_role_of_each_service_and_of_the_configuration(role: Role) -> None:
-    (row,) = re.findall(rf"^\| {role} \| .*$", PAGE, re.M)
-    told = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
-    assert told == {verb for verb, least in SERVICE_ROLES.items() if least == role}
-    assert ("and `set`, `set_pose`, `config`" in row) == (role == "maintainer")
 
 
 def named(cell: str) -> set[tuple[str, str]]:
