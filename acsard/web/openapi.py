@@ -145,7 +145,7 @@ def _answer(body: Body, refs: Refs) -> Described:
 
 def _schema(kind: Any, refs: Refs) -> Described:
     if isinstance(kind, str):
-        return _ref(kind) if kind in SCHEMAS else {}
+        return _ref(kind) if kind else {}
     return refs[kind]
 
 

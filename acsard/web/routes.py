@@ -14,6 +14,7 @@ from typing import Any, Literal
 from msgspec import Struct
 
 from acsard.bus.access import SERVICE_ROLES, least_role
+from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import TOPICS, VERBS, Topic
 from acsard.values import Role, Verb
 
@@ -56,7 +57,7 @@ class Body(Struct, frozen=True):
     what: str
     """Description for the OpenAPI document."""
     kind: Any = ""
-    """Its type, or the name of a message of the bus; any other name stands for any value."""
+    """Its type, or the name of a message of the bus; "" for any value."""
     media: str = JSON
     """Its media type; "" for an answer without a body."""
 
@@ -107,7 +108,7 @@ def values(handler: Handler) -> Iterator[Route]:
     """Yield the row of each key whose last value a program may request."""
     for topic in filter(asked, TOPICS):
         path = f"/api/{topic.key.replace('<Type>', '{type}')}"
-        gives = {200: Body("The last value.", topic.type)}
+        gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
         yield Route("GET", path, least_role(topic.key), handler, topic.note, gives=gives)
 
 
