@@ -49,8 +49,9 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
     foxglove/      S  `acsard foxglove`, outside too: hand (what of a viewer's messages goes),
                       drives, relay (what comes), settings, services, bridge (goes round)
-    web/           S  `acsard web`: the robot's page, a process of its own; a viewer per browser;
-                      guide has a check or calibration done, by errands (the command's words)
+    web/           S  `acsard web`: the robot's page, a process of its own; app has the table of its
+                      paths, which admission and openapi follow; a viewer per browser; guide has a
+                      check or calibration done, by errands (the command's words)
     doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines
     asking/        S  how a verb asks who stands beside the robot: at a terminal, by a program
     cli/           S  one verb per file

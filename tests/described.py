@@ -7,10 +7,12 @@ from typing import Any
 
 from jsonschema import Draft202012Validator
 
-from acsard.web.openapi import document
-from acsard.web.socket_schemas import FROM_ROBOT, GUIDED
+from acsard.web.app import ROUTES
+from acsard.web.openapi import FROM_ROBOT, GUIDED, document
 
-COMPONENTS = document("1")["components"]
+DOCUMENT = document("1", ROUTES)
+
+COMPONENTS = DOCUMENT["components"]
 
 SCHEMAS = COMPONENTS["schemas"]
 
@@ -31,6 +33,15 @@ FRAMES = _judges(SCHEMAS[FROM_ROBOT]["oneOf"])
 GUIDES = _judges(SCHEMAS[GUIDED]["properties"]["guide"]["oneOf"])
 
 _FRAME = _judge({"$ref": f"#/components/schemas/{FROM_ROBOT}"})
+
+
+def answers(path: str, method: str, status: int, media: str, body: Any) -> bool:
+    """Return whether the document describes this answer of a path."""
+    described = DOCUMENT["paths"][path][method]["responses"]
+    content = described.get(str(status), described["default"])["content"]
+    if media not in content:
+        return False
+    return media != "application/json" or bool(_judge(content[media]["schema"]).is_valid(body))
 
 
 def kinds(frames: Iterable[Any]) -> set[str]:

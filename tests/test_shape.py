@@ -65,7 +65,7 @@ PURE_AMONG_SHELLS = (
     "web.metrics",
     "web.minute",
     "web.openapi",
-    "web.socket_schemas",
+    "web.routes",
     "web.told",
     "web.who",
 )

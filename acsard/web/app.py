@@ -1,68 +1,76 @@
-"""The page's server as an aiohttp application: admission, routes and response headers.
+"""The page's server: what it answers on each path, and the table of all paths.
 
-Every request passes `_admit` first. `_admit` attaches the caller's identity (a `Who`) to the
-request before a handler sees it. Only the paths in `OPEN` and the page's own files are served
-without an identity, to any client that addresses the robot by one of its names.
+A request comes to a handler here after `Admission` has found its row in `ROUTES` and admitted the
+caller. A handler raises `RefusedError` for a request that is the caller's fault, which is counted,
+and `TroubleError` for one that cannot be fulfilled now.
 """
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+import asyncio
+import socket
+from gzip import decompress
 from pathlib import Path
+from typing import Annotated, Any
+from urllib.parse import parse_qsl
 
+import msgspec
 from aiohttp import web
-from msgspec.structs import replace
+from msgspec import Meta, Struct
 
-from acsard.host import clock
+from acsard import __version__
+from acsard.bus.access import least_role
+from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
+from acsard.messages.encodings import DecodeError
+from acsard.values import Role
+from acsard.web import metrics, openapi
+from acsard.web.admission import WHO, Admission, own_port, peer_of
+from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
 from acsard.web.fleet import Fleet
-from acsard.web.frames import MAX_BYTES
+from acsard.web.frames import MAX_BYTES, Begin
 from acsard.web.gate import Gate
-from acsard.web.guide import Guide
-from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS, Buckets, Seats
-from acsard.web.programs import READ_S, Programs, TroubleError
-from acsard.web.reports import Reports
-from acsard.web.requests import (
-    STATUS,
-    asked_of,
-    body_of,
-    keep_little,
-    own_address,
-    own_port,
-    peer_of,
-    problem,
-    secured,
-    sent,
-    takes_gzip,
-    token_posted,
-    tokens_shown,
-)
+from acsard.web.guide import Choices, Guide
+from acsard.web.limits import Seats
+from acsard.web.recordings import BlackBox, Recording
+from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
+from acsard.web.routes import FORM, JSON, Body, Route, services, values
+from acsard.web.settings import Setting, rows
+from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer
-from acsard.web.who import MAINTAINER, Reason, Refusal, Who, cookie_name, foreign, place
+from acsard.web.who import RefusedError, cookie_name
 
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+BODY_S = 5.0
+"""Time limit for a body of a few hundred bytes. A client that withholds its body occupies a
+connection."""
 
-OPEN = ("/", "/token", "/favicon.ico")
-"""Paths that are served without a token: a browser must load the page before it can send one."""
+SEND_BUFFER = 65536
+"""Size of the kernel's send buffer for one client. A larger buffer would deliver stale data."""
 
-UNHURRIED = ("/api/srv/stop", "/api/whoami", "/ws")
-"""Paths that are exempt from the request rate limit.
+DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
+"""HTTP status for each state of a report."""
 
-A stop must always go through. A page that reconnects must not be kept out by another program that
-uses the same token; `Seats` limits the number of connections instead.
-"""
+NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
 
-REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
-"""Refusal reason per HTTP status that aiohttp raises by itself. Every other status counts as
-`malformed`."""
 
-WHO: web.RequestKey[Who | None] = web.RequestKey("who", object)  # type: ignore[arg-type]
+class TokenForm(Struct, frozen=True):
+    """The token of an invitation."""
+
+    token: str
+
+
+class Caller(Struct, frozen=True):
+    """The role and the name of the caller."""
+
+    role: Role
+    name: str
+    full: Annotated[str, Meta(description='why another WebSocket has no room, or ""')]
 
 
 class Page:
@@ -81,46 +89,14 @@ class Page:
         guide: Guide,
         page: Path = PAGE,
     ) -> None:
-        """Build the routes.
-
-        `names` are the host names and addresses, in lower case, by which other machines reach the
-        robot.
-        """
+        """Make the application; `names` are those of `Admission`."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
-        self._guide = guide
-        self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
-        self._files, self._reports = Files(page), Reports()
-        self._programs = Programs(robots, calls, counts, self._reports)
-        self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
+        self._guide, self._counts, self._vault = guide, counts, vault
+        self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
         self._seats = Seats()
         self._viewers: set[Viewer] = set()
-        self.app = web.Application(middlewares=[self._admit], client_max_size=MAX_BYTES)
-        self.app.on_response_prepare.append(secured)
-        self.app.add_routes(
-            [
-                web.get("/", self._index),
-                web.get("/favicon.ico", self._icon),
-                web.get("/page/{name}", self._file),
-                web.get("/ws", self._socket),
-                web.post("/token", self._token),
-                web.get("/api", self._api),
-                web.get("/api/recordings", self._recordings),
-                web.get("/api/recordings/{name}", self._recording),
-                web.post("/api/recordings/{name}/report", self._draw),
-                web.get("/report/{name}", self._report),
-                web.get("/api/whoami", self._whoami),
-                web.get("/api/settings", self._settings),
-                web.get("/api/guide", self._guided),
-                web.post("/api/srv/{verb}", self._service),
-                web.get("/api/{key:.+}", self._value),
-                web.get("/metrics", self._metrics),
-            ]
-        )
-
-    @property
-    def viewers(self) -> int:
-        """Number of open WebSocket connections."""
-        return len(self._viewers)
+        self._admission = Admission(robots.id, names, vault, gate, counts)
+        self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
         """End the report and every connection; `Viewer.end` also stops a robot that a viewer is
@@ -147,103 +123,15 @@ class Page:
             if viewer.who.token and viewer.who.token not in counting:
                 viewer.end("your token has ended")
 
-    # Admission of requests.
-
-    @web.middleware
-    async def _admit(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._gate.spoke(request.transport)
-        asked = asked_of(request)
-        spot = place(asked, self._names | {own_address(request)})
-        if isinstance(spot, Refusal):
-            return self.refused(spot, asked.peer)
-        acts = request.method not in ("GET", "HEAD") or request.path == "/ws"
-        if acts or request.path.startswith(("/api", "/metrics", "/report")):
-            strange = foreign(asked)
-            if strange is not None:
-                return self.refused(strange, asked.peer)
-        here = replace(MAINTAINER, address=asked.peer)
-        try:
-            if request.path in OPEN or request.path.startswith("/page/"):
-                request[WHO] = here if spot == "here" else None
-            else:
-                shown = tokens_shown(request, self._robots.id)
-                who = here if spot == "here" else await self._known(asked.peer, shown)
-                if isinstance(who, Refusal):
-                    return self.refused(who, asked.peer)
-                if self._hurries(request, who):
-                    text = f"over {REQUESTS.hz:g} requests a second: /ws tells what changes"
-                    return self.refused(Refusal("too_fast", text), who.origin)
-                request[WHO] = who
-            return await handler(request)
-        except TimeoutError:
-            return problem(503, "the disk does not answer")
-        except TroubleError as trouble:
-            return problem(trouble.status, str(trouble))
-        except web.HTTPException as error:
-            if error.status < 400:
-                raise
-            known = request.get(WHO)
-            origin = asked.peer if known is None else known.origin
-            self._counts.refuse(REASONS.get(error.status, "malformed"), origin)
-            return problem(error.status, _WORDS.get(error.status, error.reason))
-
-    def _hurries(self, request: web.Request, who: Who) -> bool:
-        """Return whether the client exceeds its request rate.
-
-        Clients on the robot itself are exempt.
-        """
-        if not who.token or request.path in UNHURRIED:
-            return False
-        return not self._paces.take(who.token, clock.mono_ns())
-
-    async def _known(self, peer: str, shown: Sequence[str]) -> Who | Refusal:
-        """Return the owner of the first valid token in `shown`, or a refusal.
-
-        Raises `TimeoutError` if the disk does not answer within `READ_S`.
-        """
-        if not any(shown):
-            return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
-        who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
-        # A valid token is accepted even while guessing is throttled, so another client's wrong
-        # guesses lock nobody out.
-        if who is not None:
-            return replace(who, address=peer)
-        if not self._guesses.take(peer, clock.mono_ns()):
-            return Refusal("too_fast", "too many wrong tokens: wait a minute")
-        return Refusal(
-            "bad_token", "this token has ended, was revoked, is another robot's, or never was one"
-        )
-
-    def refused(self, why: Refusal, origin: str) -> web.Response:
-        """Count the refusal, log it under `origin`, and return the error response."""
-        self._counts.refuse(why.reason, origin)
-        return problem(STATUS.get(why.reason, 403), why.text)
-
-    async def _token(self, request: web.Request) -> web.StreamResponse:
-        """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
-        text, peer = await token_posted(request), peer_of(request)
-        if not request.secure:
-            return self.refused(Refusal("plain", "here you need no token"), peer)
-        who = await self._known(peer, [text])
-        if isinstance(who, Refusal):
-            return self.refused(who, peer)
-        left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
-        response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(
-            cookie_name(self._robots.id, own_port(request)), text, max_age=left_s, path="/",
-            secure=True, httponly=True, samesite="Strict",
-        )  # fmt: skip
-        return response
-
     # The page and its files.
 
-    async def _index(self, request: web.Request) -> web.StreamResponse:
+    async def index(self, request: web.Request) -> web.StreamResponse:
         return await self._send(request, "index.html")
 
-    async def _icon(self, request: web.Request) -> web.StreamResponse:
+    async def icon(self, request: web.Request) -> web.StreamResponse:
         return await self._send(request, "icon.svg")
 
-    async def _file(self, request: web.Request) -> web.StreamResponse:
+    async def file(self, request: web.Request) -> web.StreamResponse:
         return await self._send(request, request.match_info["name"])
 
     async def _send(self, request: web.Request, name: str) -> web.StreamResponse:
@@ -252,19 +140,31 @@ class Page:
             raise web.HTTPNotFound
         return sent(request, file)
 
-    async def _socket(self, request: web.Request) -> web.StreamResponse:
-        who, peer = _who(request), peer_of(request)
+    async def token(self, request: web.Request) -> web.StreamResponse:
+        """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
+        text = await _token_posted(request)
+        if not request.secure:
+            raise RefusedError("plain", "here you need no token")
+        who = await self._admission.owner(peer_of(request), [text])
+        left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
+        response = web.Response(status=303, headers={"Location": "/"})
+        response.set_cookie(
+            cookie_name(self._robots.id, own_port(request)), text, max_age=left_s, path="/",
+            secure=True, httponly=True, samesite="Strict",
+        )  # fmt: skip
+        return response
+
+    async def socket(self, request: web.Request) -> web.StreamResponse:
+        """Serve a WebSocket until it ends."""
+        who, peer = request[WHO], peer_of(request)
         if full := self._seats.enter(peer, who.token):
-            answer = self.refused(Refusal("too_many", full), who.origin)
-            # A client that retries in a loop must not keep its TCP connection either.
-            answer.force_close()
-            return answer
+            raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
                 max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
             )
             await served.prepare(request)
-            keep_little(request)
+            _limit_buffer(request)
             viewer = Viewer(
                 served, request, who, self._robots, self._hand, self._calls, self._fleet,
                 self._guide, self._counts,
@@ -280,53 +180,160 @@ class Page:
 
     # The interface for programs.
 
-    async def _api(self, request: web.Request) -> web.StreamResponse:
-        return self._programs.described()
+    async def api(self, request: web.Request) -> web.StreamResponse:
+        return web.Response(body=DOCUMENT, content_type=JSON)
 
-    async def _metrics(self, request: web.Request) -> web.StreamResponse:
-        return self._programs.metrics(self.viewers)
+    async def metrics(self, request: web.Request) -> web.StreamResponse:
+        robots, counts = self._robots, self._counts
+        body = metrics.text(
+            robots.id, robots.state, not robots.gone, len(self._viewers), counts.all(),
+            counts.refused(),
+        )  # fmt: skip
+        return web.Response(body=body.encode(), headers={"Content-Type": metrics.CONTENT_TYPE})
 
-    async def _whoami(self, request: web.Request) -> web.StreamResponse:
-        who = _who(request)
+    async def whoami(self, request: web.Request) -> web.StreamResponse:
+        who = request[WHO]
         # A browser does not report to its page why a WebSocket was refused, so `full` reports it
         # here.
         full = self._seats.missing(peer_of(request), who.token)
-        return web.json_response({"role": who.role, "name": who.name, "full": full})
+        return reply(Caller(who.role, who.name, full))
 
-    async def _settings(self, request: web.Request) -> web.StreamResponse:
-        return await self._programs.settings(_who(request))
+    async def value(self, request: web.Request) -> web.StreamResponse:
+        """Return the last value of a key."""
+        return reply(msgspec.Raw(await self._value(request.path.removeprefix("/api/"))))
 
-    async def _guided(self, request: web.Request) -> web.StreamResponse:
-        return await self._programs.guide(_who(request), self._guide)
+    async def settings(self, request: web.Request) -> web.StreamResponse:
+        """Return the settings that can be changed at run time, with their present values."""
+        return reply(rows(msgspec.json.decode(await self._value("config"))))
 
-    async def _value(self, request: web.Request) -> web.StreamResponse:
-        return await self._programs.value(_who(request), request.match_info["key"])
+    async def guide(self, request: web.Request) -> web.StreamResponse:
+        """Return the checks and calibrations that a maintainer may start."""
+        return reply(await self._guide.choices(simulated=self._robots.about.simulated))
 
-    async def _service(self, request: web.Request) -> web.StreamResponse:
-        body = await body_of(request)
-        return await self._programs.call(_who(request), request.match_info["verb"], body)
+    async def service(self, request: web.Request) -> web.StreamResponse:
+        """Call a service with the fields of a JSON object as its arguments."""
+        body = await _body_of(request)
+        try:
+            given = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise RefusedError("malformed", f"the body is to be a JSON object: {error}") from None
+        robot = given.pop("robot", "")
+        if not isinstance(robot, str):
+            text = "robot is to be the id of another robot, which may be stopped"
+            raise RefusedError("malformed", text)
+        verb = request.path.removeprefix("/api/srv/")
+        told = await self._calls.call(request[WHO], verb, given, robot)
+        return reply(told, 200 if told.success else 409)
 
-    async def _recordings(self, request: web.Request) -> web.StreamResponse:
-        return await self._programs.listed()
+    async def recordings(self, request: web.Request) -> web.StreamResponse:
+        return reply(await self._box.rows())
 
-    async def _recording(self, request: web.Request) -> web.StreamResponse:
-        return await self._programs.recording(_who(request), request.match_info["name"])
+    async def recording(self, request: web.Request) -> web.StreamResponse:
+        path, _ = await self._box.found(request.match_info["name"])
+        told = {"Content-Disposition": f'attachment; filename="{path.name}"'}
+        return web.FileResponse(path, headers=told | {"Content-Type": "application/octet-stream"})
 
-    async def _draw(self, request: web.Request) -> web.StreamResponse:
-        return await self._programs.draw(_who(request), request.match_info["name"])
+    async def draw(self, request: web.Request) -> web.StreamResponse:
+        """Return the progress of a recording's report, and start drawing it if needed."""
+        told = self._reports.ask(*await self._box.found(request.match_info["name"]))
+        return reply(told, DRAWN[told.report])
 
-    async def _report(self, request: web.Request) -> web.StreamResponse:
-        name, packed = request.match_info["name"], takes_gzip(request)
-        return await self._programs.report(_who(request), name, packed)
+    async def report(self, request: web.Request) -> web.StreamResponse:
+        """Return a drawn report as an HTML page in a sandboxed origin."""
+        name = request.match_info["name"]
+        body = self._reports.drawn(name)
+        if body is None:
+            text = f"it is not drawn: POST /api/recordings/{name}/report first"
+            raise RefusedError("path", text)
+        headers = {
+            "Content-Type": "text/html; charset=utf-8",
+            "Content-Security-Policy": POLICY,
+            "Vary": "Accept-Encoding",
+        }
+        if takes_gzip(request):
+            return web.Response(body=body, headers=headers | {"Content-Encoding": "gzip"})
+        return web.Response(body=await in_thread(lambda: decompress(body), None), headers=headers)
+
+    async def _value(self, key: str) -> bytes:
+        """Return the last value of a key as JSON."""
+        try:
+            return as_json(*await self._calls.get(self._robots.id, key))
+        except NoAnswerError as error:
+            raise TroubleError(504, str(error)) from None
+        except (MendableError, DecodeError, TimeoutError) as error:
+            raise TroubleError(503, str(error) or "no answer in time") from None
 
 
-def _who(request: web.Request) -> Who:
-    who = request[WHO]
-    assert who is not None, "it is not open to all"
-    return who
+async def _body_of(request: web.Request) -> bytes:
+    """Return the whole body; raise `HTTPRequestTimeout` if it does not arrive within `BODY_S`."""
+    try:
+        async with asyncio.timeout(BODY_S):
+            return await request.read()
+    except TimeoutError:
+        raise web.HTTPRequestTimeout(reason=f"no body came within {BODY_S:g} s") from None
 
 
-_WORDS = {
-    404: "there is no such thing here; GET /api lists what there is",
-    413: f"over {MAX_BYTES} bytes",
-}
+async def _token_posted(request: web.Request) -> str:
+    body = await _body_of(request)
+    try:
+        text = body.decode(request.charset or "utf-8")
+        if request.content_type == JSON:
+            return msgspec.json.decode(text, type=TokenForm).token
+        if request.content_type == FORM:
+            fields = dict(parse_qsl(text, errors="strict", max_num_fields=10))
+            return msgspec.convert(fields, TokenForm).token
+    except (msgspec.MsgspecError, ValueError, LookupError, RecursionError):
+        pass
+    raise RefusedError("malformed", NO_TOKEN)
+
+
+def _limit_buffer(request: web.Request) -> None:
+    at = None if request.transport is None else request.transport.get_extra_info("socket")
+    if at is not None:
+        at.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+
+
+ROUTES: tuple[Route, ...] = (
+    Route("GET", "/", None, Page.index),
+    Route("GET", "/favicon.ico", None, Page.icon),
+    Route("GET", "/page/{name}", None, Page.file),
+    Route("POST", "/token", None, Page.token,
+        "exchanges a token for a cookie that no script can read; by HTTPS only",
+        takes=TokenForm, forms=(JSON, FORM),
+        gives={303: Body("The token is valid. `Location` is the page.", media="")}),
+    Route("GET", "/ws", "viewer", Page.socket,
+        "a WebSocket with JSON as text in both directions: follows, drives, stops",
+        gives={101: Body("It is open.", media="")}, paced=False),
+    Route("GET", "/api", "viewer", Page.api, "this document", gives={200: Body("OpenAPI 3.1.")}),
+    Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
+        gives={200: Body("The caller.", Caller)}, paced=False),
+    Route("GET", "/api/settings", least_role("config"), Page.settings,
+        "the settings that srv/set takes: values, ranges, when each may change",
+        gives={200: Body("A list.", list[Setting])}),
+    Route("GET", "/api/guide", Begin.least, Page.guide,
+        "what `begin` on the WebSocket takes: ways to calibrate, ports to check",
+        gives={200: Body("The choices.", Choices)}),
+    Route("GET", "/api/recordings", "viewer", Page.recordings,
+        "the recordings of the black box, oldest first",
+        gives={200: Body("A list.", list[Recording])}),
+    Route("GET", "/api/recordings/{name}", "operator", Page.recording,
+        "one recording as a file",
+        gives={200: Body("MCAP.", media="application/octet-stream")}),
+    Route("POST", "/api/recordings/{name}/report", "operator", Page.draw,
+        "draws the report of a recording, or reports the progress; ask again until 200",
+        gives={200: Body("It is drawn, and at `href`.", ReportState),
+               202: Body("It is being drawn, or another one is.", ReportState),
+               503: Body("It cannot be drawn, and why.", ReportState)}),
+    Route("GET", "/report/{name}", "operator", Page.report,
+        "the report of a recording, once it is drawn",
+        gives={200: Body("A page.", str, "text/html")}),
+    *values(Page.value),
+    *services(Page.service),
+    Route("GET", "/metrics", "viewer", Page.metrics,
+        "state, counters and figures for Prometheus",
+        gives={200: Body("Text.", str, "text/plain")}),
+)  # fmt: skip
+"""Every path of the page."""
+
+DOCUMENT = msgspec.json.encode(openapi.document(__version__, ROUTES))
+"""The answer to `GET /api`."""

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from acsard.bus import robot_discovery
-from acsard.bus.access import MAY, SERVICE_ROLES
+from acsard.bus.access import SERVICE_ROLES
 from acsard.bus.address import require_id
 from acsard.client import Client
 from acsard.host.errors import MendableError, UsageError
@@ -18,9 +18,8 @@ from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError
 from acsard.messages.schema import ServiceReply
 from acsard.messages.topics import SERVICES
-from acsard.values import AcsardError
 from acsard.web.robots import Robots
-from acsard.web.who import Who
+from acsard.web.who import RefusedError, Who
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
 """Limits on concurrent requests of all viewers together. Stops have a separate limit; further stops
@@ -37,15 +36,6 @@ gets."""
 BUSY = "busy: too many questions at once; ask again"
 
 T = TypeVar("T")
-
-
-class RefusedError(AcsardError):
-    """A call that this role may not make, or a service that does not exist; the text says which."""
-
-    def __init__(self, text: str, role: bool) -> None:
-        super().__init__(text)
-        self.role = role
-        """True if the role is too low, False if the service or the robot id is invalid."""
 
 
 class Ending(NamedTuple):
@@ -185,12 +175,8 @@ class Stops:
 def require(who: Who, verb: str) -> None:
     """Raise `RefusedError` unless the service exists and the role of `who` may call it."""
     if verb not in SERVICES:
-        raise RefusedError(f"no service {verb!r}; there are {', '.join(SERVICES)}", role=False)
-    least = SERVICE_ROLES[verb]
-    if not who.may(least):
-        raise RefusedError(
-            f"{verb} is for who is at least {least}; you are {who.role}: {MAY[who.role]}", role=True
-        )
+        raise RefusedError("malformed", f"no service {verb!r}; there are {', '.join(SERVICES)}")
+    who.require(SERVICE_ROLES[verb], verb)
 
 
 def _require_stop(verb: str, robot: str) -> None:
@@ -198,12 +184,12 @@ def _require_stop(verb: str, robot: str) -> None:
     try:
         require_id(robot)
     except UsageError as error:
-        raise RefusedError(str(error), role=False) from None
+        raise RefusedError("malformed", str(error)) from None
     if verb != "stop":
         raise RefusedError(
+            "role",
             f"{robot} is not this page's robot: here it is seen and stopped; for {verb} open its "
             "own page",
-            role=True,
         )
 
 

@@ -8,13 +8,13 @@ whole.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import msgspec
 from msgspec import Meta, Struct
 
 from acsard.messages.signature import MOST
-from acsard.values import AcsardError
+from acsard.values import AcsardError, Role
 
 MAX_BYTES = 65536
 """Maximum size of one message; a command has about a hundred bytes."""
@@ -40,6 +40,14 @@ class FrameError(AcsardError):
 
 class _Frame(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all frames; it rejects unknown fields."""
+
+    least: ClassVar[Role] = "viewer"
+    """Least role that may send it. The role for a call depends on the service."""
+
+    @property
+    def kind(self) -> str:
+        """The field that identifies the frame, always the first one."""
+        return self.__struct_fields__[0]
 
 
 class Subscribe(_Frame, frozen=True):
@@ -70,6 +78,7 @@ class Command(_Frame, frozen=True):
     `stamp` is the time of the command in ms by the sender's own clock.
     """
 
+    least: ClassVar[Role] = "operator"
     cmd: Wish
     stamp: float
     steady: bool = False
@@ -104,6 +113,7 @@ class Ping(_Frame, frozen=True):
 class Begin(_Frame, frozen=True):
     """Check the board at `port`, or calibrate by a `way`; "" selects the default way."""
 
+    least: ClassVar[Role] = "maintainer"  # both turn wheels and write configuration files
     begin: Literal["check", "calibrate"]
     port: Device = ""
     way: Short = ""
@@ -126,16 +136,7 @@ class Press(_Frame, frozen=True):
 
 Frame = Subscribe | Unsubscribe | Command | Call | Ping | Begin | Reply | Press
 
-KINDS: dict[str, type[Frame]] = {
-    "subscribe": Subscribe,
-    "unsubscribe": Unsubscribe,
-    "cmd": Command,
-    "call": Call,
-    "ping": Ping,
-    "begin": Begin,
-    "reply": Reply,
-    "press": Press,
-}
+KINDS: dict[str, type[Frame]] = {kind.__struct_fields__[0]: kind for kind in get_args(Frame)}
 """The frame type for each field that identifies one."""
 
 _heads = msgspec.json.Decoder(dict[str, msgspec.Raw])

@@ -1,13 +1,20 @@
-"""Limits TCP connections: their number, and the time until the first request.
+"""Handles connections whose client sends no request, so that `admission.py` has none to refuse.
 
-The application refuses a request or a WebSocket. This module handles clients that never send one.
+It limits the number of TCP connections and the time until the first request. It also answers bytes
+that are not an HTTP request with words, and counts them. aiohttp alone would answer with a bare
+line, and log a traceback for each.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
+from aiohttp import web
+from aiohttp.web_protocol import RequestHandler
+
+from acsard.web.answers import HEADERS, problem
 from acsard.web.counts import Counts
 from acsard.web.limits import Places
 from acsard.web.who import unmapped
@@ -18,6 +25,13 @@ browser opens six in addition to its WebSocket."""
 
 REQUEST_S = 10.0
 """Time limit for the head of the first request; the connection is cut after that."""
+
+NO_HOST = "there is no `Host` in it: which name of this robot do you ask?"
+
+NO_REQUEST = "that is no HTTP request"
+
+MISSING = "Missing 'Host'"
+"""Start of aiohttp's message for a missing `Host` header."""
 
 Factory = Callable[[], asyncio.Protocol]
 
@@ -106,3 +120,33 @@ class _Door(asyncio.Protocol):
         self._places.leave(self._peer)
         self._gate.closed(self._transport)
         self._inner.connection_lost(error)
+
+
+class Reader(RequestHandler):
+    """Protocol handler of one connection."""
+
+    def __init__(self, counts: Counts, server: Any) -> None:
+        """Create a handler for `server`, which is the server of the application's runner."""
+        super().__init__(server, loop=server._loop, **server._kwargs)
+        self._counted = counts
+
+    def handle_error(
+        self,
+        request: web.BaseRequest,
+        status: int = 500,
+        exc: BaseException | None = None,
+        message: str | None = None,
+    ) -> web.StreamResponse:
+        """Answer unreadable bytes.
+
+        Errors of the application (status 500 and above) stay with aiohttp.
+        """
+        if status >= 500:
+            return super().handle_error(request, status, exc, message)
+        nameless = (message or "").startswith(MISSING)
+        peer = unmapped(request.remote or "")
+        self._counted.refuse("host" if nameless else "malformed", peer)
+        response = problem(status, NO_HOST if nameless else NO_REQUEST)
+        response.headers.update(HEADERS)
+        response.force_close()
+        return response

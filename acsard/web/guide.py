@@ -10,6 +10,7 @@ reply goes to the open question once, or is refused.
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -22,7 +23,6 @@ from acsard.host import clock
 from acsard.host.errors import WORDS, Exit
 from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S
-from acsard.web.boards import NO_DEVICE, Board, boards
 from acsard.web.calls import Ending
 from acsard.web.errands import Reach, words
 from acsard.web.frames import Begin, FrameError, Press, Reply
@@ -49,7 +49,22 @@ CLOSING_S = 2.0
 
 BOARDS_S = 5.0
 
+SIMULATOR = "sim"
+
+NO_DEVICE = (
+    "No serial port is seen from here. Is the board plugged in? As a service the page has no "
+    "device: then at the robot `sudo systemctl stop acsard`, and `acsard mcu check` in a terminal."
+)
+
+
 Say = Callable[[Guided], None]
+
+
+class Board(Struct, frozen=True):
+    """A serial port and a description of the device behind it."""
+
+    port: str
+    what: str
 
 
 class Choices(Struct, frozen=True):
@@ -192,6 +207,28 @@ class Guide:
     def _tell_all(self) -> None:
         for viewer, say in self._viewers.items():
             say(self._errand.about(viewer) if self._errand else Guided(Running("")))
+
+
+def boards(configured: str) -> list[Board]:
+    """Return the configured port first, then the ports with a device, then the simulator.
+
+    This scans the serial devices and the processes that hold them, so call it in a thread.
+    """
+    found: dict[str, str] = {}
+    for device in serial_devices():
+        name = device.names[0] if device.names else device.device
+        own = configured in (device.device, *device.names)
+        told = [device.board or device.description, "configured" if own else ""]
+        told += [f"held by {holder.name} (process {holder.pid})" for holder in device.holders]
+        found[configured if own else name] = ", ".join(filter(None, told))
+    if configured != SIMULATOR and configured not in found:
+        there = "" if os.path.exists(configured) else ", not there now"
+        found = {configured: f"configured{there}", **found}
+    found[SIMULATOR] = "the simulator: nothing real moves"
+    # The configured port comes first: a check that is started without looking at the list must run
+    # on the robot that the operator sees, because wheels turn.
+    ports = sorted(found, key=lambda port: port != configured)
+    return [Board(port, found[port]) for port in ports]
 
 
 class _Errand:

@@ -1,65 +1,163 @@
 """The page's interface for programs as an OpenAPI 3.1 document. This module is pure.
 
-The document is generated from the table of topics, from the schemas that `schema/<Type>` answers
-with, and from the frames of the WebSocket. A new key or field there appears in the document by
-itself.
+The paths, their permissions and their bodies come from the table of routes. The schemas come from
+msgspec for the page's own messages, and from `json_schema.SCHEMAS` for those of the bus. A row, a
+key or a field that is new there appears in the document by itself.
 """
 
 from __future__ import annotations
 
-import re
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any
 
-from acsard.bus.access import SERVICE_ROLES, least_role
+import msgspec
+from msgspec import Meta, Struct
+
 from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.topics import SERVICES, TOPICS, Topic, service_key
-from acsard.web import socket_schemas
-from acsard.web.socket_schemas import FROM_ROBOT, TO_ROBOT
+from acsard.messages.topics import IMU, PUBLISHED
+from acsard.web import lines, told
+from acsard.web.frames import KINDS
+from acsard.web.routes import Body, Problem, Route
 
 Described = dict[str, Any]
 
-PLAIN = re.compile(r"[A-Za-z0-9_/-]{1,80}\Z")
-"""Pattern of a key without wildcards."""
+Refs = dict[Any, Described]
+"""A reference to the schema of each type."""
 
-NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
-"""Topics without a value that this interface can return."""
+TO_ROBOT, FROM_ROBOT = "ToRobot", "FromRobot"
+"""Names of the schemas of all messages that the WebSocket accepts, and of all that it sends."""
 
-PAYLOADS = {"set": "Settings", "set_pose": "SetPose", "clear": "Release", "activate": "Release"}
+VALUE = "Value."
+"""Prefix of the schema name of a key's message."""
+
+GUIDED = "Guided"
+
+SENT = (
+    told.Hello, told.Way, told.LastMinute, told.Answer, told.Rows, told.Pong, told.Refused,
+    told.Gone,
+)  # fmt: skip
+
+LINES = (
+    told.Running, told.Ended, lines.Subject, lines.Told, lines.Doing, lines.Progress,
+    lines.Question, lines.Found, lines.Result,
+)  # fmt: skip
+"""Types of the content of `guide`."""
+
+KEYS = {topic.key: topic.type for topic in PUBLISHED} | {IMU: "Imu"}
+"""Type of each key that can be subscribed to."""
 
 
-def asked(topic: Topic) -> bool:
-    """Return whether the topic has a value that a program may request."""
-    return topic.direction in ("out", "query") and topic.key not in NOT_ASKED
+def _ref(name: str) -> Described:
+    return {"$ref": f"#/components/schemas/{name}"}
 
 
-def document(version: str) -> Described:
+def _raw(schema: Described) -> Any:
+    """Return the type of a field that is JSON already and has this schema."""
+    return Annotated[msgspec.Raw, Meta(extra_json_schema=schema)]
+
+
+def _value(key: str, kind: str) -> type[Struct]:
+    """Return the type of the messages that `to_browser.Following` builds for a key."""
+    return msgspec.defstruct(
+        VALUE + key.replace("/", "."),
+        [
+            ("value", _raw({"anyOf": [_ref(kind), {"type": "null"}]})),
+            ("age", Annotated[float, Meta(ge=0, description="ms")]),
+            ("robot", Annotated[str, Meta(description="only of another robot")], ""),
+        ],
+        namespace={"__doc__": "The newest message of this key; null if it is not readable."},
+        tag_field="key",
+        tag=key,
+    )
+
+
+VALUES = tuple(_value(key, kind) for key, kind in KEYS.items())
+
+ERRORS = {
+    "401": "The token is missing or not valid.",
+    "403": "The role is too low, or the request came through a proxy or from another web page.",
+    "429": "Too many requests, or wrong tokens.",
+    "default": "Any other failure.",
+}
+"""Errors of every path. The body says why, in words."""
+
+
+def document(version: str, routes: Sequence[Route]) -> Described:
     """Return the document that `GET /api` answers."""
+    described = [row for row in routes if row.summary]
+    bodies = [body.kind for row in described for body in row.gives.values()]
+    bodies += [row.takes for row in described if row.takes is not None]
+    own = [kind for kind in bodies if not isinstance(kind, str)]
+    schemas, refs = _components([Problem, *own, *KINDS.values(), *SENT, *VALUES, *LINES])
+    for kind in KINDS.values():
+        schemas[kind.__name__]["x-least-role"] = kind.least
+    messages, of_the_socket = _messages(), _of_the_socket(refs)
+    assert not (schemas | of_the_socket).keys() & messages.keys(), "one name for two types"
     paths: Described = {}
-    for topic in TOPICS:
-        if asked(topic):
-            paths[f"/api/{topic.key.replace('<Type>', '{type}')}"] = {"get": _value(topic)}
-    for verb in SERVICES:
-        paths[f"/api/{service_key(verb)}"] = {"post": _service(verb)}
-    paths |= _OTHERS
+    for row in described:
+        paths.setdefault(row.path, {})[row.method.lower()] = _operation(row, refs)
     return {
         "openapi": "3.1.0",
         "info": {
             "title": "acsard",
             "version": version,
-            "description": "The robot's page, for programs. At the machine nothing is asked for; "
-            "from elsewhere a token, as `Authorization: Bearer ...`.",
+            "description": "The robot's page, for programs. On the robot itself no token is needed."
+            " From elsewhere the header `Authorization: Bearer ...` has one. `security` names the "
+            "least role of the token.",
         },
         "paths": paths,
         "components": {
-            "schemas": _keys() | socket_schemas.schemas(),
+            "schemas": messages | schemas | of_the_socket,
             "securitySchemes": {"token": {"type": "http", "scheme": "bearer"}},
         },
-        "security": [{}, {"token": []}],
     }
 
 
-def _keys() -> Described:
-    """Return the schemas of all message types, with each nested type beside them as `Type.Part`.
+def _operation(row: Route, refs: Refs) -> Described:
+    """Return the description of one row."""
+    errors = {status: Body(what, Problem) for status, what in ERRORS.items()}
+    answers = {str(status): body for status, body in row.gives.items()} | errors
+    told: Described = {
+        "summary": row.summary,
+        # The first alternative is a client on the robot itself.
+        "security": [{}] if row.least is None else [{}, {"token": [row.least]}],
+        "responses": {status: _answer(body, refs) for status, body in answers.items()},
+    }
+    if row.parameters:
+        told["parameters"] = [
+            {"name": name, "in": "path", "required": True, "schema": {"type": "string"}}
+            for name in row.parameters
+        ]
+    if row.takes is not None:
+        content = {media: {"schema": _schema(row.takes, refs)} for media in row.forms}
+        told["requestBody"] = {"required": _needed(row.takes), "content": content}
+    if 101 in row.gives:
+        told["x-messages"] = {"to": _ref(TO_ROBOT), "from": _ref(FROM_ROBOT)}
+    return told
+
+
+def _answer(body: Body, refs: Refs) -> Described:
+    if not body.media:
+        return {"description": body.what}
+    content = {body.media: {"schema": _schema(body.kind, refs)}}
+    return {"description": body.what, "content": content}
+
+
+def _schema(kind: Any, refs: Refs) -> Described:
+    if isinstance(kind, str):
+        return _ref(kind) if kind else {}
+    return refs[kind]
+
+
+def _needed(kind: type | str) -> bool:
+    """Return whether a body of this type has a field without a default."""
+    if isinstance(kind, str):
+        return bool(SCHEMAS[kind].get("required"))
+    return any(field.required for field in msgspec.structs.fields(kind))
+
+
+def _messages() -> Described:
+    """Return the schemas of the bus's messages, with each nested type beside them as `Type.Part`.
 
     Most readers of OpenAPI documents cannot resolve a schema with `$defs` of its own.
     """
@@ -83,237 +181,36 @@ def _flat(node: Any, before: str) -> Any:
     return {key: _flat(value, before) for key, value in node.items()}
 
 
-def _ref(name: str) -> Described:
-    return {"$ref": f"#/components/schemas/{name}"} if name in SCHEMAS else {}
+def _components(kinds: Iterable[Any]) -> tuple[Described, Refs]:
+    """Return the schemas of `kinds` and their nested types, and a reference to each kind.
+
+    All kinds are described by one call, because msgspec then gives two types of the same name
+    different ones.
+    """
+    unique = list(dict.fromkeys(kinds))
+    refs, parts = msgspec.json.schema_components(
+        unique,
+        ref_template=_ref("{name}")["$ref"],
+        schema_hook=lambda _: {"description": "anything"},
+    )
+    plain: Described = msgspec.json.decode(msgspec.json.encode(parts))  # tuples become lists
+    return plain, dict(zip(unique, refs, strict=True))
 
 
-def _answer(what: str, schema: Described, kind: str = "application/json") -> Described:
-    return {"description": what, "content": {kind: {"schema": schema}}}
+def _of_the_socket(refs: Refs) -> Described:
+    """Return the schemas of all messages in either direction, and of `guide`.
 
-
-_TROUBLE: Described = {
-    "description": "Why not, in words.",
-    "content": {
-        "application/json": {
-            "schema": {"type": "object", "properties": {"error": {"type": "string"}}}
-        }
-    },
-}
-
-
-def _value(topic: Topic) -> Described:
-    about = f"{topic.note}; for who is at least {least_role(topic.key)}"
-    told: Described = {
-        "summary": about,
-        "responses": {
-            "200": _answer("The last value.", _ref(topic.type)),
-            "default": _TROUBLE,
-        },
+    Their kind is the field that only they have, so they are alternatives without a tag.
+    """
+    guided = msgspec.defstruct(
+        GUIDED,
+        [("guide", _raw({"oneOf": [refs[kind] for kind in LINES]}))],
+        namespace={"__doc__": told.Guided.__doc__},
+    )
+    found, own = _components([guided])
+    from_robot = [*(refs[kind] for kind in (*SENT, *VALUES)), own[guided]]
+    to_robot = [refs[kind] for kind in KINDS.values()]
+    return found | {
+        TO_ROBOT: {"title": TO_ROBOT, "oneOf": to_robot},
+        FROM_ROBOT: {"title": FROM_ROBOT, "oneOf": from_robot},
     }
-    if "<Type>" in topic.key:
-        kind = {"name": "type", "in": "path", "required": True, "schema": {"type": "string"}}
-        told["parameters"] = [kind]
-    return told
-
-
-def _service(verb: Any) -> Described:
-    notes = {topic.key: topic.note for topic in TOPICS}
-    told: Described = {
-        "summary": f"{notes[service_key(verb)]}; for who is at least {SERVICE_ROLES[verb]}",
-        "responses": {
-            "200": _answer("It was done.", _ref("ServiceReply")),
-            "409": _answer("It was not, and why.", _ref("ServiceReply")),
-            "default": _TROUBLE,
-        },
-    }
-    if verb in PAYLOADS:
-        body = {"application/json": {"schema": _ref(PAYLOADS[verb])}}
-        told["requestBody"] = {"required": PAYLOADS[verb] != "Release", "content": body}
-    elif verb == "stop":
-        told["requestBody"] = {"content": {"application/json": {"schema": _WHICH}}}
-    return told
-
-
-_WHICH: Described = {
-    "type": "object",
-    "properties": {"robot": {"type": "string", "description": "another one of the same router"}},
-}
-
-
-_NAME = {"name": "name", "in": "path", "required": True, "schema": {"type": "string"}}
-
-_RECORDING: Described = {
-    "type": "object",
-    "properties": {
-        "name": {"type": "string"},
-        "begin": {"type": ["number", "null"], "description": "s since 1970"},
-        "seconds": {"type": ["number", "null"]},
-        "bytes": {"type": "integer"},
-        "events": {"type": "string", "description": "what happened, in a few words"},
-    },
-}
-
-_REPORT: Described = {
-    "type": "object",
-    "required": ["report"],
-    "properties": {
-        "report": {"type": "string", "enum": ["drawing", "busy", "ready", "failed"]},
-        "text": {"type": "string", "description": "why it failed, or what to wait for"},
-        "percent": {"type": "integer"},
-        "seconds": {"type": "number", "description": "since it was begun"},
-        "href": {"type": "string", "description": "where it is, from the page on"},
-    },
-}
-
-_SETTING: Described = {
-    "type": "object",
-    "required": ["key", "value", "what", "when"],
-    "properties": {
-        "key": {"type": "string"},
-        "value": {},
-        "what": {"type": "string"},
-        "when": {"type": "string"},
-        "low": {"type": "number"},
-        "high": {"type": "number"},
-        "choices": {"type": "array", "items": {"type": "string"}},
-    },
-}
-
-_CHOICES: Described = {
-    "type": "object",
-    "properties": {
-        "ways": {
-            "type": "object",
-            "description": "of calibrating, and what each needs",
-            "additionalProperties": {"type": "string"},
-        },
-        "way": {"type": "string", "description": "the one to begin with; none is the usual one"},
-        "advice": {"type": "string", "description": "why that one, where it is not the usual"},
-        "ports": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {"port": {"type": "string"}, "what": {"type": "string"}},
-            },
-        },
-        "note": {"type": "string", "description": "what cannot be done here, and what to type"},
-    },
-}
-
-_WHO = "Role and name, and `full`: why there is no room for one more WebSocket, or nothing."
-
-_TOKEN: Described = {
-    "type": "object",
-    "required": ["token"],
-    "properties": {"token": {"type": "string"}},
-}
-
-_OTHERS: Described = {
-    "/ws": {
-        "get": {
-            "summary": "a WebSocket, JSON as text both ways: follows, drives, stops",
-            "description": f"Each message to the robot is a `{TO_ROBOT}`, each from it a "
-            f"`{FROM_ROBOT}`.",
-            "x-messages": {
-                "to": {"$ref": f"#/components/schemas/{TO_ROBOT}"},
-                "from": {"$ref": f"#/components/schemas/{FROM_ROBOT}"},
-            },
-            "responses": {"101": {"description": "It is open."}, "default": _TROUBLE},
-        }
-    },
-    "/token": {
-        "post": {
-            "summary": "a token becomes the cookie of a browser, which no script reads; by HTTPS",
-            "security": [{}],
-            "requestBody": {
-                "required": True,
-                "content": {
-                    "application/json": {"schema": _TOKEN},
-                    "application/x-www-form-urlencoded": {"schema": _TOKEN},
-                },
-            },
-            "responses": {
-                "303": {
-                    "description": "It counts; the page is there.",
-                    "headers": {
-                        "Set-Cookie": {"schema": {"type": "string"}},
-                        "Location": {"schema": {"type": "string"}},
-                    },
-                },
-                "401": _TROUBLE,
-                "429": _TROUBLE,
-                "default": _TROUBLE,
-            },
-        }
-    },
-    "/api/whoami": {
-        "get": {
-            "summary": "who you are here",
-            "responses": {"200": _answer(_WHO, {"type": "object"})},
-        }
-    },
-    "/api/settings": {
-        "get": {
-            "summary": "what srv/set takes: values, ranges, when; for a maintainer",
-            "responses": {
-                "200": _answer("A list.", {"type": "array", "items": _SETTING}),
-                "default": _TROUBLE,
-            },
-        }
-    },
-    "/api/guide": {
-        "get": {
-            "summary": "what the WebSocket takes to begin: ways to calibrate, ports to check; for "
-            "a maintainer",
-            "responses": {"200": _answer("Choices.", _CHOICES), "default": _TROUBLE},
-        }
-    },
-    "/api/recordings": {
-        "get": {
-            "summary": "the recordings of the black box, oldest first",
-            "responses": {
-                "200": _answer("A list.", {"type": "array", "items": _RECORDING}),
-                "default": _TROUBLE,
-            },
-        }
-    },
-    "/api/recordings/{name}": {
-        "get": {
-            "summary": "one of them as a file; for who is at least operator",
-            "parameters": [_NAME],
-            "responses": {
-                "200": _answer("MCAP.", {}, "application/octet-stream"),
-                "default": _TROUBLE,
-            },
-        }
-    },
-    "/api/recordings/{name}/report": {
-        "post": {
-            "summary": "draws its report, or says how far that is: ask again; for who is at least "
-            "operator",
-            "parameters": [_NAME],
-            "responses": {
-                "200": _answer("It is at `href`.", _REPORT),
-                "202": _answer("It is being drawn, or another one is.", _REPORT),
-                "503": _answer("It cannot be drawn, and why.", _REPORT),
-                "default": _TROUBLE,
-            },
-        }
-    },
-    "/report/{name}": {
-        "get": {
-            "summary": "the report, once it is drawn; for who is at least operator",
-            "parameters": [_NAME],
-            "responses": {
-                "200": _answer("A page.", {"type": "string"}, "text/html"),
-                "default": _TROUBLE,
-            },
-        }
-    },
-    "/metrics": {
-        "get": {
-            "summary": "for Prometheus",
-            "responses": {"200": _answer("Text.", {"type": "string"}, "text/plain")},
-        }
-    },
-}

@@ -1,61 +1,98 @@
-"""The recordings in the black box's directory, as the page lists them."""
+"""The recordings in the black box's directory, as the page lists and sends them."""
 
 from __future__ import annotations
 
 import calendar
 import time
 from pathlib import Path
+from typing import Annotated
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from acsard.host.errors import RecordingError
+from acsard.host.threads import in_thread
 from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import PART, STAMP, listed
 from acsard.values import NS_PER_S
+from acsard.web.answers import READ_S, TroubleError
+from acsard.web.robots import Robots
+from acsard.web.who import RefusedError, is_loopback
 
 
-class Listed(Struct, frozen=True):
-    """One recording in the list."""
+class Recording(Struct, frozen=True):
+    """One recording of the black box."""
 
     name: str
-    begin: float | None
-    """Start time in seconds since 1970, or None if it is unknown."""
-    seconds: float | None
-    """Duration in seconds; None if the recording has no end marker."""
+    begin: Annotated[float | None, Meta(description="s since 1970; null if unknown")]
+    seconds: Annotated[float | None, Meta(description="null without an end marker")]
     bytes: int
-    events: str
-    """Short summary of the recorded events."""
+    events: Annotated[str, Meta(description="summary of the recorded events")]
 
 
-def rows(directory: Path) -> list[Listed]:
-    """Return all recordings, oldest first; raises `OSError`."""
+class BlackBox:
+    """The recordings of the page's robot. Every method raises `TroubleError`."""
+
+    def __init__(self, robots: Robots) -> None:
+        self._robots = robots
+
+    async def rows(self) -> list[Recording]:
+        """Return all recordings, oldest first."""
+        place = self._place()
+        try:
+            return await in_thread(lambda: rows(place), READ_S)
+        except (OSError, TimeoutError) as error:
+            raise _unread(place, error) from None
+
+    async def found(self, name: str) -> tuple[Path, tuple[int, int]]:
+        """Return the path of a recording, and a value that changes when it grows or is replaced.
+
+        Raises `RefusedError` if it is not listed.
+        """
+        place = self._place()
+
+        def look() -> tuple[Path, tuple[int, int]] | None:
+            path = next((path for path in listed(place) if path.name == name), None)
+            if path is None:
+                return None
+            seen = path.stat()
+            return path, (seen.st_mtime_ns, seen.st_size)
+
+        try:
+            found = await in_thread(look, READ_S)
+        except (OSError, TimeoutError) as error:
+            raise _unread(place, error) from None
+        if found is None:
+            text = "there is no such recording; GET /api/recordings lists them"
+            raise RefusedError("path", text)
+        return found
+
+    def _place(self) -> Path:
+        host = self._robots.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+        if not (is_loopback(host) or host == "localhost"):
+            raise TroubleError(404, "the recordings are on the robot; this page's server is not")
+        if not self._robots.about.recordings:
+            raise TroubleError(404, "nothing is recorded: record.directory is empty")
+        return Path(self._robots.about.recordings)
+
+
+def rows(directory: Path) -> list[Recording]:
+    """Return all recordings of a directory, oldest first; raises `OSError`."""
     return [_row(path) for path in listed(directory)]
 
 
-def named(directory: Path, name: str) -> Path | None:
-    """Return the recording with this name, or None if it is not listed; raises `OSError`."""
-    return next((path for path in listed(directory) if path.name == name), None)
-
-
-def stamp(path: Path) -> tuple[int, int]:
-    """Return a value that changes when the file grows or is replaced; raises `OSError`."""
-    seen = path.stat()
-    return seen.st_mtime_ns, seen.st_size
-
-
-def _row(path: Path) -> Listed:
+def _row(path: Path) -> Recording:
     size = path.stat().st_size
     if path.name.endswith(PART):
-        return Listed(path.name, _begun(path), None, size, "being written, or cut")
+        return Recording(path.name, _begun(path), None, size, "being written, or cut")
     try:
         last = closing(path)
     except RecordingError as error:
-        return Listed(path.name, _begun(path), None, size, str(error))
+        return Recording(path.name, _begun(path), None, size, str(error))
     if last is None:
-        return Listed(path.name, _begun(path), None, size, "no end: cut")
+        return Recording(path.name, _begun(path), None, size, "no end: cut")
     events = "; ".join(filter(None, [last.said, how_it_ends(last.cut, last.why)]))
     seconds = (last.last_ns - last.wall_ns) / NS_PER_S
-    return Listed(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
+    return Recording(path.name, last.wall_ns / NS_PER_S, round(seconds, 3), size, events)
 
 
 def _begun(path: Path) -> float | None:
@@ -65,3 +102,8 @@ def _begun(path: Path) -> float | None:
     except ValueError:
         return None
     return float(calendar.timegm(told))
+
+
+def _unread(place: Path, error: Exception) -> TroubleError:
+    words = getattr(error, "strerror", None) or "no answer in time"
+    return TroubleError(503, f"cannot read {place}: {words}")

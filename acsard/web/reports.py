@@ -23,9 +23,9 @@ from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from acsard.host import clock
 from acsard.host.threads import in_thread
@@ -86,17 +86,14 @@ TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, by acsard log repor
 State = Literal["drawing", "ready", "failed", "busy"]
 
 
-class Progress(Struct, frozen=True, omit_defaults=True):
-    """Progress of a report."""
+class ReportState(Struct, frozen=True, omit_defaults=True):
+    """ReportState of a report."""
 
     report: State
-    text: str = ""
-    """Reason for a failure, or the work that this request waits for."""
+    text: Annotated[str, Meta(description="why it failed, or what this request waits for")] = ""
     percent: int = 0
-    seconds: float = 0.0
-    """Time since the drawing started."""
-    href: str = ""
-    """URL of the finished report, relative to the page."""
+    seconds: Annotated[float, Meta(description="since the drawing began")] = 0.0
+    href: Annotated[str, Meta(description="the finished report, relative to the page")] = ""
 
 
 class _Drawing:
@@ -125,7 +122,7 @@ class Reports:
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
-    def ask(self, path: Path, stamp: tuple[int, int]) -> Progress:
+    def ask(self, path: Path, stamp: tuple[int, int]) -> ReportState:
         """Return the progress of the report of this recording, and start drawing it if needed.
 
         `stamp` must change when the recording changes. A failed or outdated report is drawn again
@@ -133,17 +130,17 @@ class Reports:
         """
         one, now_ns = self._one, clock.mono_ns()
         if one is not None and not one.ended and one.path != path:
-            return Progress("busy", f"another report is being drawn: {one.path.name}")
+            return ReportState("busy", f"another report is being drawn: {one.path.name}")
         if one is None or one.path != path or (one.told and (one.failed or one.stamp != stamp)):
             one = self._one = _Drawing(path, stamp)
             self._work = asyncio.get_running_loop().create_task(self._draw(one))
         one.asked_ns, one.told = now_ns, one.ended
         if one.failed:
-            return Progress("failed", one.failed)
+            return ReportState("failed", one.failed)
         if one.packed:
-            return Progress("ready", href=f"report/{path.name}")
+            return ReportState("ready", href=f"report/{path.name}")
         seconds = (now_ns - one.begun_ns) / NS_PER_S
-        return Progress("drawing", percent=one.percent, seconds=round(seconds, 1))
+        return ReportState("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
         """Return the finished report of this recording, compressed by gzip, or None.

@@ -30,12 +30,11 @@ from acsard.web.counts import Counts
 from acsard.web.errands import Reach
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
-from acsard.web.gate import Gate
+from acsard.web.gate import Gate, Reader
 from acsard.web.guide import Guide
 from acsard.web.listen import Listen, bound, own_name, require_certificate
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
-from acsard.web.unreadable import Reader
 from acsard.web.who import is_loopback
 
 BEAT_S, TIDY_S, TELL_S = 0.5, 1.0, 1.0

@@ -11,7 +11,7 @@ from acsard.config.live import WHEN, flat, live
 from acsard.ros.parameters import kind_of
 
 
-class Row(Struct, frozen=True, omit_defaults=True):
+class Setting(Struct, frozen=True, omit_defaults=True):
     """One setting, with its value, its explanation and its allowed values."""
 
     key: str
@@ -23,12 +23,12 @@ class Row(Struct, frozen=True, omit_defaults=True):
     choices: list[str] | UnsetType = UNSET
 
 
-def rows(config: Mapping[str, Any]) -> list[Row]:
+def rows(config: Mapping[str, Any]) -> list[Setting]:
     """Return the changeable settings in the order of `config`, a value of the key `config`."""
     return [_row(key, value) for key, value in flat(config) if live(key) is not None]
 
 
-def _row(key: str, value: object) -> Row:
+def _row(key: str, value: object) -> Setting:
     told, kind = live(key), kind_of(key)
     assert told is not None
     low: float | UnsetType = UNSET
@@ -39,4 +39,4 @@ def _row(key: str, value: object) -> Row:
             low, high = least, most
         case inspect.LiteralType(values=values):
             choices = [str(one) for one in values]
-    return Row(key, value, told.what, WHEN[told.when], low, high, choices)
+    return Setting(key, value, told.what, WHEN[told.when], low, high, choices)

@@ -14,13 +14,12 @@ from typing import Any
 import aiohttp
 from aiohttp import web
 
-from acsard.bus.access import MAY
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.messages.signature import public_name
 from acsard.values import NS_PER_S
 from acsard.web import told
-from acsard.web.calls import Calls, RefusedError
+from acsard.web.calls import Calls
 from acsard.web.commands import Hand, Order
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
@@ -42,7 +41,7 @@ from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES, OVERRUNS, Bucket
 from acsard.web.robots import Robots
 from acsard.web.to_browser import Outgoing
-from acsard.web.who import Who
+from acsard.web.who import RefusedError, Who
 
 HEARTBEAT_S = 10.0
 """Ping interval. The connection ends if the client has not answered after half of it."""
@@ -151,6 +150,11 @@ class Viewer:
 
     def _obey(self, frame: Frame) -> None:
         self._guide.heard(self)
+        try:
+            self.who.require(frame.least, frame.kind)
+        except RefusedError as error:
+            self._out.refuse(frame.kind, error.reason, str(error))
+            return
         match frame:
             case Command():
                 self._command(frame)
@@ -164,7 +168,8 @@ class Viewer:
             case Unsubscribe():
                 self._unsubscribe(frame)
             case Begin():
-                self._begin(frame)
+                if why := self._guide.begin(self, self.who.name, frame):
+                    self._out.refuse("begin", "too_many", why)
             case Reply():
                 if why := self._guide.reply(self, frame):
                     self._out.refuse("reply", "malformed", why)
@@ -172,9 +177,6 @@ class Viewer:
                 self._guide.press(self, frame)
 
     def _command(self, frame: Command) -> None:
-        if not self.who.may("operator"):
-            self._out.refuse("cmd", "role", f"you are {self.who.role}: {MAY[self.who.role]}")
-            return
         stamp_ns, before_ns = frame.stamp_ns, self._last.stamp_ns if self._last else -1
         if stamp_ns == before_ns and not frame.moves:
             # Some clocks stand still for a while. A zero command with an equal stamp is still a
@@ -216,16 +218,6 @@ class Viewer:
             Order(self._sender_id, 0.0, 0.0, stamp_ns, self._sequence, now_ns, last.steady)
         )
 
-    def _begin(self, frame: Begin) -> None:
-        """Start a check or calibration for a maintainer.
-
-        The role is required because both turn wheels and write configuration files.
-        """
-        if not self.who.may("maintainer"):
-            self._out.refuse("begin", "role", f"it is for maintainers; you are {self.who.role}")
-        elif why := self._guide.begin(self, self.who.name, frame):
-            self._out.refuse("begin", "too_many", why)
-
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":
             # A stop is kept in its own set of tasks, which is not cancelled when the connection
@@ -243,7 +235,7 @@ class Viewer:
             reply = await self._calls.call(self.who, frame.call, frame.payload, frame.robot)
             ok, text = reply.success, reply.message
         except RefusedError as error:
-            self._counts.refuse("role" if error.role else "malformed", self.who.origin)
+            self._counts.refuse(error.reason, self.who.origin)
             ok, text = False, str(error)
         finally:
             if frame.call != "stop":

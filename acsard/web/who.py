@@ -1,5 +1,6 @@
-"""Decides who sends a request, by its source address and the browser's headers. This module is
-pure.
+"""Decides who sends a request, by its source address and headers, and what a role may do.
+
+This module is pure.
 
 A client on the robot itself has the role maintainer. However, any web page in a browser there may
 open `ws://localhost`, or point a host name of its own at 127.0.0.1. So `Host` must be a loopback
@@ -16,7 +17,8 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.values import ROLES, Role
+from acsard.bus.access import MAY
+from acsard.values import ROLES, AcsardError, Role
 
 Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
@@ -35,6 +37,14 @@ Domain, and for all paths."""
 
 MOST_COOKIES = 8
 """Maximum number of cookies that are checked for a token."""
+
+
+class RefusedError(AcsardError):
+    """A request or a message that is refused; the text says why, and what to do."""
+
+    def __init__(self, reason: Reason, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
 
 
 class Who(Struct, frozen=True):
@@ -56,16 +66,15 @@ class Who(Struct, frozen=True):
         """Return whether the client has at least this role."""
         return ROLES.index(self.role) >= ROLES.index(least)
 
+    def require(self, least: Role, what: str) -> None:
+        """Raise `RefusedError` unless the client has at least this role, the least for `what`."""
+        if not self.may(least):
+            text = f"{what} is for {least}s; you are {self.role}: {MAY[self.role]}"
+            raise RefusedError("role", text)
+
 
 MAINTAINER = Who("maintainer", HERE)
 """The identity of a client on the robot itself."""
-
-
-class Refusal(Struct, frozen=True):
-    """The reason for a refusal, and the remedy."""
-
-    reason: Reason
-    text: str
 
 
 class Asked(Struct, frozen=True):
@@ -85,13 +94,13 @@ class Asked(Struct, frozen=True):
     """True if a header says that a proxy forwarded the request."""
 
 
-def place(asked: Asked, names: Collection[str]) -> Place | Refusal:
-    """Classify a request as local or remote, or refuse it.
+def place(asked: Asked, names: Collection[str]) -> Place:
+    """Return whether a request is local or remote, or raise `RefusedError`.
 
     `names` are the robot's names and addresses in lower case.
     """
     if asked.proxied:
-        return Refusal(
+        raise RefusedError(
             "proxy",
             "through a proxy everybody would look as if he were at the machine: open this page "
             "without one, from elsewhere by https",
@@ -100,23 +109,22 @@ def place(asked: Asked, names: Collection[str]) -> Place | Refusal:
     if is_loopback(asked.peer) and (host == "localhost" or is_loopback(host)):
         return "here"
     if not asked.secure:
-        return Refusal(
+        raise RefusedError(
             "plain" if not is_loopback(asked.peer) else "host",
             f"{host or 'no name'!r} is not a name of this machine for itself: "
             "use http://localhost here, and https from elsewhere",
         )
     if host not in names:
-        return Refusal("host", f"{host or 'no name'!r} is not a name that this robot has")
+        raise RefusedError("host", f"{host or 'no name'!r} is not a name that this robot has")
     return "away"
 
 
-def foreign(asked: Asked) -> Refusal | None:
-    """Return a refusal if a web page of another origin made the browser send this request."""
+def require_own_origin(asked: Asked) -> None:
+    """Raise `RefusedError` if a web page of another origin made the browser send this request."""
     own = f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
     strange = asked.origin is not None and asked.origin.lower() != own
     if strange or asked.site not in (None, "same-origin", "none"):
-        return Refusal("origin", "a page of another origin may not do that")
-    return None
+        raise RefusedError("origin", "a page of another origin may not do that")
 
 
 def cookie_name(robot: str, port: int) -> str:

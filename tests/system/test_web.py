@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import pty
 import re
@@ -16,7 +17,7 @@ from typing import Any
 import aiohttp
 import pytest
 
-from acsard.web.socket_schemas import KEYS
+from acsard.web.openapi import KEYS
 from tests import described
 from tests.system.browser import Page, answer, hands, run, text
 from tests.system.harness import (
@@ -190,6 +191,48 @@ def test_programs_ask_call_and_are_told_what_there_is(page: Page, bus: Bus) -> N
     run(story)
 
 
+TYPED = ("/api/state", "/api/whoami", "/api/settings", "/api/guide", "/api/recordings", "/api/info")
+"""Some paths with a type of their own, which not any JSON fits."""
+
+
+def test_each_answer_to_a_program_is_as_it_is_described(page: Page, bus: Bus) -> None:
+    seen: dict[tuple[str, str], int] = {}
+
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            async with session.get("/api/recordings") as answer:
+                name = (await answer.json())[0]["name"]
+            for path, operations in described.DOCUMENT["paths"].items():
+                asked = path.replace("{name}", name).replace("{type}", "Twist")
+                for method in operations:
+                    async with session.request(method, asked) as answer:
+                        media = answer.content_type
+                        body = await answer.json() if media == "application/json" else None
+                    seen[method, path] = answer.status
+                    told = path, method, answer.status, media, body
+                    assert described.answers(*told), told
+                    if path in TYPED:
+                        assert not described.answers(*told[:4], {"of": "nothing"}), path
+
+    run(story)
+    assert {one for one in seen if seen[one] == 200} > {("get", path) for path in TYPED}
+    assert seen["post", "/api/recordings/{name}/report"] == 202
+    assert seen["post", "/api/srv/stop"] == 200
+    assert seen["post", "/api/srv/set"] == 409
+
+
+def test_a_path_with_another_method_says_which_it_takes(page: Page) -> None:
+    async def story() -> None:
+        async with aiohttp.ClientSession(page.here) as session:
+            async with session.get("/api/srv/stop") as answer:
+                assert (answer.status, answer.headers["Allow"]) == (405, "POST")
+                assert (await answer.json())["error"] == "this path takes POST"
+            async with session.post("/api/nothing") as answer:
+                assert answer.status == 404
+
+    run(story)
+
+
 def test_no_other_page_holds_ours_in_a_frame_or_lends_it_scripts(page: Page) -> None:
     async def story() -> None:
         async with aiohttp.ClientSession(page.here) as session:
@@ -326,7 +369,7 @@ def test_a_daemon_in_a_terminal_serves_its_page_at_a_free_port_and_anew_when_it_
         with Terminal(tmp_path, "--config", str(config), "--record", "box") as daemon:
             daemon.shows(rf"page +http://127.0.0.1:{port}, for a browser")
             url = daemon.shows(rf"page +(http://127.0.0.1:\d+/) +\(http://127.0.0.1:{port}/ is")[1]
-            assert asyncio.run(text(f"{url}api/whoami")).startswith('{"role": "maintainer"')
+            assert json.loads(asyncio.run(text(f"{url}api/whoami")))["role"] == "maintainer"
 
             def listed() -> bool:
                 """Wait until the recorder has made its directory."""

@@ -6,7 +6,9 @@ The tests read the rules as Zenoh reads them.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
@@ -461,3 +463,12 @@ def test_at_the_door_each_role_may_what_it_may_and_the_daemon_all() -> None:
         for message in ("put", "delete", "query", "reply", "declare_subscriber"):
             for key in ("acsard/acsar/odom", "acsard/acsar/tf_static/@adv/x", "@ros2_lv/0/x", "**"):
                 assert door.lets("local", message, key, flow)
+
+
+@pytest.mark.parametrize("page", ["web", "systemd", "zenoh"])
+@pytest.mark.parametrize("role", ROLES)
+def test_each_page_names_the_services_of_a_role(page: str, role: Role) -> None:
+    text = (Path(__file__).parents[3] / "deploy" / page / "README.md").read_text()
+    (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)
+    named = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
+    assert named == {verb for verb, least in SERVICE_ROLES.items() if least == role}

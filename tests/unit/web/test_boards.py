@@ -7,6 +7,7 @@ import pytest
 from acsard.host.processes import Holder
 from acsard.host.serial_ports import SerialDevice
 from acsard.web.boards import boards
+from acsard.web.guide import boards
 
 MEGA = SerialDevice(
     "/dev/ttyACM0", ["/dev/acsar"], "cdc_acm", "2341:0042", "", "Arduino Mega 2560 R3", []
@@ -18,7 +19,7 @@ HELD = SerialDevice("/dev/ttyUSB0", [], "ch341", "", "USB Serial", "", [Holder(7
 def test_the_configured_one_stands_under_its_configured_name(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("acsard.web.boards.serial_devices", lambda: [MEGA, HELD])
+    monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA, HELD])
     found = {one.port: one.what for one in boards(configured)}
     assert found == {
         configured: "Arduino Mega 2560 R3, configured",
@@ -28,7 +29,7 @@ def test_the_configured_one_stands_under_its_configured_name(
 
 
 def test_one_that_is_not_there_is_offered_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("acsard.web.boards.serial_devices", lambda: [MEGA])
+    monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA])
     first = boards("/dev/none")[0]
     assert (first.port, first.what) == ("/dev/none", "configured, not there now")
 
@@ -36,7 +37,7 @@ def test_one_that_is_not_there_is_offered_and_says_so(monkeypatch: pytest.Monkey
 def test_the_simulator_is_there_once_whatever_is_configured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("acsard.web.boards.serial_devices", list)
+    monkeypatch.setattr("acsard.web.guide.serial_devices", list)
     assert [one.port for one in boards("sim")] == ["sim"]
 
 
@@ -45,5 +46,5 @@ def test_the_configured_one_is_the_first_choice(
     configured: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A page that shows the simulator must not select a real port by itself."""
-    monkeypatch.setattr("acsard.web.boards.serial_devices", lambda: [MEGA, HELD])
+    monkeypatch.setattr("acsard.web.guide.serial_devices", lambda: [MEGA, HELD])
     assert boards(configured)[0].port == configured

@@ -18,10 +18,9 @@ from acsard.web.calls import (
     STOPS_AT_ONCE,
     Calls,
     Ending,
-    RefusedError,
     Stops,
 )
-from acsard.web.who import MAINTAINER
+from acsard.web.who import MAINTAINER, RefusedError
 from tests.unit.web.test_fleet import quiet, robots
 
 PATIENCE_S = 20.0
@@ -87,9 +86,10 @@ def test_of_another_robot_only_stop_is_called_and_only_by_an_id_that_one_can_hav
         calls = Calls(robots(None))
         with pytest.raises(RefusedError, match=r"r2 is not this page's robot.*own page") as told:
             await calls.call(MAINTAINER, "clear", {}, "r2")
-        assert told.value.role
-        with pytest.raises(RefusedError, match="not a robot's id"):
+        assert told.value.reason == "role"
+        with pytest.raises(RefusedError, match="not a robot's id") as told:
             await calls.call(MAINTAINER, "stop", {}, "**")
+        assert told.value.reason == "malformed"
         # Naming the page's own robot counts as its own.
         assert not (await calls.call(MAINTAINER, "clear", {}, "acsar")).success
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import tracemalloc
 from pathlib import Path
 
+import pytest
+
 from acsard.values import NS_PER_S
 from acsard.web.limits import (
     CONNECTIONS,
@@ -162,6 +164,9 @@ def test_the_page_tells_the_places_that_there_are() -> None:
         f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
     ) in told
     assert f"room for another {CONNECTIONS_HERE} connections from the machine itself" in told
+    most, hz = GUESSES_OF_ONE.most, GUESSES_OF_ONE.hz
+    assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in told
+    assert (GUESSES.most / most, GUESSES.hz / hz) == pytest.approx((10, 10))
 
 
 def test_each_token_has_a_pace_of_its_own() -> None:

@@ -12,12 +12,14 @@ import pytest
 from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
+from acsard.bus.access import SERVICE_ROLES, least_role
 from acsard.messages.topics import SERVICES, TOPICS
+from acsard.web.app import ROUTES
 from acsard.web.frames import KINDS, FrameError, decode
-from acsard.web.openapi import PLAIN, asked, document
-from acsard.web.socket_schemas import FROM_ROBOT, TO_ROBOT
+from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
+from acsard.web.routes import PARAMETERS, asked
 
-WHOLE = document("1.2.3")
+WHOLE = document("1.2.3", ROUTES)
 
 
 def references(node: Any) -> list[str]:
@@ -97,6 +99,30 @@ def test_parameters_in_a_path_are_declared() -> None:
             assert names == {part[1:-1] for part in path.split("/") if part.startswith("{")}
 
 
-def test_no_wildcard_is_a_plain_key() -> None:
-    assert PLAIN.match("schema/Twist")
-    assert not any(PLAIN.match(key) for key in ("schema/*", "**", "a$*", "x?fmt=cdr", "", "a" * 99))
+def test_no_wildcard_is_the_name_of_a_type() -> None:
+    name = re.compile(PARAMETERS["type"])
+    assert name.fullmatch("Twist")
+    assert not any(map(name.fullmatch, ("*", "**", "a$*", "x?fmt=cdr", "a/b", "", "a" * 99)))
+
+
+def test_each_path_names_the_least_role_that_may_use_it() -> None:
+    def role(path: str, method: str) -> str:
+        here, away = WHOLE["paths"][path][method]["security"]
+        assert here == {}
+        ((least,),) = away.values()
+        return str(least)
+
+    for verb in SERVICES:
+        assert role(f"/api/srv/{verb}", "post") == SERVICE_ROLES[verb]
+    for key in ("state", "config", "info"):
+        assert role(f"/api/{key}", "get") == least_role(key)
+    assert role("/api/recordings/{name}", "get") == "operator"
+    assert role("/api/guide", "get") == "maintainer"
+    assert WHOLE["paths"]["/token"]["post"]["security"] == [{}]
+
+
+def test_each_message_to_the_robot_names_the_least_role_that_may_send_it() -> None:
+    schemas = WHOLE["components"]["schemas"]
+    least = {kind: schemas[kind.__name__]["x-least-role"] for kind in KINDS.values()}
+    assert least == {kind: kind.least for kind in KINDS.values()}
+    assert set(least.values()) == {"viewer", "operator", "maintainer"}

@@ -14,7 +14,7 @@ import pytest
 
 from acsard.values import NS_PER_S
 from acsard.web import reports
-from acsard.web.reports import BYTES, KEEP_NS, NICE, Progress, Reports
+from acsard.web.reports import BYTES, KEEP_NS, NICE, Reports, ReportState
 
 PATIENCE_S = 30.0
 
@@ -30,7 +30,7 @@ def drawn_by(program: str) -> Reports:
     return Reports((sys.executable, "-S", "-c", program))
 
 
-async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> Progress:
+async def become(found: Reports, path: Path, *states: str, stamp: int = 1) -> ReportState:
     """Return the progress once it has one of these states."""
     async with asyncio.timeout(PATIENCE_S):
         while (told := found.ask(path, (stamp, 0))).report not in states:
@@ -48,7 +48,7 @@ def test_it_is_begun_by_who_asks_and_there_when_it_is_done() -> None:
         assert found.ask(A, (1, 0)).report == "drawing"
         assert found.drawn("a.mcap") is None
         told = await become(found, A, "ready", "failed")
-        assert told == Progress("ready", href="report/a.mcap")
+        assert told == ReportState("ready", href="report/a.mcap")
         body = found.drawn("a.mcap")
         assert body is not None
         assert gzip.decompress(body) == b"<html> /a.mcap\n"

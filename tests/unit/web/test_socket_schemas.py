@@ -15,7 +15,7 @@ from acsard.messages.report import Report
 from acsard.values import Role
 from acsard.web import lines, told
 from acsard.web.minute import Minute
-from acsard.web.socket_schemas import KEYS, LINES, SENT, VALUE
+from acsard.web.openapi import KEYS, LINES, SENT, VALUE
 from acsard.web.streams import KEYS as FOLLOWED
 from acsard.web.to_browser import Following
 from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken

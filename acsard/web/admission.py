@@ -1,0 +1,200 @@
+"""Admission of requests, from the socket to the handler of a row in the table.
+
+Each request passes `Admission` in this order: the client's place (`who.py`), the origin of the web
+page that sent it, its token, its request rate, and the role that the row asks for. Only then does
+the handler see the request, and with it the caller's identity (a `Who`). A path that no row has
+takes a token as well, so a stranger does not learn which paths exist.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from functools import partial
+
+from aiohttp import web
+from msgspec.structs import replace
+
+from acsard.host import clock
+from acsard.host.threads import in_thread
+from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
+from acsard.web.counts import Counts
+from acsard.web.frames import MAX_BYTES
+from acsard.web.gate import Gate
+from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS, Buckets
+from acsard.web.routes import Route
+from acsard.web.tokens import Vault
+from acsard.web.who import (
+    MAINTAINER,
+    Asked,
+    Reason,
+    RefusedError,
+    Who,
+    place,
+    require_own_origin,
+    tokens_in,
+    unmapped,
+)
+
+HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
+"""Pattern of a valid `Host` header. It is strict because the value is copied into a response
+header."""
+
+PROXIES = ("forwarded", "x-forwarded-", "x-real-ip", "via")
+"""Prefixes of the headers that a proxy adds when it forwards a request."""
+
+REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
+"""Refusal reason per HTTP status that aiohttp raises by itself. Every other status counts as
+`malformed`."""
+
+WORDS = {
+    404: "there is no such thing here; GET /api lists what there is",
+    413: f"over {MAX_BYTES} bytes",
+}
+
+WHO: web.RequestKey[Who] = web.RequestKey("who", Who)
+"""The identity of the caller, in each request to a row that is not open to everybody."""
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Admission:
+    """Finds the row of each request, and refuses the request or hands it to the row's handler."""
+
+    def __init__(
+        self, robot: str, names: frozenset[str], vault: Vault, gate: Gate, counts: Counts
+    ) -> None:
+        """Store how clients are known.
+
+        `names` are the host names and addresses, in lower case, by which other machines reach the
+        robot.
+        """
+        self._robot, self._names, self._vault = robot, names, vault
+        self._gate, self._counts = gate, counts
+        self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
+        self._rows: dict[web.AbstractRoute, Route] = {}
+
+    def application(self, rows: Iterable[Route], page: object) -> web.Application:
+        """Return the application that serves these rows; `page` is what their handlers work on."""
+        app = web.Application(middlewares=[self._serve], client_max_size=MAX_BYTES)
+        app.on_response_prepare.append(secured)
+        for row in rows:
+            for method in ("GET", "HEAD") if row.method == "GET" else (row.method,):
+                added = app.router.add_route(method, row.pattern, partial(row.handler, page))
+                self._rows[added] = row
+        return app
+
+    async def owner(self, peer: str, shown: Sequence[str]) -> Who:
+        """Return the owner of the first valid token in `shown`.
+
+        Raises `RefusedError`, and `TimeoutError` if the disk does not answer within `READ_S`.
+        """
+        if not any(shown):
+            raise RefusedError("no_token", "who are you? `acsard web --invite ROLE` at the robot")
+        who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
+        # A valid token is accepted even while guessing is throttled, so another client's wrong
+        # guesses lock nobody out.
+        if who is not None:
+            return replace(who, address=peer)
+        if not self._guesses.take(peer, clock.mono_ns()):
+            raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
+        raise RefusedError(
+            "bad_token", "this token has ended, was revoked, is another robot's, or never was one"
+        )
+
+    @web.middleware
+    async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        self._gate.spoke(request.transport)
+        try:
+            await self._admit(request, self._rows.get(request.match_info.route))
+            return await handler(request)
+        except RefusedError as error:
+            self._counts.refuse(error.reason, _origin(request))
+            answer = problem(STATUS.get(error.reason, 403), str(error))
+            if error.reason == "too_many":
+                # A client that retries in a loop must not keep its TCP connection either.
+                answer.force_close()
+            return answer
+        except TimeoutError:
+            return problem(503, "the disk does not answer")
+        except TroubleError as trouble:
+            return problem(trouble.status, str(trouble))
+        except web.HTTPException as error:
+            if error.status < 400:
+                raise
+            self._counts.refuse(REASONS.get(error.status, "malformed"), _origin(request))
+            if (methods := error.headers.get("Allow")) is not None:
+                answer = problem(error.status, f"this path takes {methods}")
+                answer.headers["Allow"] = methods
+                return answer
+            return problem(error.status, WORDS.get(error.status, error.reason))
+
+    async def _admit(self, request: web.Request, row: Route | None) -> None:
+        """Raise `RefusedError`, or store the identity of the caller unless the row is open."""
+        said = asked_of(request)
+        here = place(said, self._names | {own_address(request)}) == "here"
+        is_open = row is not None and row.least is None
+        if not is_open or request.method not in ("GET", "HEAD"):
+            require_own_origin(said)
+        if is_open:
+            return
+        who = replace(MAINTAINER, address=said.peer)
+        if not here:
+            who = await self.owner(said.peer, tokens_shown(request, self._robot))
+        request[WHO] = who
+        # Clients on the robot itself have no token and no rate limit.
+        paced = who.token and (row is None or row.paced)
+        if paced and not self._paces.take(who.token, clock.mono_ns()):
+            text = f"over {REQUESTS.hz:g} requests a second: /ws tells what changes"
+            raise RefusedError("too_fast", text)
+        if row is not None and row.least is not None:
+            who.require(row.least, f"{row.method} {row.path}")
+
+
+def asked_of(request: web.Request) -> Asked:
+    """Return the facts of a request that decide about its admission, none of them trusted yet."""
+    hosts = request.headers.getall("Host", [])
+    return Asked(
+        peer_of(request),
+        request.secure,
+        hosts[0] if len(hosts) == 1 and HOST.fullmatch(hosts[0]) else "",
+        request.headers.get("Origin"),
+        request.headers.get("Sec-Fetch-Site"),
+        any(name.lower().startswith(PROXIES) for name in request.headers),
+    )
+
+
+def peer_of(request: web.Request) -> str:
+    """Return the address of the client."""
+    return unmapped(request.remote or "")
+
+
+def own_address(request: web.Request) -> str:
+    """Return the local address that the client connected to.
+
+    Unlike a host name, it cannot be forged.
+    """
+    return unmapped(_reached(request)[0].lower())
+
+
+def own_port(request: web.Request) -> int:
+    """Return the local port that the client connected to."""
+    return _reached(request)[1]
+
+
+def tokens_shown(request: web.Request, robot: str) -> list[str]:
+    """Return a program's bearer token, or a browser's cookie tokens, the likeliest first."""
+    kind, _, text = request.headers.get("Authorization", "").partition(" ")
+    if kind.lower() == "bearer":
+        return [text.strip()]
+    return tokens_in(request.cookies, robot, own_port(request))
+
+
+def _reached(request: web.Request) -> tuple[str, int]:
+    at = None if request.transport is None else request.transport.get_extra_info("sockname")
+    return (str(at[0]), int(at[1])) if at else ("", 0)
+
+
+def _origin(request: web.Request) -> str:
+    who = request.get(WHO)
+    return peer_of(request) if who is None else who.origin

@@ -1,0 +1,83 @@
+"""The answers of the page's server: JSON, files, problems, and the headers of all of them."""
+
+from __future__ import annotations
+
+import msgspec
+from aiohttp import web
+
+from acsard.values import AcsardError
+from acsard.web.files import File
+from acsard.web.routes import JSON, Problem
+from acsard.web.who import Reason
+
+READ_S = 10.0
+"""Time limit for reading from a disk."""
+
+STATUS: dict[Reason, int] = {
+    "no_token": 401,
+    "bad_token": 401,
+    "too_fast": 429,
+    "too_many": 503,
+    "path": 404,
+    "malformed": 400,
+}
+"""HTTP status for each refusal reason; every other reason gives 403."""
+
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Server": "acsard",
+}
+"""Headers of every answer."""
+
+
+class TroubleError(AcsardError):
+    """A request that cannot be fulfilled now or here, with its HTTP status and an explanation."""
+
+    def __init__(self, status: int, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+def reply(body: object, status: int = 200) -> web.Response:
+    """Return an answer in JSON."""
+    return web.Response(body=msgspec.json.encode(body), content_type=JSON, status=status)
+
+
+def problem(status: int, text: str) -> web.Response:
+    """Return an error response with an explanation."""
+    return reply(Problem(text), status)
+
+
+def sent(request: web.Request, file: File) -> web.Response:
+    """Return a page file, or 304 if the browser has it. Compress it if the client supports gzip."""
+    headers = {"ETag": file.tag, "Cache-Control": "no-cache", "Vary": "Accept-Encoding"}
+    if request.headers.get("If-None-Match") == file.tag:
+        return web.Response(status=304, headers=headers)
+    body = file.body
+    if file.packed is not None and takes_gzip(request):
+        body, headers["Content-Encoding"] = file.packed, "gzip"
+    return web.Response(body=body, headers=headers | {"Content-Type": file.kind})
+
+
+def takes_gzip(request: web.Request) -> bool:
+    """Return whether the client accepts gzip."""
+    return "gzip" in request.headers.get("Accept-Encoding", "")
+
+
+async def secured(request: web.Request, response: web.StreamResponse) -> None:
+    """Add the security headers to an answer."""
+    host = request.headers.get("Host", "")
+    # Browsers before 2022 do not apply 'self' to ws:// URLs, so the host is written out. A refused
+    # request may have a foreign Host, which must not be echoed.
+    connect = f" ws://{host} wss://{host}" if response.status < 400 else ""
+    policy = (
+        f"default-src 'self'; connect-src 'self'{connect}; frame-ancestors 'none'; "
+        "base-uri 'none'; form-action 'self'"
+    )
+    response.headers.update(HEADERS)
+    response.headers.setdefault("Content-Security-Policy", policy)  # a report sets its own
+    response.headers.setdefault("Cache-Control", "no-store")

@@ -1,0 +1,126 @@
+"""The rows of the page's table: what each path is, who may use it, and what goes in and out.
+
+This module is pure. `app.ROUTES` is the table. Dispatch, admission, the request rate, the answers
+404 and 405 and the OpenAPI document follow it, so a path that is not in the table does not exist.
+The rows of the robot's keys and services are made here from the bus's own tables.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from typing import Any, Literal
+
+from msgspec import Struct
+
+from acsard.bus.access import SERVICE_ROLES, least_role
+from acsard.messages.json_schema import SCHEMAS
+from acsard.messages.topics import TOPICS, VERBS, Topic
+from acsard.values import Role, Verb
+
+Handler = Callable[[Any, Any], Awaitable[Any]]
+"""Takes the page and the request, and returns the response."""
+
+JSON, FORM = "application/json", "application/x-www-form-urlencoded"
+
+NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
+"""Topics without a value that this interface can return."""
+
+PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
+"""Pattern of a path parameter. A parameter that is not listed is any text without a slash."""
+
+_PARAMETER = re.compile(r"{(\w+)}")
+
+
+class Which(Struct, frozen=True):
+    """The robot to stop: the page's own, or another one of the same router."""
+
+    robot: str = ""
+
+
+PAYLOADS: Mapping[Verb, type | str] = {
+    "stop": Which, "set": "Settings", "set_pose": "SetPose", "clear": "Release",
+    "activate": "Release",
+}  # fmt: skip
+"""Type of each service's request. The daemon decodes it, so the daemon's words refuse it."""
+
+
+class Problem(Struct, frozen=True):
+    """Why a request was not fulfilled, in words."""
+
+    error: str
+
+
+class Body(Struct, frozen=True):
+    """The body of an answer."""
+
+    what: str
+    """Description for the OpenAPI document."""
+    kind: Any = ""
+    """Its type, or the name of a message of the bus; "" for any value."""
+    media: str = JSON
+    """Its media type; "" for an answer without a body."""
+
+
+class Route(Struct, frozen=True):
+    """One row: a method on a path."""
+
+    method: Literal["GET", "POST"]
+    """GET includes HEAD."""
+    path: str
+    """The path as OpenAPI writes it: `{name}` is a parameter."""
+    least: Role | None
+    """Least role that may use it; None lets everybody in, without a token."""
+    handler: Handler
+    summary: str = ""
+    """Description for the OpenAPI document; "" leaves the row out of it."""
+    takes: type | str | None = None
+    """Type of the request's body, or the name of a message of the bus; None without a body."""
+    forms: tuple[str, ...] = (JSON,)
+    """Media types of the request's body."""
+    gives: Mapping[int, Body] = {}
+    """The answers by HTTP status. Every error is a `Problem`."""
+    paced: bool = True
+    """False exempts it from the request rate limit.
+
+    A stop must always go through. A page that reconnects must not be kept out by another program
+    that uses the same token.
+    """
+
+    @property
+    def parameters(self) -> list[str]:
+        """The names of the path's parameters."""
+        return _PARAMETER.findall(self.path)
+
+    @property
+    def pattern(self) -> str:
+        """The path with the pattern of each parameter, for the router."""
+        patterns = {name: PARAMETERS.get(name, "[^{}/]+") for name in self.parameters}
+        return _PARAMETER.sub(lambda found: f"{{{found[1]}:{patterns[found[1]]}}}", self.path)
+
+
+def asked(topic: Topic) -> bool:
+    """Return whether the topic has a value that a program may request."""
+    return topic.direction in ("out", "query") and topic.key not in NOT_ASKED
+
+
+def values(handler: Handler) -> Iterator[Route]:
+    """Yield the row of each key whose last value a program may request."""
+    for topic in filter(asked, TOPICS):
+        path = f"/api/{topic.key.replace('<Type>', '{type}')}"
+        gives = {200: Body("The last value.", topic.type if topic.type in SCHEMAS else "")}
+        yield Route("GET", path, least_role(topic.key), handler, topic.note, gives=gives)
+
+
+def services(handler: Handler) -> Iterator[Route]:
+    """Yield the row of each service."""
+    notes = {topic.key: topic.note for topic in TOPICS}
+    for key, verb in VERBS.items():
+        gives = {
+            200: Body("It was done.", "ServiceReply"),
+            409: Body("It was not done, and why.", "ServiceReply"),
+        }
+        yield Route(
+            "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],
+            takes=PAYLOADS.get(verb), gives=gives, paced=verb != "stop",
+        )  # fmt: skip
