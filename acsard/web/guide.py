@@ -21,6 +21,7 @@ from msgspec import Struct
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
 from acsard.host import clock
 from acsard.host.errors import WORDS, Exit
+from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S
 from acsard.web.calls import Ending

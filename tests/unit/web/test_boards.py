@@ -6,7 +6,6 @@ import pytest
 
 from acsard.host.processes import Holder
 from acsard.host.serial_ports import SerialDevice
-from acsard.web.boards import boards
 from acsard.web.guide import boards
 
 MEGA = SerialDevice(
