@@ -81,4 +81,5 @@ EQUIVALENT: dict[str, str] = {
     "acsard/drive/freshness.py _Clock.__init__: 'self._paused = False' -> 'pass'": "set when the first proof ends, before it is read",
     "acsard/drive/freshness.py _Clock.__init__: 'self._paused = False' -> 'self._paused = True'": "set when the first proof ends, before it is read",
     "acsard/drive/freshness.py _Clock.judge: 'mark = (stamp_ns, -1 if command.sequence is None else command.sequence)' -> 'mark = (stamp_ns, -2 if command.sequence is None else command.sequence)'": "no sender has a number below 0",
+    "acsard/drive/freshness.py _Proof._constant: 'pairs = [min(pair) for pair in zip(minima[::2], minima[1::2], strict=True)]' -> 'pairs = [min(pair) for pair in zip(minima[1::2], minima[::2], strict=True)]'": "the minimum of a pair is the same in either order",
 }

@@ -331,6 +331,14 @@ def test_a_second_and_a_sixtieth_of_the_proof_time_is_forgiven_at_once(
     assert sender.steadily(late, 30)[-1] == verdict
 
 
+def test_a_fourth_jump_of_300_ms_is_over_the_second_that_is_forgiven() -> None:
+    sender, ends = Sender(), list[Verdict]()
+    for jump in range(1, 5):
+        assert sender.sends(NS_PER_S, jump * 300 * MS) == "stale"
+        ends.append(sender.steadily(jump * 300 * MS, 30)[-1])
+    assert ends == ["set", "set", "set", "stale"]
+
+
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
 def test_after_a_pause_that_took_all_a_sixtieth_of_the_time_is_forgiven(
     beyond: int, verdict: Verdict
@@ -388,8 +396,8 @@ def numbered(freshness: Freshness, at_ns: int, number: int, sender: str = "a") -
 @pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "fresh")])
 def test_numbers_without_stamps_begin_again_after_over_2_s(beyond: int, verdict: Verdict) -> None:
     freshness = Freshness()
-    assert numbered(freshness, 0, 6) == "fresh"
-    assert numbered(freshness, 2 * NS_PER_S + beyond, 5) == verdict
+    assert numbered(freshness, NS_PER_S, 6) == "fresh"
+    assert numbered(freshness, 3 * NS_PER_S + beyond, 5) == verdict
 
 
 @pytest.mark.parametrize(("others", "verdict"), [(1023, "stale"), (1024, "fresh")])
