@@ -188,7 +188,8 @@ class Robot:
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
-        status = (self._life.mode.value, self._reason(), self.session.link, self._choice.source)
+        link = self.session.link
+        status = (self._life.mode.value, self._reason(), link, self._choice.source)
         another, self._status = status != self._status, status
         # Otherwise neither the mode nor the commander has changed.
         if another or news:
@@ -200,7 +201,7 @@ class Robot:
             line,
             self._speeds,
             applied,
-            status[2] == "up",
+            link == "up",
             estimates,
             *status,
             self._choice.arrived_ns,

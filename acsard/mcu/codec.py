@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import lru_cache
 from typing import Literal
 
 from acsard.config.settings import WheelMap
@@ -94,15 +95,13 @@ class Codec:
 
         Raise `FrameError` unless all of it is valid.
         """
-        match = _LINE.fullmatch(line)
-        if match is None:
+        words = _words(line)
+        if words is None:
             raise FrameError("malformed", line)
         wheel: list[float | None] = [None] * 4
-        a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
         places = self._by_word
-        for word, digits in (a, of_a), (b, of_b), (c, of_c), (d, of_d):
+        for word, speed in words:
             index, sign = places[word]
-            speed = float(digits)
             if speed > MAX_SPEED:
                 raise FrameError("over_range", line)
             wheel[index] = speed * sign
@@ -110,6 +109,17 @@ class Codec:
         if front_right is None or front_left is None or rear_left is None or rear_right is None:
             raise FrameError("wheel_twice", line)
         return WheelSpeeds(front_right, front_left, rear_left, rear_right)
+
+
+# A robot at rest reports one line again and again.
+@lru_cache(16)
+def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
+    """Return the four words of a line, each a motor and its direction, with their speeds."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return None
+    a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
+    return (a, float(of_a)), (b, float(of_b)), (c, float(of_c)), (d, float(of_d))
 
 
 def _token(letter: str, speed: float) -> str:

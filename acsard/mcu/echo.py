@@ -57,19 +57,16 @@ class EchoDetector:
     def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
         """Take a report without its end, and the speeds in it; return whether it is an echo."""
         self._reports += 1
-        before, self._runs = self._runs, {}
+        runs: dict[int, _Run] = {}
+        first, found = (0, 0.0, speeds), False
         for number, sent in self._sent:
             if line == sent:
                 offset = self._reports - number
-                self._runs[offset] = _longer(before.get(offset, (0, 0.0, speeds)), speeds)
-        return any(
-            equal >= REPORTS and change >= CHANGE for equal, change, _ in self._runs.values()
-        )
-
-
-def _longer(run: _Run, speeds: WheelSpeeds) -> _Run:
-    equal, change, before = run
-    if before != speeds:
-        pairs = zip(before.as_tuple(), speeds.as_tuple(), strict=True)
-        change += max([abs(now - then) for then, now in pairs])
-    return equal + 1, change, speeds
+                equal, change, before = self._runs.get(offset, first)
+                if before != speeds:
+                    pairs = zip(before.as_tuple(), speeds.as_tuple(), strict=True)
+                    change += max([abs(now - then) for then, now in pairs])
+                runs[offset] = equal + 1, change, speeds
+                found = found or (equal + 1 >= REPORTS and change >= CHANGE)
+        self._runs = runs
+        return found

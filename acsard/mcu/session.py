@@ -242,7 +242,7 @@ class McuSession:
             self._link.sign("blocked")
         # The link is never up in the update that saw a restart: the arbiter must see it lost first.
         self._link.judge(now_ns, may_rise=not self._starting_over)
-        check, up = self.negotiation, self.link == "up"
+        check, up = self.negotiation, self._link.state == "up"
         quiet = not up and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
         if quiet and (check.state == "plain" or check.checked):
             check.begin()
@@ -275,7 +275,7 @@ class McuSession:
 
     def _announce(self) -> None:
         """Add an event for the link and one for the check if they have changed."""
-        link, check = self.link, self.negotiation
+        link, check = self._link.state, self.negotiation
         before = self._announced
         self._announced = (link, check.in_force, bool(check.trouble), self.blocked)
         if self._announced == before:

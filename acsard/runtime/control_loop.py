@@ -129,7 +129,7 @@ class ControlLoop:
     @property
     def retry_ns(self) -> int | None:
         """Monotonic time of the next step for a command that came too soon after a line, if any."""
-        return self._pace.retry_ns(self._port.sent_ns)
+        return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
 
     @property
     def listens(self) -> bool:

@@ -84,7 +84,11 @@ class Pace:
         """Whether a command that arrives now is worth a step of its own."""
         return self._possible and not (self._tried or self._waiting or self._idle > IDLE_WAKES)
 
+    @property
+    def waits(self) -> bool:
+        """Whether a new command waits for its distance to the line before."""
+        return self._waiting and self._possible and not self._tried
+
     def retry_ns(self, sent_ns: int) -> int | None:
         """Return the monotonic time at which a waiting command may go, or None if none waits."""
-        ahead = self._waiting and self._possible and not self._tried
-        return sent_ns + self._gap_ns if ahead else None
+        return sent_ns + self._gap_ns if self.waits else None

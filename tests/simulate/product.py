@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -47,7 +47,7 @@ Estimate = tuple[int, float, float, float, tuple[float, ...], tuple[float, ...]]
 NONE: Sequence[Estimate] = ()
 
 
-class Seen(NamedTuple):
+class Seen(msgspec.Struct, frozen=True, gc=False):
     """What one control step showed to the outside."""
 
     at_ns: int
