@@ -11,6 +11,7 @@ import zenoh
 from acsard.bus.robot_discovery import ALL, robot_of
 from acsard.bus.subscription import encoded
 from acsard.client import Client
+from acsard.client.follower import FLEET_ASK_S
 from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.messages.encodings import DecodeError, Decoder
@@ -28,7 +29,7 @@ names."""
 FORGET_NS = 30 * NS_PER_S
 """A robot that has been silent for longer is dropped, unless its liveliness token is present."""
 
-ASK_NS = 2 * NS_PER_S
+ASK_NS = int(FLEET_ASK_S * NS_PER_S)
 """Interval between queries to a robot that has not reported its version."""
 
 UNROUTED = (

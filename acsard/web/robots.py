@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import msgspec
+import zenoh
 from msgspec import Struct
 
 from acsard.bus.address import Address
+from acsard.bus.subscription import encoded
 from acsard.bus.tls import shown_at
 from acsard.client import Client
+from acsard.client.follower import Follower, restarted
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
@@ -32,12 +37,6 @@ AGAIN_S = 1.0
 ASK_S, ASK_SOON_S = 10.0, 1.0
 """Interval of queries for the daemon's version and limits: after an answer, and until the first
 answer."""
-
-MISSING = 3
-"""Number of consecutive missing states after which the daemon counts as silent, after `SILENT_S` at
-the earliest."""
-
-SILENT_S = 1.5
 
 WISHED_NS = 2 * NS_PER_S
 """Maximum age of a commanded twist in the plots."""
@@ -93,7 +92,9 @@ class Robots:
         self._states, self._poses = Decoder(RobotState), Decoder(PoseStamped)
         self._wishes = Decoder(TwistStamped)
         self._asks = asyncio.Event()
-        self.state: RobotState | None = None
+        self._follower = Follower(0.0)
+        self._answers: deque[zenoh.Sample] = deque()
+        """Answers to queries of the state. A thread of Zenoh appends them here."""
 
     async def run(self) -> None:
         """Follow the robot until cancelled. Raises a `MendableError` that a retry cannot fix."""
@@ -103,6 +104,11 @@ class Robots:
             await self._watch(await self._following("state"))
         finally:
             asking.cancel()
+
+    @property
+    def state(self) -> RobotState | None:
+        """The newest state, or None before the first one."""
+        return self._follower.state
 
     def ask_anew(self) -> None:
         """Query the daemon's facts again because they may have changed."""
@@ -137,17 +143,26 @@ class Robots:
                 await asyncio.sleep(AGAIN_S)
 
     async def _watch(self, states: Stream) -> None:
-        seen, heard_ns, truth = 0, 0, None
+        seen, truth, asking = 0, None, None
+        follower = self._follower = Follower(clock.mono_ns() / NS_PER_S)
         while True:
             now_ns = clock.mono_ns()
+            now = now_ns / NS_PER_S
+            while self._answers:
+                self._take(encoded(self._answers.popleft()), now_ns, now_ns, asked=True)
             if states.number != seen:
-                seen, heard_ns = states.number, now_ns
-                self._take(states, now_ns)
-            silence_ns = max(SILENT_S, MISSING / self.about.state_hz) * NS_PER_S
-            quiet = now_ns - heard_ns > silence_ns
-            if quiet and (seen or not self.gone):
-                self.gone = f"nothing is heard of the daemon at {self.endpoint}: does it run?"
-            elif not quiet and self.gone:
+                seen = states.number
+                self._take(states.raw() or ("", b""), states.at_ns, now_ns, asked=False)
+            if follower.asks(now) and (asking is None or asking.done()):
+                asking = asyncio.create_task(self._ask_state())
+            quiet = follower.silent(now)
+            if quiet and (follower.heard or not self.gone):
+                self.gone = (
+                    f"nothing is heard of the daemon at {self.endpoint}: does it run?"
+                    if not follower.unreadable
+                    else "the daemon's state cannot be read: is it of another version?"
+                )
+            elif follower.heard and not quiet and self.gone:
                 self.gone = ""
                 self.ask_anew()
             if self.about.simulated and truth is None:
@@ -156,18 +171,30 @@ class Robots:
                 self._take_truth(truth, now_ns)
             await asyncio.sleep(LOOK_S)
 
-    def _take(self, states: Stream, now_ns: int) -> None:
-        before = self.state
+    def _take(self, told: tuple[str, bytes], at_ns: int, now_ns: int, *, asked: bool) -> None:
+        follower, now = self._follower, now_ns / NS_PER_S
+        before = follower.state
         try:
-            state = self.state = self._states.decode(*(states.raw() or ("", b"")))
+            state = self._states.decode(*told)
         except DecodeError:
+            follower.unreadable += 1
             self._counts.add("unreadable")
             return
-        if before is not None and state.counters.get("lines", 0) < before.counters.get("lines", 0):
-            self._paths = {name: _path() for name in self._paths}  # the daemon was restarted
+        if not asked:
+            follower.published(state, now)
+        elif not follower.answered(state, now):
+            return
+        if restarted(before, state):
+            self._paths = {name: _path() for name in self._paths}
         self._paths["path"].add(Place(now_ns / NS_PER_S, state.x, state.y, state.yaw))
-        if self._minute.due(states.at_ns):
-            self._minute.add(states.at_ns, state, self._wished(now_ns))
+        if self._minute.due(at_ns):
+            self._minute.add(at_ns, state, self._wished(now_ns))
+
+    async def _ask_state(self) -> None:
+        client = self.client
+        assert client is not None
+        with suppress(*UNREADY):
+            await in_thread(lambda: client.ask("state", self._answers.append), None)
 
     def _wished(self, now_ns: int) -> Twist | None:
         """Return the commanded twist if it is recent and a viewer of this server follows it."""

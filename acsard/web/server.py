@@ -116,7 +116,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         await _until(leaving, robots, hand, page, wanted)
         page.end_all("the page's server ends")
         await asyncio.sleep(0)
-        await asyncio.to_thread(hand.flush, LEAVE_S)
+        await asyncio.to_thread(hand.outbox.flush, LEAVE_S)
 
 
 async def _until(
@@ -127,7 +127,7 @@ async def _until(
         asyncio.create_task(leaving.wait()),
         asyncio.create_task(robots.run()),
         asyncio.create_task(_tidy(page)),
-        asyncio.wrap_future(hand.dead),
+        asyncio.wrap_future(hand.outbox.dead),
     ]
     if wanted.held:
         work.append(asyncio.create_task(_held(leaving)))

@@ -14,13 +14,14 @@ from typing import Any
 import aiohttp
 from aiohttp import web
 
+from acsard.client.commander import Commander, Sender, Wish
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.messages.signature import public_name
-from acsard.values import NS_PER_S
+from acsard.values import Twist
 from acsard.web import told
 from acsard.web.calls import Calls
-from acsard.web.commands import Hand, Order
+from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
 from acsard.web.frames import (
@@ -48,9 +49,6 @@ HEARTBEAT_S = 10.0
 
 CALLS_AT_ONCE = 8
 
-DROVE_NS = NS_PER_S
-"""Maximum age of the last command for which a viewer still counts as driving."""
-
 FLEET, FLEET_S = "fleet", 1.0
 
 LOOK_S = 0.25
@@ -73,8 +71,9 @@ class Viewer:
         counts: Counts,
     ) -> None:
         self.who = who
-        self._sender_id = sender_id(who.name)
-        self.sender = public_name(self._sender_id, robots.certificate)
+        whole = sender_id(who.name)
+        self._sender, self._commander = Sender(whole), Commander()
+        self.sender = public_name(whole, robots.certificate)
         """Public name that `state.sender` has while this viewer drives. The page never learns the
         secret part."""
         self._socket = socket
@@ -87,8 +86,8 @@ class Viewer:
         self._tasks: set[asyncio.Task[None]] = set()
         self._stops: set[asyncio.Task[None]] = set()
         self._ended = False
-        self._last: Order | None = None
-        self._sequence = 0
+        self._stamp_ns = -1
+        """Stamp of the last command."""
         self._gone, self._about = "", robots.about
         self._fleet_due: float | None = None
 
@@ -177,46 +176,26 @@ class Viewer:
                 self._guide.press(self, frame)
 
     def _command(self, frame: Command) -> None:
-        stamp_ns, before_ns = frame.stamp_ns, self._last.stamp_ns if self._last else -1
-        if stamp_ns == before_ns and not frame.moves:
+        stamp_ns = frame.stamp_ns
+        if stamp_ns == self._stamp_ns and not frame.moves:
             # Some clocks stand still for a while. A zero command with an equal stamp is still a
             # genuine release.
             stamp_ns += 1
-        if stamp_ns <= before_ns:
+        if stamp_ns <= self._stamp_ns:
             self._out.refuse(
                 "cmd", "replayed", "stamp must be later than that of the command before"
             )
             return
-        self._sequence += 1
-        twist, now_ns = frame.cmd, clock.mono_ns()
-        self._last = Order(
-            self._sender_id,
-            twist.linear_x,
-            twist.angular_z,
-            stamp_ns,
-            self._sequence,
-            now_ns,
-            frame.steady,
-        )
-        self._hand.give(self._last)
+        self._stamp_ns = stamp_ns
+        wish = Wish(Twist(frame.cmd.linear_x, frame.cmd.angular_z), stamp_ns, frame.steady)
+        self._hand.give(self._commander, self._sender, wish)
 
     def _release(self) -> None:
-        """Send one zero command if this viewer was driving, stamped with the present time of its
-        own clock.
+        """Send one zero command if the robot may still follow this viewer, by its own clock.
 
         This is the last command that is sent for this viewer.
         """
-        last, self._last = self._last, None
-        now_ns = clock.mono_ns()
-        # The command timeout has already released a viewer that fell silent. A zero now would only
-        # get in the way of the next driver.
-        if last is None or not last.moves or now_ns - last.given_ns > DROVE_NS:
-            return
-        stamp_ns = last.stamp_ns + now_ns - last.given_ns
-        self._sequence += 1
-        self._hand.give(
-            Order(self._sender_id, 0.0, 0.0, stamp_ns, self._sequence, now_ns, last.steady)
-        )
+        self._hand.outbox.release(self._commander)
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":

@@ -98,7 +98,7 @@ def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside
                 await asyncio.sleep(0.01)
             await ours.say(ping=1)
             await asyncio.sleep(0.2)
-            inside.hand.flush(PATIENCE_S)
+            inside.hand.outbox.flush(PATIENCE_S)
             assert inside.counts.all() == before
             wire.abort()
 
@@ -231,7 +231,7 @@ def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
     wanted = Wanted(Config(), address, (), "", tmp_path, next_port=False, held=False)
 
     async def story() -> None:
-        inside.hand.dead.set_exception(MemoryError("no room"))
+        inside.hand.outbox.dead.set_exception(MemoryError("no room"))
         with pytest.raises(MemoryError):
             await _until(asyncio.Event(), inside.robots, inside.hand, inside.page, wanted)
 

@@ -1,17 +1,19 @@
-"""The thread that sends commands drops those it cannot send, and never dies unnoticed."""
+"""What cannot be put on the bus is dropped and counted, and the next command is looked at."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from acsard.client import Client
-from acsard.host import clock
-from acsard.web.commands import Hand, Order
+from acsard.client.commander import Commander, Sender, Wish
+from acsard.messages.signature import unpack
+from acsard.values import Twist
+from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 
 PATIENCE_S = 20.0
 
-
-def order(sender: str) -> Order:
-    return Order(sender, 0.2, 0.0, 1, 1, clock.mono_ns())
+AHEAD = Wish(Twist(0.2, 0.0), 1000, steady=True)
 
 
 def test_what_cannot_be_sent_is_dropped_and_the_next_one_is_looked_at() -> None:
@@ -20,17 +22,30 @@ def test_what_cannot_be_sent_is_dropped_and_the_next_one_is_looked_at() -> None:
 
     counts = Counts()
     hand = Hand(broken, counts)
-    for sender in ("a", "b", "a"):
-        hand.give(order(sender))
-        hand.flush(PATIENCE_S)
+    senders = {name: (Commander(), Sender(name)) for name in "ab"}
+    for name in "aba":
+        hand.give(*senders[name], AHEAD)
+        hand.outbox.flush(PATIENCE_S)
     assert counts.all() == {"commands_dropped": 3}
-    assert not hand.dead.done()
+    assert not hand.outbox.dead.done()
 
 
-def test_a_hand_that_dies_says_so() -> None:
-    def deadly() -> Client | None:
-        raise SystemExit
+def test_a_command_is_put_with_the_stamp_and_the_clock_of_its_sender() -> None:
+    put: list[Any] = []
 
-    hand = Hand(deadly, Counts())
-    hand.give(order("a"))
-    assert isinstance(hand.dead.exception(PATIENCE_S), SystemExit)
+    class Fake:
+        def put(self, twist: Any, signature: Any) -> None:
+            put.append((twist.linear.x, twist.angular.z, unpack(signature.pack())))
+
+    fake: Any = Fake()
+    counts = Counts()
+    hand, commander, sender = Hand(lambda: fake, counts), Commander(), Sender("joe/aa")
+    for stamp_ns in (1000, 2000):
+        hand.give(commander, sender, Wish(Twist(0.2, -0.5), stamp_ns, steady=True))
+        hand.outbox.flush(PATIENCE_S)
+    assert [(x, z) for x, z, _ in put] == [(0.2, -0.5)] * 2
+    signed = [one for *_, one in put]
+    assert [one.stamp for one in signed] == [1000, 2000]
+    assert [one.sequence for one in signed] == [1, 2]
+    assert {(one.sender, one.steady) for one in signed} == {("joe/aa", True)}
+    assert counts.all() == {"commands": 2}
