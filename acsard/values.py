@@ -143,7 +143,7 @@ class Request(Struct, frozen=True):
     asked_ns: int | None = None
     """Monotonic time of its arrival. A clear must not undo a stop that came after it."""
     by: str = ""
-    """Name of the client, as in `incoming/asker.py`."""
+    """Name of the client, as in `incoming/commands.py`."""
     settings: dict[str, Plain] = {}
     """The settings that `set` changes, by key as in `config/live.py`."""
     latch: int | None = None
@@ -470,7 +470,7 @@ class Snapshot(Struct, frozen=True):
     missed_last_minute: int = 0
     """Number of periods without a step in the last minute."""
     figures: dict[str, Measured] = {}
-    """The daemon's own latencies, by the names in `runtime/figures.py`."""
+    """The daemon's own latencies, by the names in `runtime/latencies.py`."""
     gyro: GyroStatus = GyroStatus()
     doubt: WheelsStatus = WheelsStatus()
     check: str = "plain"

@@ -24,9 +24,8 @@ from msgspec import Struct
 
 from acsard.asking.attendant import number_of
 from acsard.calibration.guided.steps import Ask
-from acsard.host.config_file import writable
+from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
-from acsard.host.files import change, require_changeable
 from acsard.web.lines import Doing, Found, Progress, Question, Result, Subject, Told
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ its last line.
 The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
 after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
 three times would be as late. On a computer that is too busy for this, the leg has ended before,
-because the daemon was silent for 0.5 s (calibration/guided/riding.py). When a person drives by
+because the daemon was silent for 0.5 s (client/riding.py). When a person drives by
 hand, each command is a sign of life, and the source's timeout applies.
 """
 

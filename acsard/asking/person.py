@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Self
 
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson

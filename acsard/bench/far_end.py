@@ -17,13 +17,12 @@ from pathlib import Path
 import msgspec
 from msgspec.structs import replace
 
-from acsard.bench.matching import staircase
-from acsard.bench.record import Seen
+from acsard.bench.matching import Seen, staircase
 from acsard.config.parsing import from_builtins
 from acsard.config.settings import Config
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
-from acsard.serial.pty_end import PtyEnd
+from acsard.serial.sim_pty import PtyEnd
 from acsard.sim.fake_mcu import FakeMcu
 
 PRIORITY = 80

@@ -22,7 +22,7 @@ from acsard.config.settings import BusConfig, RosConfig
 from acsard.host import clock
 from acsard.host.errors import InUseError
 from acsard.host.threads import in_thread
-from acsard.incoming.bus import BusInput, Waker
+from acsard.incoming.bus_interface import BusInput, Waker
 from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Reply
 from acsard.messages.encodings import encoding_name

@@ -13,7 +13,7 @@ import zenoh
 
 from acsard.bus.replies import Replies
 from acsard.host import clock
-from acsard.incoming.bus import NOTHING, BusInput, Waker
+from acsard.incoming.bus_interface import NOTHING, BusInput, Waker
 from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival, Via
 from acsard.incoming.queries import BUSY, Query, most_bytes, refused
 from acsard.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key, source_keys

@@ -16,8 +16,8 @@ import zenoh
 from acsard.bus.certificates import CA, CERTIFICATE, KEY, require_usable
 from acsard.bus.tls_trouble import trouble
 from acsard.config.settings import TLS, BusConfig
-from acsard.host.colours import coloured
 from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
+from acsard.host.terminal import coloured
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0

@@ -83,6 +83,10 @@ class Subscription:
                 return sample
         return None
 
+    def wakes(self, wake: Callable[[], object]) -> None:
+        """Call `wake` on Zenoh's thread whenever a sample arrives or the subscription ends."""
+        self._queue.wakes(wake)
+
     def add(self, sample: zenoh.Sample) -> None:
         """Append a sample that a query fetched, as if it had been published."""
         self._queue.take(sample)

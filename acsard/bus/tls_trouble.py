@@ -32,7 +32,9 @@ def trouble(endpoint: str, directory: str) -> str:
 
     Returns "" if this machine finds no fault. Takes a few seconds at most.
     """
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    # An endpoint may end with options of Zenoh: `?metadata` and `#configuration`.
+    bare = endpoint.partition("?")[0].partition("#")[0]
+    host, _, port = bare.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     try:
         plain = socket.create_connection((host, int(port)), PATIENCE_S)

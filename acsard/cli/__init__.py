@@ -21,8 +21,7 @@ from acsard import __version__
 from acsard.cli.exits import code_of
 from acsard.config.nearest import nearest
 from acsard.formatting import lines
-from acsard.host.errors import MendableError
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit, MendableError
 from acsard.values import AcsardError
 
 VERBS = (

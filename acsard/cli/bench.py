@@ -72,9 +72,8 @@ def main(args: argparse.Namespace) -> int:
 
     import msgspec
 
-    from acsard.bench.measure import measure
-    from acsard.bench.setup import bench_config
-    from acsard.bench.table import parts
+    from acsard.bench.measure import bench_config, measure
+    from acsard.bench.results_table import parts
     from acsard.serial.device import require
     from acsard.terminal.output import show
 

@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
 from acsard.cli.common import JSON_LINES, add_bus, load
-from acsard.host.config_file import writable
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
-from acsard.host.files import change
+from acsard.host.config_file import change, writable
+from acsard.host.errors import Exit, ExitError, UsageError
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonAttendant

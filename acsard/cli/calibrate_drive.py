@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from acsard.calibration.guided.setup import Setup
     from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
-    from acsard.cli.calibrate_robot import Robot
     from acsard.client import Client
+    from acsard.client.legs import Robot
     from acsard.config.settings import Config
 
 DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
@@ -73,9 +73,9 @@ def guided(
     from acsard.calibration.guided.setup import setup
     from acsard.calibration.guided.steps import GuideError
     from acsard.calibration.guided.ways import KINDS
-    from acsard.cli.calibrate_robot import SOURCE, Robot
     from acsard.cli.common import require_one
     from acsard.client import connect
+    from acsard.client.legs import SOURCE, Robot
     from acsard.messages.topics import full_key
 
     require_one(args)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
 from acsard.formatting import json_line, lines, printable
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.messages.topics import SERVICES
 
 if TYPE_CHECKING:

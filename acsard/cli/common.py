@@ -14,8 +14,7 @@ from acsard.config.parsing import ConfigError
 from acsard.config.settings import RECORD, Config
 from acsard.formatting import many, printable
 from acsard.host.config_file import find
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.messages.topics import key_hint, row_of, unknown
 
 Overrides = dict[str, dict[str, object]]

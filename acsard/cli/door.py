@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from acsard.cli.common import add_config, load
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -32,8 +32,8 @@ def main(args: argparse.Namespace) -> int:
     import os
 
     from acsard.bus.session import log_from_environment
-    from acsard.door.door import Door
-    from acsard.door.watched import Watched
+    from acsard.door.supervision import Watched
+    from acsard.door.tls_gateway import Door
     from acsard.host.logs import Log
     from acsard.host.systemd import Systemd
 

@@ -16,7 +16,7 @@ from acsard.cli.common import (
     robots_address,
     warn_of_unknown,
 )
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     import zenoh
@@ -61,7 +61,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, a count or a timeout ends it."""
     from acsard.bus.fleet import follow
-    from acsard.cli.waiting import QUIET_S, explained, lost_by, nothing, waits_for
+    from acsard.cli.waiting import explained, lost_by, nothing, waits_for
     from acsard.client import connect
 
     where, many = robots_address(args)
@@ -71,9 +71,7 @@ def main(args: argparse.Namespace) -> int:
             raise ExitError(Exit.USAGE, "a log is of one robot: --csv takes one --id")
         with (
             connect(endpoint, robot_id=robot_id, tls=tls) as robot,
-            explained(
-                waits_for(robot, args.topic[0], where), QUIET_S, lost_by(robot, where)
-            ) as heard,
+            explained(waits_for(robot, args.topic[0], where), lost_by(robot, where)) as heard,
         ):
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
@@ -92,7 +90,7 @@ def main(args: argparse.Namespace) -> int:
         elif tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             look = nothing  # the reason for the silence has just been printed
-        with explained(look, QUIET_S, lost_by(robot, where)) as heard:
+        with explained(look, lost_by(robot, where)) as heard:
             return _print(samples, decoder, args.n, bool(many), heard)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from acsard.host.errors import (
     CertificateError,
+    Exit,
+    ExitError,
     InUseError,
     MendableError,
     NoAnswerError,
@@ -16,7 +18,6 @@ from acsard.host.errors import (
     UnreachableError,
     UsageError,
 )
-from acsard.host.exits import Exit, ExitError
 
 CODES: dict[type[MendableError], Exit] = {
     ReplyError: Exit.FAILURE,

@@ -8,7 +8,7 @@ import sys
 
 from acsard.cli.common import add_bus, robot_address
 from acsard.formatting import lines
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 
 DEFAULT = "127.0.0.1:8765"

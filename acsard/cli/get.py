@@ -8,7 +8,7 @@ import sys
 from acsard import formatting
 from acsard.cli.common import MANY, add_bus, require_asked, robots_address
 from acsard.formatting import printable
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.values import AcsardError
 
 

@@ -33,7 +33,7 @@ def main(args: argparse.Namespace) -> int:
 
     import msgspec
 
-    from acsard.cli.waiting import QUIET_S, explained, lost_by, waits_for
+    from acsard.cli.waiting import explained, lost_by, waits_for
     from acsard.client import connect
 
     require_followed(args.topic)
@@ -43,7 +43,7 @@ def main(args: argparse.Namespace) -> int:
     left = args.n
     with (
         connect(endpoint, robot_id=robot_id, tls=tls) as robot,
-        explained(waits_for(robot, args.topic, where), QUIET_S, lost_by(robot, where)) as heard,
+        explained(waits_for(robot, args.topic, where), lost_by(robot, where)) as heard,
     ):
 
         def take(_: zenoh.Sample) -> None:

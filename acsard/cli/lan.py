@@ -13,7 +13,7 @@ from acsard.cli.common import add_config, load
 from acsard.config.settings import Config
 from acsard.config.validation import write
 from acsard.host.errors import UsageError
-from acsard.host.service import TLS
+from acsard.host.service_installation import TLS
 from acsard.lan import identities
 from acsard.values import ROLES
 
@@ -115,7 +115,7 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 def main_init(args: argparse.Namespace) -> int:
     """Make the authority, the robot's certificate and one client certificate per role."""
-    from acsard.host.files import require_changeable, require_tomlkit
+    from acsard.host.config_file import require_changeable, require_tomlkit
 
     directory = args.directory.resolve()
 
@@ -145,7 +145,7 @@ def main_init(args: argparse.Namespace) -> int:
 
 def main_add(args: argparse.Namespace) -> int:
     """Make one more client certificate."""
-    from acsard.host.files import change, require_changeable, require_tomlkit
+    from acsard.host.config_file import change, require_changeable, require_tomlkit
 
     listed = f"{args.role}s"
 
@@ -187,7 +187,7 @@ def main_renew(args: argparse.Namespace) -> int:
 def main_router(args: argparse.Namespace) -> int:
     """Print the configuration of a fleet's router."""
     from acsard.bus.address import require_id
-    from acsard.host.service import source
+    from acsard.host.service_installation import source
     from acsard.lan.router_file import router_file
 
     for robot in args.robots:
@@ -204,7 +204,7 @@ def _certified(names: list[str]) -> str:
 
 def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
     """Set the keys of the bus in a configuration file and keep its comments."""
-    from acsard.host.files import change
+    from acsard.host.config_file import change
 
     changed = change(file, keys, new=True)
     print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
@@ -216,7 +216,7 @@ def _admit_service(directory: Path) -> None:
     It writes a systemd drop-in with the permitted networks and the certificates, and does nothing
     without an installed service.
     """
-    from acsard.host import service
+    from acsard.host import service_installation as service
 
     step = service.admitting(directory)
     if step is None:

@@ -14,7 +14,7 @@ from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
 from acsard.formatting import json_line, many, printable
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.record.closing import Closing

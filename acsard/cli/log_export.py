@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from acsard.cli import log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.record.export import Kind

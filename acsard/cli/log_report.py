@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from acsard.cli import log_span
 from acsard.cli.log_progress import telling
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 from acsard.values import NS_PER_S
 
@@ -89,7 +89,7 @@ def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Wo
 
     The progress in percent goes to standard error.
     """
-    from acsard.host.parent import end_with_parent
+    from acsard.host.processes import end_with_parent
     from acsard.record.closing import closing
 
     end_with_parent(signal.SIGKILL)

@@ -94,7 +94,7 @@ def stretches(recording: Recording) -> list[Stretch]:
         if found and 0 <= wall_ns - last_ns < SET_NS:
             found[-1] = found[-1]._replace(end=wall_ns / NS_PER_S)
         else:
-            times = [*_instants(recording, before), *_instants(recording, data)]
+            times = [*_instants(before), *_instants(data)]
             if not found and times:
                 found.append(_from(recording, times[0]))
             for one, other in pairwise(times):
@@ -111,11 +111,11 @@ def _from(recording: Recording, now: Instant) -> Stretch:
     return Stretch(at, now.wall_ns / NS_PER_S, now.wall_ns / NS_PER_S)
 
 
-def _instants(recording: Recording, data: bytes) -> list[Instant]:
+def _instants(data: bytes) -> list[Instant]:
     """Return the time of each step in a message."""
     from acsard.record.batch import BatchError, decode
 
     try:
-        return [step.inputs.now for step in decode(data, "", recording.about.format)]
+        return [step.inputs.now for step in decode(data)]
     except BatchError:
         return []

@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING
 
 from acsard.asking.person import SIMULATOR, Nobody, Person, answering, ended_by_signals
 from acsard.cli.common import JSON_LINES, Overrides, add_config, load
-from acsard.host.config_file import writable
-from acsard.host.errors import MendableError, UsageError
-from acsard.host.exits import Exit
-from acsard.host.files import change
+from acsard.host.config_file import change, writable
+from acsard.host.errors import Exit, MendableError, UsageError
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson

@@ -11,7 +11,7 @@ import time
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, load, robot_address
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.client import Client, Subscription
@@ -26,9 +26,6 @@ of the lines, what they round away, gaps, slip, wheel radii and track, and the g
 used; and what to do about the largest. It sends nothing. Of a robot that stands it says what the
 settings tell.
 """
-
-FIRST_S = 3.0
-"""Time allowed for the first feedback line, s."""
 
 LOOK_S = 0.05
 
@@ -107,6 +104,8 @@ def _await_line(robot: Client, lines: Subscription) -> None:
 
     Raises `ExitError` with the robot's reason if none arrives within `FIRST_S`.
     """
+    from acsard.client.follower import FIRST_S
+
     end = time.monotonic() + FIRST_S
     while lines.try_recv() is None:
         if time.monotonic() > end:

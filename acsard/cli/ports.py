@@ -23,7 +23,7 @@ def main(args: argparse.Namespace) -> int:
     """List the ports."""
     import msgspec
 
-    from acsard.host.ports import serial_devices
+    from acsard.host.serial_ports import serial_devices
 
     found = serial_devices()
     if args.json:

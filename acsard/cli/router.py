@@ -34,8 +34,8 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.bus.session import log_from_environment
     from acsard.config.settings import LogConfig
-    from acsard.door.router import Router
-    from acsard.door.watched import Watched
+    from acsard.door.fleet_router import Router
+    from acsard.door.supervision import Watched
     from acsard.host.logs import Log
     from acsard.host.systemd import Systemd
 

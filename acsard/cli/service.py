@@ -8,11 +8,10 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from acsard.host.errors import MendableError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, MendableError
 
 if TYPE_CHECKING:
-    from acsard.host.steps import Step
+    from acsard.host.installation_steps import Step
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -49,8 +48,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main_install(args: argparse.Namespace) -> int:
     """Write the files, reload systemd, and enable and start the service."""
-    from acsard.host import service
-    from acsard.host.placement import misplaced
+    from acsard.host import service_installation as service
+    from acsard.host.service_installation import misplaced
 
     _ready(args)
     trouble = misplaced()
@@ -68,7 +67,7 @@ def main_install(args: argparse.Namespace) -> int:
 
 def main_uninstall(args: argparse.Namespace) -> int:
     """Stop and disable the service and remove its files."""
-    from acsard.host import service
+    from acsard.host import service_installation as service
 
     _ready(args)
     files = [*service.files(), *map(service.lan_drop_in, service.ALL)]
@@ -87,7 +86,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 def main_status(args: argparse.Namespace) -> int:
     """Print the state of files and units. Return 0 if the daemon's unit is active."""
-    from acsard.host import service
+    from acsard.host import service_installation as service
     from acsard.terminal.output import show
     from acsard.terminal.tables import table
 

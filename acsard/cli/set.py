@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from acsard.cli.common import add_bus, robot_address
 from acsard.formatting import json_line, lines
 from acsard.host.config_file import writable
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 
 if TYPE_CHECKING:
@@ -53,8 +53,8 @@ def main(args: argparse.Namespace) -> int:
     """Set the settings, or list them if none is given."""
     from acsard.client import connect
     from acsard.config.lowered import stays
+    from acsard.host.config_file import change, require_changeable
     from acsard.host.errors import MendableError
-    from acsard.host.files import change, require_changeable
     from acsard.messages.encodings import encode
 
     settings = pairs(args.settings)

@@ -9,7 +9,7 @@ from pathlib import Path
 from acsard.cli.common import add_config, load
 from acsard.config.named_faults import FAULTS, RESET, NamedFault, forms, named
 from acsard.config.settings import Config
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.sim.fake_mcu import FakeMcu
 
 

@@ -8,17 +8,12 @@ from contextlib import contextmanager
 from threading import Event, Thread
 from typing import TYPE_CHECKING
 
+from acsard.client.follower import FIRST_S
 from acsard.formatting import printable
 
 if TYPE_CHECKING:
     from acsard.bus.address import Address
     from acsard.client import Client
-
-QUIET_S = 2.0
-"""Silence before it is explained, s.
-
-Published keys come sooner, or the daemon reports them as late.
-"""
 
 
 def nothing() -> str:
@@ -28,7 +23,7 @@ def nothing() -> str:
 
 @contextmanager
 def explained(
-    look: Callable[[], str], after_s: float = QUIET_S, ceased: Callable[[], str] | None = None
+    look: Callable[[], str], ceased: Callable[[], str] | None = None, after_s: float = FIRST_S
 ) -> Iterator[Callable[[], None]]:
     """Yield a function that the caller calls for each message, and explain silences.
 
@@ -37,8 +32,8 @@ def explained(
 
     Args:
         look: explains why nothing has arrived for `after_s` s, in one line; "" prints nothing.
-        after_s: silence before it is explained, s.
         ceased: explains each later silence of `after_s` s, once for each.
+        after_s: silence before it is explained, s.
     """
     come, end = Event(), Event()
 

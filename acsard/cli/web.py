@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_bus, load, recorded
 from acsard.formatting import lasting
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
 from acsard.values import ROLES
 
@@ -186,11 +185,6 @@ def _list(vault: Vault) -> int:
         show(table((one.name, one.role, until(one.ends)) for one in tokens))
     else:
         print(f"no tokens of {vault.robot} in {vault.path}")
-    if older := [one.name for one in tokens if not one.robot]:
-        print(
-            f"made before tokens had a robot, so they open the page of any here: {', '.join(older)}"
-            "; --revoke and --invite them anew"
-        )
     return int(Exit.OK)
 
 

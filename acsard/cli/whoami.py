@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

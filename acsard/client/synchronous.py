@@ -18,6 +18,7 @@ from acsard.bus.fleet import around
 from acsard.bus.identity import Identity, identity
 from acsard.bus.quiet import why as why_quiet
 from acsard.bus.subscription import Subscription, encoded, queue_on
+from acsard.client.commander import SPACING_S, Sender
 from acsard.client.driving import UnheardError, drive
 from acsard.host import clock
 from acsard.host.errors import (
@@ -28,7 +29,7 @@ from acsard.host.errors import (
     ReplyError,
     UsageError,
 )
-from acsard.host.own_name import new_secret, own_name, sender_id
+from acsard.host.own_identity import new_secret, own_name, sender_id
 from acsard.incoming.queries import BUSY
 from acsard.messages import schema
 from acsard.messages.encodings import Decoder, encode, encoding_name
@@ -47,7 +48,6 @@ from acsard.values import Plain, Pose
 AGAIN_S = 0.03
 """Pause before the next try, s, if the daemon reports too many queries."""
 
-SPACING_S = 0.003
 REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
@@ -97,13 +97,13 @@ class Client:
         # `like` can make another sender of commands on this connection, but not another caller.
         self._secret = new_secret()
         self._sign_as(f"{platform.node()[:32]}/{os.getpid()}")
-        self._sequence = 0
         # The wall clock may be set during a drive, and the daemon would take the step for a delay.
         self._wall_offset_ns = clock.now().wall_ns - clock.steady_ns()
 
     def _sign_as(self, name: str) -> None:
-        self._sender_id = sender_id(name)
-        self.sender = public_name(self._sender_id, self.certificate)
+        whole = sender_id(name)
+        self._sender = Sender(whole)
+        self.sender = public_name(whole, self.certificate)
         """Value of `state.sender` while the robot follows this client."""
 
     @property
@@ -248,6 +248,21 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
+    def put(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
+        """Send one command with a signature, for a program that forwards another sender's."""
+        self._puts.wait()
+        self._publish(twist, signature)
+
+    def _publish(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
+        self.session.put(
+            self.key(self.command_key(self.source)),
+            encode(twist, "msgpack"),
+            encoding=encoding_name("msgpack", type(twist).__name__),
+            express=True,
+            attachment=signature.pack(),
+            timestamp=self.session.new_timestamp(),
+        )
+
     def _put(self, linear: float, angular: float, stamp_ns: int | None) -> None:
         self._puts.wait()
         steady = stamp_ns is None
@@ -257,15 +272,7 @@ class Client:
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
-        self._sequence += 1
-        self.session.put(
-            self.key(self.command_key(self.source)),
-            encode(message, "msgpack"),
-            encoding=encoding_name("msgpack", "TwistStamped"),
-            express=True,
-            attachment=Signature(self._sender_id, stamp_ns, self._sequence, steady).pack(),
-            timestamp=self.session.new_timestamp(),
-        )
+        self._publish(message, self._sender.sign(stamp_ns, steady=steady))
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         """Return the first reply. A stranger may send any number of further ones."""

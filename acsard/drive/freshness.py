@@ -5,8 +5,7 @@ The offset cancels out against the minimum of all delays: a command is stale if 
 the minimum by more than its timeout, or if its stamp lies before that of an accepted command.
 
     new      the minimum is not known: the delays must stop falling first, as a backlog's never do
-    known    the minimum is believed
-    stepped  (foreign clocks only) late or early by the minimum: held up, or the clock was set
+    known    the minimum is believed, until a proof of another one ends
 
 There are two kinds of clocks. A *steady* clock is never adjusted: our client, tools and page say so
 with `"steady": true`. Its command that looks late is late, and stays refused. A *foreign* clock may
@@ -39,9 +38,6 @@ EARLY_NS = NS_PER_S // 20
 WAVER_NS = NS_PER_S
 """Delays that rise by more than this are not jitter: the network held commands back."""
 
-FALLS_NS = NS_PER_S // 50
-"""The last of several minima that is lower by more than this still falls."""
-
 EVEN, CREPT = 200, 20
 """A proof allows the minimum of the delays to change by one part in this of the time it takes. The
 halves of that time are compared, so the slopes are twice that: 1 %, or 10 % for a clock that crept
@@ -63,16 +59,9 @@ GAP_NS = 2 * NS_PER_S
 sender paused for this time by its own stamps. Numbers tell a pause from commands that were lost."""
 
 STANDS_NS = 10_000
-"""Two stamps that are no further apart, of commands that did not arrive together, show a clock that
-was set back. Zenoh's own clock never goes back: it advances by a fraction of a microsecond for each
+"""Two stamps that are no further apart show a clock that was set back by the time between the
+arrivals. Zenoh's own clock never goes back: it advances by a fraction of a microsecond for each
 message until the wall clock has caught up."""
-
-APART_NS = NS_PER_S // 500
-"""Commands that arrive within this time of each other may have been sent together."""
-
-TOGETHER_NS = NS_PER_S // 2000
-"""Commands that arrive within this time of each other come out of one queue, the oldest first. A
-check waits for the last of them. No sender may send more than 1000 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 """How much later a foreign clock may become without an adjustment that shows: 1 s, and 1 s more for
@@ -82,7 +71,7 @@ MAX_CLOCKS = 1024
 """Number of clocks that are remembered. The clock that was silent for longest is forgotten first.
 Senders may use this many names within 0.05 s before one at 20 Hz is forgotten."""
 
-State = Literal["new", "known", "stepped"]
+State = Literal["new", "known"]
 Verdict = Literal["fresh", "first", "unproven", "stale", "set"]
 """`fresh` counts. `unproven` does not count yet, nor does `first`, with which a proof begins.
 `stale` does not count. `set` counts, but the sender must return to neutral."""
@@ -92,50 +81,54 @@ class _Proof:
     """A test that the delays have become constant, from one command on.
 
     The minimum of the first half of the proof time is compared with that of the second. Through
-    jitter they differ. Then the last eight halves are looked at, in four pairs. Their minima must
+    jitter they differ. The proof of a clock that is known begins `again` with its second half.
+    For a new clock the last eight halves are looked at instead, in four pairs. Their minima must
     differ by less than `EARLY_NS` and follow no trend: they fall while a backlog pours in, and rise
-    while a queue grows. The proof of a clock that stepped begins `again` with its second half.
+    while a queue grows.
     """
 
     def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
         self.least = self._first = self._half = delay
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
-        self._begun_ns = self._last_ns = at_ns
+        self._begun_ns = at_ns
         self._halves: list[tuple[int, int]] = []
         """When each of the last halves began, and its minimum."""
 
-    def add(self, delay: int, at_ns: int) -> Literal["proven", "open", "failed"]:
-        """Judge one more command; `failed` if the proof must begin again with it."""
+    def add(self, delay: int, at_ns: int, timeout_ns: int) -> Literal["proven", "open", "failed"]:
+        """Judge one more command; `failed` if the proof must begin again with it.
+
+        A command later than the least by more than the timeout proves nothing about itself.
+        """
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
         proven = False
-        if at_ns - self._begun_ns >= self._length_ns and at_ns - self._last_ns > TOGETHER_NS:
+        if at_ns - self._begun_ns >= self._length_ns:
             self._halves.append((self._begun_ns, self._half))
             self._begun_ns += self._length_ns
             if at_ns - self._begun_ns >= self._length_ns:
                 self._begun_ns = at_ns
             self._half = delay
             proven = self._constant(at_ns)
-        self._last_ns = at_ns
         self._half, self.least = min(self._half, delay), min(self.least, delay)
-        return "proven" if proven else "open"
+        return "proven" if proven and delay - self.least <= timeout_ns else "open"
 
     def _constant(self, at_ns: int) -> bool:
-        """Compare the halves that are over. A clock that stepped has two to compare, never more."""
+        """Compare the halves that are over."""
         minima, count = [least for _, least in self._halves], len(self._halves)
         lasted = at_ns - self._halves[0][0]
         if count == 2:
-            if abs(minima[1] - minima[0]) <= lasted // self._share:
-                return True
+            even = abs(minima[1] - minima[0]) <= lasted // self._share
             if self._again:
                 del self._halves[0]
-                self.least = self._first = minima[1]
+                if not even:
+                    self.least = self._first = minima[1]
+            return even
         if count < 8:
             return False
         del self._halves[0]
-        pairs = [min(minima[n], minima[n + 1]) for n in (0, 2, 4, 6)]
+        pairs = [min(pair) for pair in zip(minima[::2], minima[1::2], strict=True)]
         spread, up = max(pairs) - min(pairs), sorted(pairs)
-        trend = pairs == up or pairs == up[::-1] or min(pairs[:3]) - pairs[3] > FALLS_NS
+        trend = pairs in (up, up[::-1])
         return spread <= lasted // self._share or (spread <= EARLY_NS and not trend)
 
 
@@ -210,20 +203,21 @@ class _Clock:
             return
         if departed > GAP_NS:
             self._paused = True
-        elif departed <= STANDS_NS and silence > APART_NS:
+        elif departed <= STANDS_NS:
             self._before = self._delay if self._before is None else self._before
             self._shown += silence - departed
 
     def _prove(self, delay: int, at_ns: int, silence: int, timeout_ns: int) -> Verdict:
         proof = self._proof
-        sign = "failed" if proof is None or silence > GAP_NS else proof.add(delay, at_ns)
-        if proof is None or sign == "failed":
-            needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
-            self._proof = _Proof(delay, at_ns, needed_ns, EVEN, again=False)
-            return "first"
-        if sign == "open" or not -EARLY_NS <= delay - proof.least <= timeout_ns:
-            return "unproven"
-        return self._believe(proof, "fresh")
+        if proof is not None and silence <= GAP_NS:
+            sign = proof.add(delay, at_ns, timeout_ns)
+            if sign == "proven":
+                return self._believe(proof, "fresh")
+            if sign == "open":
+                return "unproven"
+        needed_ns = min(timeout_ns, LONGEST_PROOF_NS)
+        self._proof = _Proof(delay, at_ns, needed_ns, EVEN, again=False)
+        return "first"
 
     def _compare(
         self, delay: int, at_ns: int, silence: int, timeout_ns: int, steady: bool
@@ -231,42 +225,37 @@ class _Clock:
         late = delay - self._least
         early = max(0, self._early - silence // CREEP) + max(0, -late)
         if late <= timeout_ns and early <= EARLY_NS:
-            self.state, self._proof, self._early = "known", None, early
+            self._proof, self._early = None, early
             self._least = min(self._least, delay)
             self._forget_adjustments()
             return "fresh"
         if steady:  # the minimum was that of a backlog
             self.state, self._proof = "new", None
             return self._prove(delay, at_ns, silence, timeout_ns)
-        proof, needed_ns = self._proof, min(timeout_ns, LONGEST_PROOF_NS)
-        crept = False
+        proof, needed_ns, share = self._proof, min(timeout_ns, LONGEST_PROOF_NS), CREPT
         if proof is None:
-            self.state = "stepped"
             self._accrue(at_ns, FORGIVE_NS)
-            crept = abs(delay - self._delay) <= silence // CREEP + JITTER_NS
         elif silence <= GAP_NS:
-            sign = proof.add(delay, at_ns)
-            if sign == "open" or (sign == "proven" and delay - proof.least > timeout_ns):
+            sign = proof.add(delay, at_ns, timeout_ns)
+            if sign == "open":
                 return "stale"
             if sign == "proven":
                 return self._forgive(proof, at_ns)
-        if not crept:
-            needed_ns = max(needed_ns, JUMP_PROOF_NS)
-        share = CREPT if crept else EVEN
+        if proof or abs(delay - self._delay) > silence // CREEP + JITTER_NS:
+            needed_ns, share = max(needed_ns, JUMP_PROOF_NS), EVEN
         self._proof = _Proof(delay, at_ns, needed_ns, share, again=True)
         return "stale"
 
     def _forgive(self, proof: _Proof, at_ns: int) -> Verdict:
         """Believe the proven delay if an adjustment showed or a pause hid it, or by the budget."""
         self._accrue(at_ns, FORGET_NS)
-        late = max(0, proof.least - self._least)
-        hidden = late
+        hidden = proof.least - self._least
         if self._before is not None:
-            hidden = min(late, max(0, self._before - self._least, late - self._shown))
+            hidden = min(hidden, max(self._before - self._least, hidden - self._shown))
         if hidden > self._budget and not self._paused:
             return "stale"
-        self._budget = max(0, min(self._budget, FORGIVE_NS) - hidden)
-        self.forgiven_ns = hidden
+        self.forgiven_ns = max(0, hidden)
+        self._budget = max(0, min(self._budget, FORGIVE_NS) - self.forgiven_ns)
         return self._believe(proof, "set")
 
     def _accrue(self, at_ns: int, most_ns: int) -> None:
@@ -279,7 +268,6 @@ class _Clock:
 
     def _believe(self, proof: _Proof, verdict: Verdict) -> Verdict:
         self.state, self._least, self._proof = "known", proof.least, None
-        self._early = 0
         self._forget_adjustments()
         return verdict
 
@@ -314,12 +302,14 @@ class Freshness:
         number, at_ns = command.sequence, command.arrived_ns
         if number is None:
             return "fresh"
-        last, last_at_ns = self._numbers.pop(command.sender, (-1, at_ns))
-        stale = number <= last and at_ns - last_at_ns <= GAP_NS
-        self._numbers[command.sender] = (last, last_at_ns) if stale else (number, at_ns)
+        last = self._numbers.pop(command.sender, None)
+        if last is not None and number <= last[0] and at_ns - last[1] <= GAP_NS:
+            self._numbers[command.sender] = last
+            return "stale"
+        self._numbers[command.sender] = number, at_ns
         if len(self._numbers) > MAX_CLOCKS:
             del self._numbers[next(iter(self._numbers))]
-        return "stale" if stale else "fresh"
+        return "fresh"
 
     def _forget(self, now_ns: int) -> None:
         """Forget the clocks that were silent for long, and any above the limit.

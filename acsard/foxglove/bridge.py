@@ -10,13 +10,15 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from threading import Event
 
 import foxglove
 import zenoh
 
 from acsard.client import Client
-from acsard.client.driving import objection
+from acsard.client.commander import objection
+from acsard.client.watch import Watch
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.facts import Facts, learn
 from acsard.foxglove.notices import Notices
@@ -26,7 +28,6 @@ from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, sta
 from acsard.foxglove.services import CALLED, STOPS, services
 from acsard.foxglove.settings import Settings
 from acsard.host import clock
-from acsard.messages.schema import RobotState
 from acsard.messages.topics import full_key
 from acsard.ros.names import full_name
 from acsard.values import NS_PER_S, AcsardError
@@ -37,10 +38,6 @@ than one frame makes the rounds a third cheaper. Commands do not wait for it."""
 
 ROUND_S = 0.5
 """Longest time between two rounds."""
-
-ASK_NS = NS_PER_S // 2
-"""Age of the last state at which the bridge asks for a new one while a viewer drives. The daemon
-may be configured to publish its state less often."""
 
 GONE = "daemon"
 """Id of the status message that the daemon is gone."""
@@ -79,8 +76,8 @@ class Bridge:
         offered = services(robot, ros, CALLED if acts else STOPS)
         self._server = start(f"acsard {robot_id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
-        self._state: RobotState | None = None
-        self._state_ns = clock.mono_ns()
+        self._watch: Watch | None = None
+        """Follows the robot while a viewer drives."""
         self._here = self._was_here = True
         key = full_key(robot_id, "alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
@@ -118,20 +115,18 @@ class Bridge:
             self._was_here = here
         driving = self._drives.driving()
         shown, fresh = self._shown.take()
-        self._relay.follow(shown, fresh, state=bool(driving))
+        self._relay.follow(shown, fresh)
         if self._deaf and not shown.isdisjoint(self._relay.commanders):
             self._notices.say("warning", "commands", self._deaf, stays="commands")
             self._deaf = ""
-        state = self._relay.pass_on()
-        if state is not None:
-            self._state, self._state_ns = state, clock.mono_ns()
+        self._relay.pass_on()
+        self._follow(bool(driving) and here)
         self._object(driving)
         if here and (news := self._settings.refresh()):
             self._server.publish_parameter_values(as_parameters(news))
         self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
 
     def _went(self) -> bool:
-        self._state = None
         words = f"the daemon of {self._id} is gone: it is waited for"
         self._notices.say("error", "daemon", words, stays=GONE)
         return True
@@ -156,18 +151,34 @@ class Bridge:
         self._drives.forbidden = facts.forbidden
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
 
+    def _follow(self, driving: bool) -> None:
+        """Follow the robot's state while a viewer drives."""
+        now = clock.mono_ns() / NS_PER_S
+        if self._watch is not None and not driving:
+            self._watch.end()
+            self._watch = None
+        elif self._watch is None and driving:
+            self._watch = Watch(self._robot, now, self._wake.set)
+        if self._watch is not None:
+            with suppress(zenoh.ZError):  # the session is closed: the program is ending
+                self._watch.look(now)
+
+    def _objection(self, watch: Watch, robot: Client, now: float) -> str:
+        if watch.silent(now):
+            return f"no word from the daemon of {self._id}: is it running?"
+        if watch.state is None:
+            return ""
+        return objection(watch.state, robot.source, robot.sender)
+
     def _object(self, driving: dict[int, Client]) -> None:
         """Report to each viewer once why its commands do not drive. Withdraw the report later."""
         now_ns = clock.mono_ns()
-        if driving and now_ns - self._state_ns > ASK_NS:
-            self._state_ns = now_ns
-            self._relay.ask_state()
         for client in driving.keys() - self._objections.keys():
             self._objections[client] = Objections()
         for client, told in list(self._objections.items()):
             robot, why = driving.get(client), ""
-            if robot is not None and self._state is not None:
-                why = objection(self._state, robot.source, robot.sender)
+            if robot is not None and self._watch is not None:
+                why = self._objection(self._watch, robot, now_ns / NS_PER_S)
             if told.look(why, now_ns):
                 stays = f"drive {client}"
                 if told.told:

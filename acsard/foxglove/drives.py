@@ -1,19 +1,20 @@
 """Drives the robot from a viewer's panel. Each viewer is a sender of its own, under the daemon's
 rules.
 
-The server's threads pass each message to the viewer's `Hand`, which keeps the newest. A separate
-thread sends it, so that no thread of the server waits for the bus.
+A panel repeats its command while a button is held and is silent after the release, and few of its
+messages have a stamp. Therefore a zero goes first after a silence, and a burst after it is dropped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Condition, Thread
+from threading import Lock
 
 import zenoh
 
 from acsard.client import Client
-from acsard.foxglove.hand import Hand, Wish
+from acsard.client.commander import Commander, Wish
+from acsard.client.outbox import Outbox
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.twists import encoding_of, wish
 from acsard.host import clock
@@ -26,6 +27,10 @@ CHANNELS = 64
 END_S = 0.5
 """Time limit for sending the final zeros, which normally takes a few ms."""
 
+SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
+"""Thresholds for a panel that publishes too seldom: this many messages in a row after a silence of
+the commander, none longer than `SLOW_NS`."""
+
 TOO_SLOW = (
     "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 Hz "
     "or more"
@@ -35,14 +40,24 @@ TOO_SLOW = (
 LOST = "the bus takes no commands: what a panel publishes is lost until it does"
 
 
-class _Viewer:
+class Viewer:
     """One viewer with its sender name."""
 
     def __init__(self, robot: Client) -> None:
-        self.robot, self.hand = robot, Hand()
+        self.robot, self.commander = robot, Commander(leads=True, gathers=True)
         self.channels: dict[int, tuple[str, str]] = {}
         """Encoding and problem of each channel. If the problem is not empty, the channel cannot
         drive."""
+        self._slow = 0
+
+    def is_slow(self, silence_ns: int | None) -> bool:
+        """Take the silence before a message, None for a short one.
+
+        Return whether messages come so seldom that the robot stops in between.
+        """
+        slow = silence_ns is not None and silence_ns <= SLOW_NS
+        self._slow = self._slow + 1 if slow else 0
+        return self._slow >= SLOW_TIMES
 
 
 class Drives:
@@ -53,12 +68,9 @@ class Drives:
     ) -> None:
         self.topic, self.forbidden = topic, forbidden
         self._robot_of, self._notices = robot_of, notices
-        self._viewers: dict[int, _Viewer] = {}
-        self._parting: list[tuple[Client, Wish]] = []
-        self._news = Condition()
-        self._ended = False
-        self._thread = Thread(target=self._run, name="drives", daemon=True)
-        self._thread.start()
+        self._viewers: dict[int, Viewer] = {}
+        self._lock = Lock()
+        self.outbox = Outbox()
 
     # Called by the server's threads.
 
@@ -74,16 +86,15 @@ class Drives:
                 found = encoding_of(encoding, schema_name)
             except DecodeError as error:
                 problem = f"{topic}: {error}"
-        with self._news:
+        with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:
-                viewer = self._viewers[client] = _Viewer(self._robot_of(client))
+                viewer = self._viewers[client] = Viewer(self._robot_of(client))
             if len(viewer.channels) < CHANNELS:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
         """Take a message that a viewer published."""
-        now_ns = clock.mono_ns()
         viewer = self._viewers.get(client)
         encoding, problem = viewer.channels.get(channel, ("", "")) if viewer else ("", "")
         if viewer is None or not encoding:
@@ -98,68 +109,41 @@ class Drives:
         except DecodeError as error:
             self._notices.say("warning", "drive", f"{self.topic}: refused: {error}")
             return
-        with self._news:
-            viewer.hand.take(wished, now_ns)
-            self._news.notify()
-        if viewer.hand.is_slow():
+        robot = viewer.robot
+        silence_ns = self.outbox.take(viewer.commander, lambda due: self._send(robot, due), wished)
+        if viewer.is_slow(silence_ns):
             self._notices.say("warning", "drive", TOO_SLOW)
 
     def withdrawn(self, client: int, channel: int) -> None:
         """Release the robot, because the viewer closed this channel or disconnected."""
-        with self._news:
+        with self._lock:
             viewer = self._viewers.get(client)
             if viewer is None:
                 return
             encoding, _ = viewer.channels.pop(channel, ("", ""))
             if encoding:
-                self._part(viewer)
+                self.outbox.release(viewer.commander)
             if not viewer.channels:
                 del self._viewers[client]
-            self._news.notify()
 
     # Called by the main thread.
 
     def driving(self) -> dict[int, Client]:
         """Return the viewers that currently ask for a speed, with their clients."""
         now_ns = clock.mono_ns()
-        with self._news:
+        with self._lock:
             viewers = self._viewers.items()
-            return {one: viewer.robot for one, viewer in viewers if viewer.hand.drives(now_ns)}
+            return {one: it.robot for one, it in viewers if it.commander.drives(now_ns)}
 
     def end(self) -> None:
         """Send one zero for each viewer that drives, then stop the sending thread."""
-        with self._news:
+        with self._lock:
             for viewer in self._viewers.values():
-                self._part(viewer)
+                self.outbox.release(viewer.commander)
             self._viewers.clear()
-            self._ended = True
-            self._news.notify()
-        self._thread.join(END_S)
+        self.outbox.end(END_S)
 
-    # Run by the sending thread, or with the lock held.
-
-    def _part(self, viewer: _Viewer) -> None:
-        """Queue a final zero for this viewer; the caller holds the lock."""
-        zero = viewer.hand.end(clock.mono_ns())
-        if zero is not None:
-            self._parting.append((viewer.robot, zero))
-
-    def _run(self) -> None:
-        while True:
-            with self._news:
-                while not ((due := self._due()) or self._parting or self._ended):
-                    self._news.wait(self._left())
-                parting, self._parting = self._parting, []
-                if not (parting or due):
-                    return
-            for robot, zero in parting:
-                self._send(robot, zero)
-            for viewer in due:
-                # The bus may have blocked the previous send, so judge the age by the present time.
-                with self._news:
-                    wished = viewer.hand.send(clock.mono_ns())
-                if wished is not None:
-                    self._send(viewer.robot, wished)
+    # Run by the sending thread.
 
     def _send(self, robot: Client, wished: Wish) -> None:
         twist = wished.twist
@@ -167,15 +151,3 @@ class Drives:
             robot.send(twist.linear, twist.angular, stamp_ns=wished.stamp_ns)
         except zenoh.ZError as error:
             self._notices.say("error", "drive", f"{LOST} ({error})")
-
-    def _due(self) -> list[_Viewer]:
-        """Return the viewers with a message that is due."""
-        now_ns = clock.mono_ns()
-        times = [(viewer, viewer.hand.due_ns()) for viewer in self._viewers.values()]
-        return [viewer for viewer, due_ns in times if due_ns is not None and due_ns <= now_ns]
-
-    def _left(self) -> float | None:
-        """Return the seconds until the next message is due, or None if none is waiting."""
-        times = [viewer.hand.due_ns() for viewer in self._viewers.values()]
-        known = [one for one in times if one is not None]
-        return max(0.0, (min(known) - clock.mono_ns()) / NS_PER_S) if known else None

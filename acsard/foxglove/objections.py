@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
+from acsard.client.commander import GRACE_S
 from acsard.values import NS_PER_S
-
-OBJECTS_NS = NS_PER_S // 2
-"""Delay before an objection is reported: the first 0.25 s of a new sender never drive, which is
-normal."""
 
 
 class Objections:
@@ -25,7 +22,7 @@ class Objections:
             return changed
         if self._since_ns is None:
             self._since_ns = now_ns
-        if now_ns - self._since_ns < OBJECTS_NS or objection == self.told:
+        if now_ns - self._since_ns < GRACE_S * NS_PER_S or objection == self.told:
             return False
         self.told = objection
         return True

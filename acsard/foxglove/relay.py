@@ -20,7 +20,7 @@ from acsard.foxglove.facts import Facts, key_of
 from acsard.foxglove.heard import Commanders
 from acsard.foxglove.news import News
 from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import MESSAGES, Events, RobotState
+from acsard.messages.schema import MESSAGES, Events
 from acsard.messages.topics import by_key
 from acsard.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.ros.shapes import Log
@@ -28,9 +28,9 @@ from acsard.ros.shapes import Log
 MOST = 100
 """Maximum number of messages of a topic per round; a second's worth at 100 Hz."""
 
-STATE, EVENTS = "state", "events"
+EVENTS = "events"
 
-KEPT = ("tf_static", "diagnostics", STATE)
+KEPT = ("tf_static", "diagnostics", "state")
 """Keys that are published seldom; a viewer that starts to look receives the last message."""
 
 
@@ -82,8 +82,8 @@ class Relay:
         """The topics that show the commands of each source."""
         return self._commanders.topics
 
-    def follow(self, topics: Collection[str], fresh: Collection[str], *, state: bool) -> None:
-        """Subscribe to the keys of these topics only, and to `state` if requested.
+    def follow(self, topics: Collection[str], fresh: Collection[str]) -> None:
+        """Subscribe to the keys of these topics only.
 
         `fresh` are topics that a viewer has just begun to look at.
         """
@@ -95,7 +95,7 @@ class Relay:
             for topic, out in self._outs.items()
             if topic in topics and topic not in self._commanders.topics
         ]
-        keys = {out.key for out in shown} | ({STATE} if state else set())
+        keys = {out.key for out in shown}
         for key in self._followed.keys() - keys:
             self._followed.pop(key).undeclare()
         for topic in fresh:
@@ -118,9 +118,8 @@ class Relay:
             self._robot.ask(key, arrivals.take)  # the next message may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
-    def pass_on(self) -> RobotState | None:
-        """Forward the received messages; return the newest state among them, or None."""
-        newest: RobotState | None = None
+    def pass_on(self) -> None:
+        """Forward the received messages."""
         for topic, command in self._commanders.take():
             self._outs[topic].log(command)
         for key, samples in self._followed.items():
@@ -132,18 +131,6 @@ class Relay:
                     continue
                 for out in outs:
                     out.log(message)
-                if isinstance(message, RobotState):
-                    newest = message
-        return newest
-
-    def ask_state(self) -> None:
-        """Query the state, because the next one may be late.
-
-        The answer is treated like a published state.
-        """
-        samples = self._followed.get(STATE)
-        if samples is not None:
-            self._robot.ask(STATE, samples.add)
 
     def log(self, line: Log) -> None:
         """Publish a line on the topic `log`."""

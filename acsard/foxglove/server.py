@@ -96,10 +96,10 @@ class Listener:
         return as_parameters(self._settings.set(wishes))
 
     def on_parameters_subscribe(self, param_names: list[str]) -> None:
-        self._settings.follow(followed=True)
+        self._settings.follow(param_names)
 
     def on_parameters_unsubscribe(self, param_names: list[str]) -> None:
-        self._settings.follow(followed=False)
+        self._settings.unfollow(param_names)
 
 
 def as_parameters(values: dict[str, foxglove.AnyNativeParameterValue]) -> list[foxglove.Parameter]:

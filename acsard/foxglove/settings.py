@@ -28,7 +28,8 @@ class Settings:
         self._lock = Lock()
         self._known: dict[str, Any] = {}
         self._read_ns = clock.mono_ns()
-        self._asked = self._followed = False
+        self._asked = False
+        self._followed: set[str] = set()
         self._readable = tables is not None
         self.learn(tables)
 
@@ -50,10 +51,15 @@ class Settings:
             self._asked = True
             return parameters.asked(self._known, names)
 
-    def follow(self, *, followed: bool) -> None:
-        """Record whether any viewer follows changes."""
+    def follow(self, names: Collection[str]) -> None:
+        """Record that a viewer follows these settings."""
         with self._lock:
-            self._followed = followed
+            self._followed.update(names)
+
+    def unfollow(self, names: Collection[str]) -> None:
+        """Record that no viewer follows these settings any longer."""
+        with self._lock:
+            self._followed.difference_update(names)
 
     def set(self, wishes: Mapping[str, Any]) -> dict[str, Any]:
         """Change settings, all or none, and return their values afterwards.

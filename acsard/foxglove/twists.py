@@ -6,9 +6,9 @@ reason.
 
 from __future__ import annotations
 
+from acsard.client.commander import Wish
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.foxglove.hand import Wish
 from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
 from acsard.messages.encodings import DecodeError, encoding_name
 

@@ -1,4 +1,4 @@
-"""The only module that reads a clock.
+"""The only module that reads a clock. It also detects that this computer was suspended.
 
 The monotonic clock is CLOCK_MONOTONIC_RAW. NTP slews CLOCK_MONOTONIC by up to 8 %, and with it
 every distance that is computed as speed times time, and every apparent delay of a command.
@@ -47,3 +47,31 @@ def now() -> Instant:
         if mono_ns() - mono < TOGETHER_NS:
             break
     return Instant(mono - mono % NS_PER_US, wall - wall % NS_PER_US)
+
+
+MOMENT_NS = 100_000_000
+"""Shortest time that counts as a suspend, ns. A suspend takes longer, and a step of the wall
+clock by NTP does not change the measured time.
+"""
+
+
+class Asleep:
+    """Detector that reports each suspend of this computer once.
+
+    The daemon's monotonic clock stands still in a suspend. Without this check, commands and wheel
+    speeds from before it would seem fresh.
+    """
+
+    def __init__(self, read: Callable[[], int] = asleep_ns) -> None:
+        """Use `read`, which returns how long the computer was suspended since its start, ns."""
+        self._read, self._known_ns = read, read()
+
+    def was(self) -> bool:
+        """Return whether the computer has been suspended since the last call."""
+        if self._read() - self._known_ns < MOMENT_NS:
+            return False
+        # `read` reads two clocks, and another process may have run between them. A second reading
+        # confirms the suspend.
+        now_ns = self._read()
+        slept, self._known_ns = now_ns - self._known_ns >= MOMENT_NS, now_ns
+        return slept

@@ -1,12 +1,17 @@
-"""Finds the configuration file, and checks whether it can be changed."""
+"""Finds the configuration file, and changes its values in place, completely or not at all."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from acsard.host.exits import Exit, ExitError
-from acsard.host.files import require_tomlkit
+from acsard.config.editing import edited
+from acsard.config.parsing import ConfigError, parse
+from acsard.config.settings import Config
+from acsard.host.atomic_file import replace
+from acsard.host.errors import Exit, ExitError
+from acsard.host.extras import install
 
 PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
 
@@ -46,3 +51,60 @@ def writable(path: str | None) -> Path:
             "nothing for the robot",
         )
     return Path(where)
+
+
+Keys = Mapping[str, object]
+"""Values by dotted keys, such as "mcu.port"."""
+
+
+def require_tomlkit() -> None:
+    """Raise an error now if tomlkit is missing, before a person has spent minutes on a check."""
+    try:
+        import tomlkit  # noqa: F401
+    except ImportError:
+        raise ExitError(
+            Exit.FAILURE,
+            f"--write needs the library tomlkit; run: {install('mcu')}, or leave --write out and "
+            "paste the lines",
+        ) from None
+
+
+def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
+    """Set keys in an `acsard.toml`, and return them.
+
+    `keys` may be a function that computes them from the configuration. Raises `ExitError` and
+    leaves the file unchanged if that is impossible. With `new` the file need not exist.
+    """
+    try:
+        place, text, given = _changed(file, keys, new)
+        replace(place, text)
+        return given
+    except (OSError, ValueError, ConfigError) as error:
+        raise _left(file, error) from None
+
+
+def require_changeable(
+    file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False
+) -> None:
+    """Raise the error that `change` would raise, before other work depends on the change."""
+    try:
+        place, _, _ = _changed(file, keys, new)
+        if not os.access(place.parent, os.W_OK):
+            raise PermissionError(f"no permission to write to {place.parent}")
+    except (OSError, ValueError, ConfigError) as error:
+        raise _left(file, error) from None
+
+
+def _changed(
+    file: Path, keys: Keys | Callable[[Config], Keys], new: bool
+) -> tuple[Path, str, Keys]:
+    """Return the resolved path, the text with the new keys, and the keys."""
+    place = file.resolve(strict=not new)
+    # `read_text` would lose CRLF line ends.
+    text = "" if new and not place.exists() else place.read_bytes().decode()
+    given = keys(parse(text.encode())) if callable(keys) else keys
+    return place, edited(text, given), given
+
+
+def _left(file: Path, error: Exception) -> ExitError:
+    return ExitError(Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand")

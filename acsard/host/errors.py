@@ -1,12 +1,15 @@
-"""Errors with an external cause that a person can fix.
+"""Errors with an external cause that a person can fix, and the exit codes of acsard.
 
-Each is an `AcsardError` and also the built-in exception that Python uses for such a case, so either
-can be caught. The text says what is wrong and how to fix it. `cli/exits.py` maps them to exit
-codes. Bugs are not among them, and neither are states of the robot, such as a lost port or a stale
-command.
+Each error is an `AcsardError` and also the built-in exception that Python uses for such a case, so
+either can be caught. The text says what is wrong and how to fix it. Modules that other programs may
+import raise these errors, and `cli/exits.py` maps them to exit codes. `ExitError` is for verbs,
+which name their exit code themselves. Bugs are not among these errors, and neither are states of
+the robot, such as a lost port or a stale command.
 """
 
 from __future__ import annotations
+
+from enum import IntEnum
 
 from acsard.values import AcsardError
 
@@ -57,3 +60,37 @@ class CertificateError(MendableError, ValueError):
 
 class RecordingError(MendableError, ValueError):
     """A file is not a recording of acsard, or it cannot be replayed."""
+
+
+class Exit(IntEnum):
+    """Exit codes, after sysexits.h."""
+
+    OK = 0
+    FAILURE = 1
+    USAGE = 2
+    NO_PORT = 66
+    UNREACHABLE = 69
+    IN_USE = 75
+    NO_PERMISSION = 77
+    BAD_CONFIG = 78
+
+
+WORDS: dict[int, str] = {
+    Exit.OK: "done",
+    Exit.FAILURE: "failure",
+    Exit.USAGE: "usage",
+    Exit.NO_PORT: "no such port",
+    Exit.UNREACHABLE: "daemon unreachable",
+    Exit.IN_USE: "port, bus address or robot id in use",
+    Exit.NO_PERMISSION: "no permission",
+    Exit.BAD_CONFIG: "bad configuration",
+}
+"""Meaning of each exit code, for people."""
+
+
+class ExitError(MendableError):
+    """Ends the program with exit code `code`; the text says what is wrong and how to fix it."""
+
+    def __init__(self, code: Exit, text: str) -> None:
+        super().__init__(text)
+        self.code = code

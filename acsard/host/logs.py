@@ -1,23 +1,27 @@
-"""Logs events as lines on standard error through structlog, without ever blocking.
+"""Logs events as lines on standard error or in the systemd journal, without ever blocking.
 
 A thread writes the lines from a bounded queue, because a full disk, a closed pipe or a stopped
 terminal must not delay the control loop. Lines that do not fit in the queue are dropped.
+
+In the journal each line is a datagram with fields of its own. With these fields,
+`journalctl ACSARD_EVENT=link_down` finds exactly the lines of an event.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import queue
+import socket
 import sys
 import threading
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from typing import Any, Literal, TextIO
 
 from acsard.config.settings import LogConfig
 from acsard.formatting import printable
-from acsard.host.colours import coloured
-from acsard.host.journal import JournalStream, is_journal, render
+from acsard.host.terminal import coloured
 from acsard.values import Event, EventName
 
 # structlog imports rich to draw tracebacks, and the log has none. The daemon's modules take 39 MB
@@ -27,6 +31,58 @@ import structlog  # noqa: E402
 
 if sys.modules["rich"] is None:
     del sys.modules["rich"]
+
+SOCKET = "/run/systemd/journal/socket"
+
+_PRIORITIES = {"debug": 7, "info": 6, "warning": 4, "error": 3}
+"""Priorities of syslog."""
+
+
+def is_journal(stream: TextIO, environ: Mapping[str, str]) -> bool:
+    """Return whether the stream leads to the journal, according to systemd's JOURNAL_STREAM."""
+    try:
+        found = os.fstat(stream.fileno())
+    except (OSError, ValueError):
+        return False
+    return environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+
+
+def render(logger: object, method: str, line: MutableMapping[str, Any]) -> str:
+    """Render a structlog line in the journal's own protocol."""
+    fields = {
+        "MESSAGE": _message(line),
+        "PRIORITY": str(_PRIORITIES.get(str(line.get("level")), 6)),
+        "SYSLOG_IDENTIFIER": "acsard",
+    }
+    for name, value in line.items():
+        if name not in ("timestamp", "level"):
+            fields[f"ACSARD_{name.upper()}"] = str(value)
+    return "\n".join(f"{name}={value.replace(chr(10), ' ')}" for name, value in fields.items())
+
+
+def _message(line: Mapping[str, Any]) -> str:
+    event, text = str(line.get("event", "")), str(line.get("text", ""))
+    rest = [f"{k}={v}" for k, v in line.items() if k not in ("timestamp", "level", "event", "text")]
+    return " ".join([f"{event}: {text}" if text else event, *rest])
+
+
+class JournalStream(io.StringIO):
+    """Stream that sends each write as a datagram. Raises `OSError` without a journal."""
+
+    def __init__(self, path: str = SOCKET) -> None:
+        super().__init__()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        try:
+            self._socket.connect(path)
+        except OSError:
+            self._socket.close()
+            raise
+
+    def write(self, text: str) -> int:
+        """Send one line of the log."""
+        self._socket.send(text.encode(errors="replace"))
+        return len(text)
+
 
 Form = Literal["console", "json", "logfmt", "journal"]
 

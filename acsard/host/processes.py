@@ -1,12 +1,14 @@
-"""Finds the processes that have a device open, as far as procfs shows them, and opens nothing.
+"""Finds the processes that have a device open, and ends a child process with its parent.
 
-Only files below a /dev directory are examined: a file on a network disk that hangs would block this
-process.
+Procfs shows the open files, and no file is opened. Only files below a /dev directory are examined:
+a file on a network disk that hangs would block this process.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -170,3 +172,15 @@ def _name(process: Path) -> str:
 
 def _comm(process: Path) -> str:
     return (process / "comm").read_text().strip()
+
+
+# From linux/prctl.h.
+PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent(number: signal.Signals) -> None:
+    """Ask the kernel for this signal when the thread that started this process ends.
+
+    The child process calls it.
+    """
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)

@@ -2,7 +2,7 @@
 
 A command is refused as a whole, never in part, and a refused command does not refresh the motion.
 Reasons are a payload that cannot be decoded or is too big, NaN or infinity in any field that the
-daemon reads, a wildcard key, and a DELETE.
+daemon reads, a wildcard key, a DELETE, and a sender id that belongs to another certificate.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from msgspec import UNSET, Struct, UnsetType
 
 from acsard.config.settings import JointsConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.incoming.bindings import Bindings
 from acsard.messages import signature
 from acsard.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.messages.schema import (
@@ -33,6 +32,42 @@ from acsard.ros.attachments import GID_BYTES, unpack
 from acsard.ros.transports import Transport
 from acsard.values import NS_PER_S, REST, Command, Pose, Request, Verb, WheelSpeeds
 from acsard.values import Twist as BodyTwist
+
+BOUND_NS = 60 * NS_PER_S
+"""A sender that is silent for longer may come back under another certificate, for example when a
+program with a fixed id moves from the robot to a laptop."""
+
+MAX_BOUND = 1024
+"""Senders remembered at once. The one that was seen longest ago is forgotten first."""
+
+
+class Bindings:
+    """The certificates of the senders that were seen lately.
+
+    It binds each sender id to the certificate under which the daemon first saw it. The certificate
+    is part of a sender's name (`messages/signature.py`), so a command under another certificate
+    counts as another sender's in any case. But one id under two certificates is a mistake or a
+    stolen secret. The daemon therefore refuses the second one for as long as the first one speaks.
+
+    Only native keys name a certificate. A sender that commands on a key of ROS is bound to nothing,
+    and its name is never that of a native sender.
+    """
+
+    def __init__(self) -> None:
+        self._seen: dict[str, tuple[str, int]] = {}
+        """Certificate, "" for the robot's own machine, and time of the last command, by sender."""
+
+    def other(self, sender: str, certificate: str, now_ns: int) -> str | None:
+        """Return the certificate that the sender is bound to, or None if it is this one."""
+        bound, seen_ns = self._seen.get(sender, (certificate, now_ns))
+        if bound != certificate and now_ns - seen_ns <= BOUND_NS:
+            return bound
+        self._seen.pop(sender, None)
+        self._seen[sender] = (certificate, now_ns)
+        if len(self._seen) > MAX_BOUND:
+            del self._seen[next(iter(self._seen))]
+        return None
+
 
 MAX_COMMAND_BYTES = 4096
 """Limit of a payload. A TwistStamped takes less than 300 bytes as JSON."""
@@ -308,3 +343,22 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
         raise DecodeError("wrong_shape", f"{size} bytes of CDR are no Twist and no TwistStamped")
     stamped = decode_cdr(TwistStamped, arrival.payload)
     return _TwistPayload(header=stamped.header, twist=stamped.twist)
+
+
+def asker(via: Via, attachment: bytes, stamped_by: str = "") -> str:
+    """Return a name for the log of the program that called a service or sent a stop.
+
+    The name is the public name of the sender id in the attachment (`messages/signature.py`),
+    followed by the transport in brackets. The name itself is a claim: Zenoh does not say which
+    connection a query came by. The digits behind it are the same for as long as the program keeps
+    its secret. A call over rmw_zenoh has the client's GID, which ROS discovery publishes; a bridge
+    says nothing. `stamped_by` is the id of the Zenoh session that stamped the sample, "" for none.
+    """
+    if via == "rmw":
+        return f"unnamed (rmw {attachment[-GID_BYTES:].hex()})"
+    if via == "bridge":
+        return "unnamed (bridge)"
+    session = f", session {public_name(stamped_by)}" if stamped_by else ""
+    signed = signature.unpack(attachment)
+    name = public_name(signed.sender) if signed else "unnamed"
+    return f"{name} (native{session})"

@@ -13,8 +13,7 @@ from msgspec.structs import replace
 
 from acsard.config.parsing import effective
 from acsard.config.settings import Config
-from acsard.incoming.asker import asker
-from acsard.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via
+from acsard.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via, asker
 from acsard.messages.cdr import CdrError
 from acsard.messages.encodings import FORMATS, DecodeError, Format, detect, encode, encoding_name
 from acsard.messages.json_schema import SCHEMAS
@@ -51,6 +50,10 @@ from acsard.ros.transports import PARAMETERS, in_ros_words
 from acsard.values import ROLES, Answer, Outputs, Request
 
 Current = Callable[[str], Message | None]
+
+MAX_WILDCARD = 512
+"""Characters of the longest key expression with a wildcard that is compared with keys. A longer one
+would take time from the control loop, and no key is as long."""
 
 BUSY = "busy: too many queries at once; ask again"
 
@@ -203,9 +206,8 @@ class Queries:
     ) -> list[tuple[str, str, object]]:
         topic = query.topic
         if topic == "schema/<Type>":
-            asked = query.asked.removeprefix("schema/")
-            names = list(SCHEMAS) if "*" in asked else [asked]
-            return [(f"schema/{n}", "", SCHEMAS[n]) for n in names if n in SCHEMAS]
+            keys = {f"schema/{name}": value for name, value in SCHEMAS.items()}
+            return [(key, "", value) for key, value in keys.items() if self._matches(query, key)]
         if topic == WHOAMI:
             found = [role for role in ROLES if whoami_key(role) == query.asked]
             by = asker(query.via, query.attachment)
@@ -217,6 +219,52 @@ class Queries:
             return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
         value = current(topic.removeprefix(JSON_TREE))
         return [] if value is None else [(topic, type(value).__name__, value)]
+
+    def _matches(self, query: Query, key: str) -> bool:
+        """Return whether a query asks for a key.
+
+        The expression of the query is below `acsard/<id>/`, or it is whole if its first two chunks
+        are not exactly these.
+        """
+        if "*" not in query.asked:
+            return query.asked == key
+        if len(query.asked) > MAX_WILDCARD:
+            return False
+        whole = full_key(self._config.robot.id, key)
+        return includes(query.asked, key) or includes(query.asked, whole)
+
+
+def includes(expression: str, key: str) -> bool:
+    """Return whether a Zenoh key expression includes a key, in time linear in both."""
+    chunks = key.split("/")
+    reached = {0}
+    for part in expression.split("/"):
+        if not reached:
+            return False
+        if part == "**":
+            reached = set(range(min(reached), len(chunks) + 1))
+        else:
+            reached = {n + 1 for n in reached if n < len(chunks) and _fits(part, chunks[n])}
+    return len(chunks) in reached
+
+
+def _fits(pattern: str, chunk: str) -> bool:
+    """Return whether a chunk of a key expression includes a chunk of a key."""
+    if pattern == "*":
+        return True
+    first, *middle = pattern.split("$*")
+    if not middle:
+        return pattern == chunk
+    last = middle.pop()
+    if not chunk.startswith(first):
+        return False
+    at = len(first)
+    for text in middle:
+        at = chunk.find(text, at)
+        if at < 0:
+            return False
+        at += len(text)
+    return chunk.endswith(last) and at <= len(chunk) - len(last)
 
 
 def refused(query: Query, why: str, wall_ns: int) -> Reply | None:

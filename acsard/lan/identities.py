@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 from acsard.bus.certificates import CA
 from acsard.config.settings import Config
-from acsard.host.addresses import own_addresses
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
+from acsard.host.own_identity import own_addresses
 from acsard.values import ROLES
 
 if TYPE_CHECKING:

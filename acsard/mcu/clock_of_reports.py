@@ -63,6 +63,9 @@ MOST_LOST = 0.45
 """Share of the reads of two windows before which lines are missing. Above it the period is
 wrong."""
 
+BRIDGED_S = 1.0
+"""Longest gap that is filled, s. After a longer one the board may have been reset."""
+
 
 class Slots:
     """The slots of a free-running board, counted read by read."""
@@ -116,7 +119,8 @@ class Slots:
             self.forget()  # the lines come too early or ever later, so they follow another clock
             return 0
         self._slot += lost
-        self._stretch = 1.0 + lost / lines
+        # What is missing for too long to be filled lies before the whole read.
+        self._stretch = 1.0 + lost / lines if lost * self.usual < BRIDGED_S * NS_PER_S else 1.0
         self._given += lost
         self._passed += lines + lost
         self._lossy += lost > 0
@@ -139,7 +143,7 @@ class Slots:
 
     def time_ns(self, behind: int) -> int:
         """Return when a line was complete, ns, that lies `behind` lines before the last one."""
-        return int(self._first + (self._slot - behind) * self.usual)
+        return int(self._first + self.place(behind) * self.usual)
 
     def place(self, behind: int) -> float:
         """Return the slot of that line. Missing slots are spread over the lines of the read."""

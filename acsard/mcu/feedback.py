@@ -22,14 +22,11 @@ from acsard.config.settings import McuConfig
 from acsard.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.mcu.check import Reading
 from acsard.mcu.clock_of_answers import Prompts
-from acsard.mcu.clock_of_reports import Slots
+from acsard.mcu.clock_of_reports import BRIDGED_S, Slots
 from acsard.mcu.codec import Codec, Motors
 from acsard.mcu.encoders import Encoders, Turned
 from acsard.mcu.habit import Habit
 from acsard.values import NS_PER_S, Instant, WheelSpeeds
-
-BRIDGED_S = 1.0
-"""Longest gap that is filled, s. After a longer one the board may have been reset."""
 
 APART_NS = 1000
 """Least distance between the stamps of two lines, ns. A line with an equal stamp would be taken for

@@ -235,7 +235,7 @@ class RobotState(Message, frozen=True):
     certificate: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
     figures: dict[str, Figure] = {}
-    """Durations of the control loop by the names in `runtime/figures.py`, at most a second old."""
+    """Durations of the control loop by the names in `runtime/latencies.py`, up to a second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """Use of the gyro in odometry, a value of `values.GyroDoes`."""
     encoders: list[int] = []

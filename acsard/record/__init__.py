@@ -2,7 +2,7 @@
 
 The pure modules:
 - `steps`: one step as a recording stores it.
-- `batch`, `layout`, `columns`: the encoding of many steps; `earlier` reads the previous format.
+- `batch`, `layout`, `columns`: the encoding of many steps.
 - `plausible`: refuses a batch with values that no daemon records.
 - `replay`: runs recorded inputs through `Robot.step` again and compares the outputs.
 - `merge`: applies another configuration to a recorded robot state.

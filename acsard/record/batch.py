@@ -11,11 +11,9 @@ from collections.abc import Iterator, Sequence
 import msgspec
 from msgspec import Struct
 
-from acsard.record import earlier
 from acsard.record.columns import pack, unpack
 from acsard.record.layout import (
     AT_ONCE,
-    FORMAT,
     LEAVING,
     LEFT,
     LINE,
@@ -53,7 +51,6 @@ class BatchError(AcsardError):
 
 _decoder = msgspec.msgpack.Decoder(Batch)
 _decoder_of_first = msgspec.msgpack.Decoder(_First)
-_decoder_of_1 = msgspec.msgpack.Decoder(earlier.Batch1)
 
 
 # Encoding
@@ -169,22 +166,18 @@ def _brief(status: Status, reason: str | None) -> Status:
 # Decoding
 
 
-def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
+def decode(data: bytes, reason: str = "") -> list[Step]:
     """Decode a batch.
 
     Args:
         data: the bytes of the batch.
         reason: the status reason of the last step of the batch before.
-        form: the format of the recording, as in `About.format`.
 
     Raises:
         BatchError: the bytes are not a valid batch.
     """
     try:
-        if form == earlier.FORMAT:
-            spread = earlier.spread(_decoder_of_1.decode(data))
-        else:
-            spread = _spread(_decoder.decode(data))
+        spread = _spread(_decoder.decode(data))
         if why := implausible(spread):
             raise ValueError(why)
         return list(_steps(spread, reason))
@@ -193,7 +186,7 @@ def decode(data: bytes, reason: str = "", form: str = FORMAT) -> list[Step]:
 
 
 def first_of(data: bytes) -> int | None:
-    """Return the number of the first step of a batch of any format, or None for other bytes."""
+    """Return the number of the first step of a batch, or None for other bytes."""
     try:
         return _decoder_of_first.decode(data).number
     except msgspec.MsgspecError:

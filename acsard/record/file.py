@@ -26,7 +26,6 @@ from mcap.writer import IndexType, Writer
 from msgspec import Struct
 
 from acsard.host.errors import RecordingError
-from acsard.record import earlier
 from acsard.record.batch import first_of
 from acsard.record.closing import END, Closing, Ns, fields
 from acsard.record.layout import FORMAT
@@ -40,9 +39,6 @@ CHUNK_BYTES = 32 * 1024
 
 MODE = 0o640
 """Mode of a recording: the service's group may read it."""
-
-FORMATS = (earlier.FORMAT, FORMAT)
-"""Formats of the messages that this version reads."""
 
 Topic = Literal["steps", "events", "state", "unfinished"]
 
@@ -251,10 +247,10 @@ class Recording:
             about = msgspec.convert({**found, "config": config}, About, strict=False)
         except (ValueError, msgspec.ValidationError) as error:
             raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None
-        if about.format not in FORMATS:
+        if about.format != FORMAT:
             raise RecordingError(
-                f"{self.path} has the format {about.format}, this acsard reads {FORMAT} "
-                f"and before: it was written by acsard {about.version}"
+                f"{self.path} has the format {about.format}, this acsard reads "
+                f"{FORMAT}: it was written by acsard {about.version}"
             )
         return about
 

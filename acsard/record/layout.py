@@ -1,7 +1,6 @@
 """The layout of a batch of steps, which `batch.py` writes and reads.
 
-A change of this layout is a new format. The reader of the old one then moves to a module of its
-own, as `earlier.py` is for format 1.
+A change of this layout is a new format, with a new number in `FORMAT`.
 """
 
 from __future__ import annotations
@@ -107,7 +106,7 @@ class Batch(Struct, frozen=True, array_like=True):
 
 
 class Spread(NamedTuple):
-    """A batch of any format with its columns unpacked."""
+    """A batch with its columns unpacked."""
 
     first: int
     standing: Standing

@@ -70,7 +70,7 @@ def steps(recording: Recording) -> Iterator[Step]:
     for topic, _, data in recording.messages():
         if topic == "steps":
             try:
-                batch = decode(data, reason, recording.about.format)
+                batch = decode(data, reason)
             except BatchError:
                 recording.damaged += 1
                 continue

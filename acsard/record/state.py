@@ -47,14 +47,6 @@ TABLE = copyreg.dispatch_table | {
 """
 
 
-MOVED = {
-    "acsard.mcu.frames": "acsard.mcu.codec",
-    "acsard.mcu.link": "acsard.mcu.link_state",
-    "acsard.drive.lying_wheels.witness": "acsard.drive.lying_wheels.verdict",
-}
-"""New names of the modules that older recordings name otherwise."""
-
-
 class StateError(AcsardError):
     """Bytes that do not hold a robot, or hold one that this version cannot make."""
 
@@ -104,7 +96,6 @@ def part(module: str, name: str) -> type:
     that name, and the module must be loaded already: nothing is imported. Re-exported names,
     functions and attributes of attributes are refused.
     """
-    module = MOVED.get(module, module)
     if (module, name) in BESIDE:
         return BESIDE[module, name]
     ours = module in ROOMS or any(r.endswith(".") and module.startswith(r) for r in ROOMS)

@@ -24,9 +24,9 @@ from acsard.report.drawing import (
     layout,
     note,
     numbers,
+    path,
     sentence,
 )
-from acsard.report.path import path
 from acsard.thinning import Point, Span
 from acsard.values import WHEELS
 

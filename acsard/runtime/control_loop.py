@@ -15,14 +15,11 @@ from acsard.config.settings import Config
 from acsard.config.wire_time import wire_ns
 from acsard.drive.kinematics import Kinematics
 from acsard.guard import Guard
-from acsard.incoming.asker import asker
-from acsard.incoming.bus import NOTHING, Bus, BusInput
-from acsard.incoming.commands import Receiver, parts, sender
-from acsard.incoming.door import KEY as DOOR
-from acsard.incoming.door import DoorTold
+from acsard.incoming.bus_interface import DOOR_KEY as DOOR
+from acsard.incoming.bus_interface import NOTHING, Bus, BusInput, DoorTold, RoutersTold
+from acsard.incoming.commands import Receiver, asker, parts, sender
 from acsard.incoming.imu import ImuTold
 from acsard.incoming.queries import Queries, Query, refused
-from acsard.incoming.routers import RoutersTold
 from acsard.mcu.gate import Port
 from acsard.messages.encodings import DecodeError
 from acsard.messages.report import Report
@@ -30,10 +27,9 @@ from acsard.messages.schema import Info, Message
 from acsard.messages.topics import IMU
 from acsard.record.steps import BlackBox
 from acsard.robot import Robot
-from acsard.runtime.at_once import Pace
 from acsard.runtime.kept_latches import ANSWER_NS, Handover, LatchKeeper
-from acsard.runtime.period import NO_PERIOD, Period
-from acsard.runtime.stopwatch import Stopwatch
+from acsard.runtime.latencies import Stopwatch
+from acsard.runtime.pacing import NO_PERIOD, Pace, Period
 from acsard.values import (
     NS_PER_S,
     Answer,

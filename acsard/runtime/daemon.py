@@ -1,8 +1,9 @@
 """Runs the daemon from its start to its end; reads from top to bottom.
 
 The daemon enters the simulator, the bus, the port and the control loop in this order. Leaving them
-in reverse order is the shutdown: ramp to zero, STOP, close the port, close the bus. A bug in any
-task ends the process in the same way.
+in reverse order is the shutdown: ramp to zero, STOP, close the port, close the bus. The first
+signal begins it, and a second one cuts the ramp short. A bug in any task ends the process in the
+same way.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
+import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
@@ -31,14 +33,58 @@ from acsard.messages.topics import offered, published
 from acsard.record.recorder import Recorder
 from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
-from acsard.runtime.departure import Departure
 from acsard.runtime.doorkeeper import DOOR, PAGE, Kind, keep_door
 from acsard.runtime.latch_file import LatchFile
 from acsard.runtime.simulated import Simulated
-from acsard.runtime.ticker import Ticker
-from acsard.runtime.wakeup import Next, Wakeup
+from acsard.runtime.wakeup import Next, Ticker, Wakeup
 from acsard.serial.port import SerialPort
 from acsard.values import NS_PER_S, Event, Latches
+
+EXIT_RAMP_S = 0.6
+"""Bound on the ramp to zero, s. After it the daemon sends STOP at any speed."""
+
+
+class Departure:
+    """The shutdown, begun by the first signal and hurried by the second."""
+
+    def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
+        self._log, self._wake, self._manager = log, wake, manager
+        self._starting = asyncio.current_task()
+        self.begun_ns: int | None = None
+        self.hurried = False
+
+    def watch(self) -> None:
+        """Handle the signals.
+
+        Those of a closed terminal are included, because it must not leave the wheels turning.
+        """
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+            loop.add_signal_handler(number, self._signal, number)
+
+    def started(self) -> None:
+        """Note that the start is complete.
+
+        Before this a signal cancels the start; now it begins the ramp.
+        """
+        self._starting = None
+
+    def _signal(self, number: signal.Signals) -> None:
+        self.hurried = self.begun_ns is not None
+        if self.begun_ns is None:
+            self.begun_ns = clock.now().mono_ns
+            self._manager.stopping()
+        self._log.info("signal", signal=number.name, hurried=self.hurried)
+        if self._starting is not None:
+            self._starting.cancel()
+        self._wake()
+
+    def over(self, now_ns: int, at_rest: bool) -> bool:
+        """Return whether the ramp has ended, was cut short or has taken too long."""
+        if self.begun_ns is None:
+            return False
+        return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
+
 
 SWITCH_INTERVAL_S = 0.0005
 """Longest time that another Python thread may hold the interpreter, s. The default is 5 ms, which

@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from msgspec import Struct
 
 from acsard.host import clock
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.host.silence import Silence
 from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S, Event, EventName

@@ -24,8 +24,8 @@ from msgspec.structs import replace as replace_fields
 
 from acsard.config.settings import Config
 from acsard.host import clock
+from acsard.host.atomic_file import replace, sync
 from acsard.host.errors import InUseError
-from acsard.host.files import replace, sync
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.runtime.kept_latches import (
     MAX_BYTES,

@@ -9,7 +9,7 @@ from types import TracebackType
 
 from acsard.config.settings import Config
 from acsard.host import clock
-from acsard.incoming.bus import Bus
+from acsard.incoming.bus_interface import Bus
 from acsard.messages.schema import Message
 from acsard.messages.topics import IMU
 from acsard.serial.sim_pty import SimPty

@@ -19,8 +19,14 @@ from contextlib import suppress
 import serial
 
 from acsard.host import clock
-from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import (
+    Exit,
+    ExitError,
+    InUseError,
+    MendableError,
+    NoPortError,
+    NotPermittedError,
+)
 from acsard.host.processes import holder_of
 
 _left_open: list[int] = []

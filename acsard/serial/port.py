@@ -19,7 +19,7 @@ import serial
 import serial_asyncio
 
 from acsard.host import clock
-from acsard.host.asleep import Asleep
+from acsard.host.clock import Asleep
 from acsard.host.errors import InUseError, MendableError, NotPermittedError
 from acsard.host.threads import NoThreadError, in_thread
 from acsard.mcu.gate import Gate, Offered
@@ -173,7 +173,7 @@ class SerialPort:
                 opening.discard(which)
 
         try:
-            device = await in_thread(open_port, OPEN_TIMEOUT_S, late=lambda late: late.close())
+            device = await in_thread(open_port, OPEN_TIMEOUT_S, late=close)
         except NoThreadError as error:
             opening.discard(which)
             raise OSError(errno.EIO, str(error)) from None

@@ -1,22 +1,70 @@
-"""Connects the simulated board to a real pty in real time, so that the real serial code runs.
+"""A serial line as a pty, and the simulated board behind one, so that the real serial code runs.
 
-A pty carries any baud rate. Here a host that sets another rate than the board's gets garbage, and
-so does the board, as on a real wire.
+The simulated board runs in real time. A pty carries any baud rate. Here a host that sets another
+rate than the board's gets garbage, and so does the board, as on a real wire.
 """
 
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
+import pty
 import termios
+import tty
 from types import TracebackType
 from typing import get_args
 
 from acsard.config.settings import Baud
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
-from acsard.serial.pty_end import PtyEnd
+from acsard.serial.device import unlock
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.garble import garbled
+
+
+class PtyEnd:
+    """The pty's end of the board.
+
+    It never blocks, and `fileno` is readable when the host has written.
+    """
+
+    def __init__(self) -> None:
+        self._master, self.slave = pty.openpty()
+        # Keep the slave open, or the master would see a hang-up whenever no host is connected.
+        tty.setraw(self.slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self.slave)
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return self._master
+
+    def read(self) -> bytes:
+        """Return the bytes that the host has written, b"" if none."""
+        try:
+            data = os.read(self._master, 4096)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EIO):
+                return b""
+            raise
+        # A killed host leaves its exclusive mark on the pty. A real port would not keep it.
+        unlock(self.slave)
+        return data
+
+    def write(self, data: bytes) -> bool:
+        """Write to the host; return False if nobody reads. A real wire would lose the bytes too."""
+        try:
+            os.write(self._master, data)
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close both ends, as if the device were unplugged."""
+        os.close(self._master)
+        os.close(self.slave)
+
 
 _RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_args(Baud)}
 

@@ -1,40 +1,20 @@
-"""The data of `acsard top`: the robot's received states, and the decision when the robot is silent.
-
-States may be published 10 s apart, so the feed queries one at the start. It subscribes to `state`
-only, which costs the daemon the same as any other reader of `state`.
-"""
+"""The data of `acsard top`: the robot's received states and the facts of its daemon."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Collection
 
-import zenoh
-
-from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
+from acsard.client.follower import restarted
+from acsard.client.watch import Watch
 from acsard.host.errors import MendableError, ReplyError
-from acsard.messages.encodings import DecodeError, Decoder
+from acsard.messages.encodings import DecodeError
 from acsard.messages.schema import Info, RobotState
-from acsard.top.seen import SILENT_S, Seen
+from acsard.top.seen import Seen
 
 SPAN_S = 1.0
 """Time over which rates are averaged; over less they would jump."""
-
-GAPS = 8
-"""Number of remembered intervals between states. One burst of changes must not replace all of
-them."""
-
-MISSING = 3
-"""Number of consecutive missing states that count as silence."""
-
-SLOWEST_S = 10.0
-"""Interval between states at the lowest configurable rate; also assumed until two states have
-arrived."""
-
-STEADY = ("lines", "lines_sent", "commands")
-"""Counters that decrease only when the daemon restarts."""
 
 
 class Feed:
@@ -42,17 +22,10 @@ class Feed:
 
     def __init__(self, robot: Client, endpoint: str, robot_id: str) -> None:
         self._robot, self._endpoint, self._id = robot, endpoint, robot_id
-        self._decoder = Decoder(RobotState)
         # The first query also fails with the usual message if no daemon answers.
         self._info = self._ask_info()
-        self._samples = robot.subscribe("state")
+        self._watch = Watch(robot, time.monotonic())
         self._past: deque[tuple[float, RobotState]] = deque()
-        self._heard = time.monotonic()
-        self._came: float | None = None
-        """Arrival time of the last published state, monotonic clock; answers to queries do not
-        count."""
-        self._gaps: deque[float] = deque(maxlen=GAPS)
-        self._undecodable = 0
 
     def ask(self) -> None:
         """Query the present state instead of waiting for the next published one.
@@ -62,68 +35,46 @@ class Feed:
         try:
             state: RobotState = self._robot.get("state")
         except DecodeError as error:
-            self._undecodable += 1
+            self._watch.unreadable += 1
             raise ReplyError(
                 f"cannot read the state ({error}); is the daemon of another version?"
             ) from None
         # A state that arrived before the answer is usually older than it, but not always.
-        come = self._newest()
-        later = come is not None and come.stamp.to_ns() > state.stamp.to_ns()
-        self._take(come if come is not None and later else state)
+        self.poll()
+        held, now = self._watch.state, time.monotonic()
+        if held is None or state.stamp.to_ns() > held.stamp.to_ns():
+            self._watch.answered(state, now)
+            self._take(state, now)
 
     def poll(self) -> None:
-        """Take the states that were published since the last call."""
-        state = self._newest()
-        if state is None:
-            return
+        """Take the states that arrived since the last call."""
         now = time.monotonic()
-        if self._came is not None:
-            self._gaps.append(now - self._came)
-        self._came = now
-        self._take(state)
+        for state in self._watch.look(now)[-1:]:
+            self._take(state, now)
 
-    def _take(self, state: RobotState) -> None:
-        now = time.monotonic()
-        if self._past and anew(self._past[-1][1], state):
+    def _take(self, state: RobotState, now: float) -> None:
+        if self._past and restarted(self._past[-1][1], state):
             self._past.clear()
-            self._gaps.clear()
             self._refresh_info()
         self._past.append((now, state))
-        self._heard = now
         while len(self._past) > 2 and now - self._past[1][0] >= SPAN_S:
             self._past.popleft()
 
     def seen(self, hint: str = "") -> Seen:
         """Return the data for the screen; `hint` is shown in the header."""
+        now, watch, past = time.monotonic(), self._watch, self._past
         return Seen(
             self._id,
             self._endpoint,
-            self._past[-1][1] if self._past else None,
-            self._past[0][1] if self._past else None,
-            time.monotonic() - self._heard,
+            watch.state,
+            past[0][1] if past else None,
+            watch.age(now),
             self._info,
-            self._undecodable,
+            watch.unreadable,
             hint,
-            silence(self._gaps) if self._past else SILENT_S,
-            self._past[-1][0] - self._past[0][0] if self._past else 0.0,
+            watch.silent(now),
+            past[-1][0] - past[0][0] if past else 0.0,
         )
-
-    def _newest(self) -> RobotState | None:
-        waiting: list[zenoh.Sample] = []
-        for _ in range(QUEUED):  # bounded, so a flood cannot block the screen
-            sample = self._samples.try_recv()
-            if sample is None:
-                break
-            waiting.append(sample)
-        for sample in reversed(waiting):
-            try:
-                state = self._decoder.decode(*encoded(sample))
-            except DecodeError:
-                self._undecodable += 1
-            else:
-                self._undecodable = 0
-                return state
-        return None
 
     def _ask_info(self) -> Info | None:
         try:
@@ -137,17 +88,3 @@ class Feed:
             self._info = self._ask_info()
         except MendableError:
             self._info = None
-
-
-def anew(before: RobotState, state: RobotState) -> bool:
-    """Return whether a counter decreased, which means that the daemon was restarted."""
-    return any(state.counters.get(name, 0) < before.counters.get(name, 0) for name in STEADY)
-
-
-def silence(gaps: Collection[float]) -> float:
-    """Return the time in s without a state that counts as silence.
-
-    `gaps` are the last intervals between states, s.
-    """
-    longest = min(SLOWEST_S, max(gaps, default=SLOWEST_S))
-    return max(SILENT_S, MISSING * longest)

@@ -13,20 +13,11 @@ import zenoh
 from acsard.bus.fleet import ALL, follow, nobody, robot_of, seen
 from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
-from acsard.client.driving import Answers
+from acsard.client.follower import FLEET_ASK_S, Follower
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import Info, RobotState
 from acsard.messages.topics import full_key
 from acsard.top.roster import Row
-from acsard.top.seen import SILENT_S
-
-ASK_S = 2.0
-"""Interval of queries to a robot that is present but silent."""
-
-SILENCE_S = SILENT_S + ASK_S
-"""Age from which a robot counts as silent: the last answer may be this late."""
-
-NEVER = -math.inf
 
 MOST = 1000
 """Maximum number of robots. The bound is needed because any client of the bus can invent robot
@@ -37,17 +28,14 @@ class _Known:
     """The known facts of one robot."""
 
     def __init__(self) -> None:
-        self.here = False
-        self.since = time.monotonic()
-        """Time when the robot appeared, or when the search for it began."""
-        self.said: tuple[RobotState | None, float] = None, NEVER
-        """State and arrival time in one value, because another thread reads it.
+        self.here, self.version = False, ""
+        self.begin()
 
-        The time is `NEVER` for a first answer to a query, which a router's storage may have sent.
-        """
-        self.asked = NEVER
-        self.answered = Answers()
-        self.version = ""
+    def begin(self) -> None:
+        """Query the robot at once, because it appeared or the search for it begins."""
+        self.since = self.info_due = time.monotonic()
+        self.follower = Follower(self.since, FLEET_ASK_S)
+        self.follower.due = self.since
 
 
 class Fleet:
@@ -76,14 +64,19 @@ class Fleet:
             known = list(self._known.items())
         rows = []
         for name, one in known:
-            state, heard = one.said
-            unheard = one.here and (heard == NEVER or not one.version)
-            if now - max(heard, one.asked) > ASK_S or unheard:
-                self._ask(name, one, now)
-            if one.here and heard == NEVER and now - one.since < SILENCE_S:
+            with self._lock:
+                follower = one.follower
+                asks, silent = follower.asks(now), follower.silent(now)
+                state = follower.state
+                age = follower.age(now) if follower.heard else math.inf
+            if asks:
+                self._robot.like(name).ask("state", partial(self._state, asked=True))
+            if one.here and not one.version and now >= one.info_due:
+                one.info_due = now + FLEET_ASK_S
+                self._robot.like(name).ask("info", self._info)
+            if one.here and not follower.heard and not silent:
                 state = None  # wait for the robot's own answer
-            age = max(0.0, now - heard)
-            rows.append(Row(name, one.here, state, age, one.version, SILENCE_S))
+            rows.append(Row(name, one.here, state, age, one.version, silent))
         return rows
 
     @property
@@ -95,7 +88,7 @@ class Fleet:
         with self._lock:
             known = list(self._known.values())
         named = ALL not in self._ids
-        return named and all(one.here and one.version and one.said[1] > NEVER for one in known)
+        return named and all(one.here and one.version and one.follower.heard for one in known)
 
     @property
     def seen(self) -> str:
@@ -114,14 +107,6 @@ class Fleet:
     def hint(self) -> str:
         """Return the reason why there may be no robots to show."""
         return nobody(self._endpoint) if ALL in self._ids else "none of these robots is there"
-
-    def _ask(self, name: str, one: _Known, now: float) -> None:
-        if now - one.asked < ASK_S / 2:
-            return
-        one.asked = now
-        other = self._robot.like(name)
-        other.ask("state", partial(self._state, asked=True))
-        other.ask("info", self._info)
 
     def _of(self, sample: zenoh.Sample) -> _Known | None:
         name = robot_of(str(sample.key_expr))
@@ -144,10 +129,12 @@ class Fleet:
     def _token(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)
         if one is not None:
-            one.here = sample.kind == zenoh.SampleKind.PUT
-            one.since = time.monotonic()
+            appeared, one.here = not one.here, sample.kind == zenoh.SampleKind.PUT
             if not one.here:
-                one.version = ""  # a restarted daemon may have another version
+                # A restarted daemon may have another version.
+                one.since, one.version = time.monotonic(), ""
+            elif appeared:
+                one.begin()
 
     def _state(self, sample: zenoh.Sample, asked: bool) -> None:
         try:
@@ -157,11 +144,8 @@ class Fleet:
         one = self._of(sample)
         if one is None:
             return
-        held = one.said[0]
-        if not asked or one.answered.news(state, held):
-            one.said = state, time.monotonic()
-        elif held is None:
-            one.said = state, NEVER
+        with self._lock:
+            (one.follower.answered if asked else one.follower.published)(state, time.monotonic())
 
     def _info(self, sample: zenoh.Sample) -> None:
         one = self._of(sample)

@@ -10,8 +10,6 @@ from acsard.formatting import printable, rough, signed
 from acsard.messages.schema import RobotState
 from acsard.top.teleop import reason
 
-SILENT_S = 2.0
-
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY")
 
 ROOM = (32, 8, 6, 7, 10, 6)
@@ -41,8 +39,8 @@ class Row(Struct, frozen=True):
     age: float
     """Age of `state` in s; inf if the only state is an answer that a storage may have sent."""
     version: str
-    silence: float = SILENT_S
-    """Age in s from which the robot counts as silent."""
+    silent: bool = False
+    """Whether the robot counts as silent."""
 
 
 def table(rows: Sequence[Row], width: int, height: int | None = None) -> list[str]:
@@ -112,7 +110,7 @@ def told(row: Row) -> tuple[str, ...]:
 def _absence(row: Row) -> str:
     if not row.here:
         return "GONE"
-    return "SILENT" if row.state is not None and row.age > row.silence else ""
+    return "SILENT" if row.state is not None and row.silent else ""
 
 
 def _order(row: Row) -> tuple[int, str]:

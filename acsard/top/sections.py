@@ -13,7 +13,7 @@ from rich.text import Text
 from acsard.drive.gyro import WORDS
 from acsard.formatting import rough, signed
 from acsard.messages.schema import Info, RobotState, SourceState, Spread
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.seen import Seen
 from acsard.top.text import bar, clean, count, rate, row, rule
 from acsard.values import NS_PER_S
@@ -40,7 +40,7 @@ FIGURES = {
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
-"""Short and long explanation of each `figures.Name`. An arrow leads from one moment to another."""
+"""Short and long words for each `latencies.Name`. An arrow leads from one moment to another."""
 
 
 def motion(state: RobotState, width: int) -> list[Text]:

@@ -6,10 +6,6 @@ from msgspec import Struct
 
 from acsard.messages.schema import Info, RobotState
 
-SILENT_S = 2.0
-"""Shortest time without a state after which the shown data counts as old."""
-
-
 MODES = {
     "driving": "bold white on green",
     "ready": "bold white on blue",
@@ -35,8 +31,8 @@ class Seen(Struct, frozen=True):
     undecodable: int = 0
     """Number of consecutive messages on the state's key that could not be decoded."""
     hint: str = ""
-    silence: float = SILENT_S
-    """Age in s from which the robot counts as silent."""
+    silent: bool = False
+    """Whether the robot counts as silent, so that the shown data is old."""
     passed: float = 0.0
     """Seconds from `before` to `state` by the local clock. The stamps differ from it by more than
     the network delay only if the robot's clock was set."""

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from acsard.formatting import rough, signed
 from acsard.messages.schema import RobotState
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.sections import (
     certificate,
     drives,

@@ -19,9 +19,6 @@ from acsard.top.seen import MODES
 if TYPE_CHECKING:
     from rich.text import Text
 
-SILENT_S = 1.0
-"""Time without a state after which the shown data counts as old."""
-
 HELP = (
     " u  i  o    arrows drive, too",
     " j  k  l    space or k stops",
@@ -46,6 +43,8 @@ class Teleop(Struct, frozen=True):
     """Seconds since `state` arrived, or since the wait for the first one began."""
     objection: str = ""
     """Reason why the robot does not follow the keys, or ""."""
+    silent: bool = False
+    """Whether the robot counts as silent, so that the shown data is old."""
 
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
@@ -55,7 +54,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown = [Text(head, "bold")]
-    if seen.age > SILENT_S or seen.state is None:
+    if seen.silent or seen.state is None:
         shown += _wrapped(silence(seen), width, "bold red")
     if seen.state is not None:
         state = seen.state
@@ -82,7 +81,7 @@ def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
 def news(seen: Teleop, width: int) -> list[str]:
     """Return the content without the help, wrapped between words and between figures."""
     told = [f"keys ask {asked(seen)}"]
-    if seen.state is None or seen.age > SILENT_S:
+    if seen.state is None or seen.silent:
         return _words([silence(seen), *told], width)
     if seen.objection:
         told.insert(0, f"your keys do not drive: {printable(seen.objection)}")
@@ -92,7 +91,7 @@ def news(seen: Teleop, width: int) -> list[str]:
 
 def parting(seen: Teleop, width: int) -> list[str]:
     """Return the last message: whether the robot stands, and where."""
-    if seen.state is None or seen.age > SILENT_S:
+    if seen.state is None or seen.silent:
         return _words([f"left: {silence(seen)}"], width)
     what = "still moves" if moves(seen.state) else "stands"
     if seen.state.linear is None:
@@ -108,7 +107,7 @@ def moves(state: RobotState) -> bool:
 
 def silence(seen: Teleop) -> str:
     """Return a message that the robot is silent, and for how long."""
-    if seen.state is None and seen.age <= SILENT_S:
+    if seen.state is None and not seen.silent:
         return "waiting for the first state"
     return f"no word from the daemon for {seen.age:.0f} s: is it running?"
 

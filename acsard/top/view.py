@@ -27,8 +27,7 @@ MOST_SOURCES = 32
 def screen(seen: Seen, width: int, height: int | None = None) -> Group:
     """Return the screen as lines of at most `width` cells, at most `height` of them (None: all)."""
     width = max(20, min(WIDEST, width))
-    silent = seen.age >= seen.silence
-    head = [_header(seen, width), *(_no_news(seen, width) if silent else _mode(seen, width))]
+    head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
     sections: list[list[Text]] = []
     if seen.state is not None:
         state = seen.state
@@ -45,7 +44,7 @@ def screen(seen: Seen, width: int, height: int | None = None) -> Group:
     airy = height is None or height - used >= len(sections) - 1
     body = [line for part in sections for line in ([Text(), *part] if airy else part)]
     body = body[1:] if airy else body  # the mode already leaves an empty line below it
-    if silent:
+    if seen.silent:
         for line in body:
             line.stylize("dim")
     lines = [*head, *body][:height]

@@ -23,7 +23,7 @@ from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
-from acsard.web.limits import REQUESTS_HZ, Paces, Seats, Tries
+from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS, Buckets, Seats
 from acsard.web.programs import READ_S, Programs, TroubleError
 from acsard.web.reports import Reports
 from acsard.web.requests import (
@@ -91,7 +91,7 @@ class Page:
         self._counts, self._vault, self._names, self._gate = counts, vault, names, gate
         self._files, self._reports = Files(page), Reports()
         self._programs = Programs(robots, calls, counts, self._reports)
-        self._tries, self._paces = Tries(), Paces()
+        self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
         self._seats = Seats()
         self._viewers: set[Viewer] = set()
         self.app = web.Application(middlewares=[self._admit], client_max_size=MAX_BYTES)
@@ -171,7 +171,7 @@ class Page:
                 if isinstance(who, Refusal):
                     return self.refused(who, asked.peer)
                 if self._hurries(request, who):
-                    text = f"over {REQUESTS_HZ:g} requests a second: /ws tells what changes"
+                    text = f"over {REQUESTS.hz:g} requests a second: /ws tells what changes"
                     return self.refused(Refusal("too_fast", text), who.origin)
                 request[WHO] = who
             return await handler(request)
@@ -201,7 +201,6 @@ class Page:
 
         Raises `TimeoutError` if the disk does not answer within `READ_S`.
         """
-        now_ns = clock.mono_ns()
         if not any(shown):
             return Refusal("no_token", "who are you? `acsard web --invite ROLE` at the robot")
         who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
@@ -209,9 +208,8 @@ class Page:
         # guesses lock nobody out.
         if who is not None:
             return replace(who, address=peer)
-        if self._tries.spent(peer, now_ns):
+        if not self._guesses.take(peer, clock.mono_ns()):
             return Refusal("too_fast", "too many wrong tokens: wait a minute")
-        self._tries.failed(peer, now_ns)
         return Refusal(
             "bad_token", "this token has ended, was revoked, is another robot's, or never was one"
         )

@@ -6,7 +6,7 @@ import os
 
 from msgspec import Struct
 
-from acsard.host.ports import serial_devices
+from acsard.host.serial_ports import serial_devices
 
 SIMULATOR = "sim"
 

@@ -19,7 +19,7 @@ from msgspec import Struct
 
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
 from acsard.host import clock
-from acsard.host.exits import WORDS, Exit
+from acsard.host.errors import WORDS, Exit
 from acsard.host.threads import in_thread
 from acsard.values import NS_PER_S
 from acsard.web.boards import NO_DEVICE, Board, boards

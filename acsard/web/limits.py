@@ -1,25 +1,19 @@
-"""Limits per client: message rates, token guesses, connections, subscriptions.
+"""Limits per client: rates by token buckets, and counts of places. This module is pure.
 
-This module is pure.
+The rates are those of messages, requests and wrong tokens. The places are those of connections and
+subscriptions.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Hashable
+from typing import NamedTuple
 
 from acsard.values import NS_PER_S
 
-MESSAGES_HZ, MESSAGES_AT_ONCE = 200.0, 400.0
-"""Message rate limit per connection. The burst allowance covers the messages a client sends when
-its network returns."""
-
 OVERRUNS = 600
 """Number of messages beyond the rate limit that ends a connection."""
-
-REQUESTS_HZ, REQUESTS_AT_ONCE = 50.0, 200.0
-"""HTTP request rate limit per token, with its burst allowance. The page's static files are
-exempt."""
 
 CONNECTIONS, CONNECTIONS_OF_ONE, CONNECTIONS_OF_TOKEN, CONNECTIONS_ALIKE = 100, 20, 30, 6
 """Limits on WebSockets from other machines: in all, per address, per token, and per token and
@@ -37,61 +31,75 @@ STREAMS, STREAMS_OF_ONE = 200, 50
 """Limits on subscribed keys of other robots: in all, and per token. Keys of the page's own robot
 are few and are not limited."""
 
-TRIES_OF_ONE, TRIES = 10, 100
-"""Limits on wrong tokens per minute: from one address, and in all."""
 
-MINUTE_NS = 60 * NS_PER_S
+class Rate(NamedTuple):
+    """A sustained rate with a burst allowance."""
+
+    hz: float
+    most: float
+    """Number of units that may be taken at once after a rest."""
+
+
+REQUESTS = Rate(50.0, 200.0)
+"""Limit on HTTP requests per token. The page's static files are exempt."""
+
+MESSAGES = Rate(200.0, 400.0)
+"""Limit on messages per WebSocket. The burst allowance covers the messages a client sends when its
+network returns."""
+
+GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
+"""Limits on wrong tokens: from one address, and in all."""
 
 
 class Bucket:
-    """A token bucket: a sustained rate with a burst allowance."""
+    """A token bucket."""
 
-    def __init__(self, rate_hz: float, most: float, now_ns: int) -> None:
-        self._rate, self._most = rate_hz / NS_PER_S, most
-        self._left, self._at_ns = most, now_ns
+    def __init__(self, rate: Rate, now_ns: int) -> None:
+        self._per_ns, self._most = rate.hz / NS_PER_S, rate.most
+        self._left, self._at_ns = rate.most, now_ns
+
+    def room(self, now_ns: int) -> bool:
+        """Return whether a unit is left."""
+        return self._filled(now_ns) >= 1.0
+
+    def full(self, now_ns: int) -> bool:
+        """Return whether all units are back."""
+        return self._filled(now_ns) >= self._most
 
     def take(self, now_ns: int) -> bool:
         """Consume one unit; return False if the bucket is empty."""
-        self._left = min(self._most, self._left + (now_ns - self._at_ns) * self._rate)
-        self._at_ns = now_ns
-        if self._left < 1.0:
+        if not self.room(now_ns):
             return False
         self._left -= 1.0
         return True
 
+    def _filled(self, now_ns: int) -> float:
+        self._left = min(self._most, self._left + (now_ns - self._at_ns) * self._per_ns)
+        self._at_ns = now_ns
+        return self._left
 
-class Paces:
-    """One request bucket per access token."""
 
-    def __init__(self) -> None:
+class Buckets:
+    """A token bucket for each name (an address or a token), and one for all names together."""
+
+    def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
+        """Set the rate of each name; `in_all` is None if their sum is not limited."""
+        self._of_one, self._in_all = of_one, in_all
         self._buckets: dict[str, Bucket] = {}
+        self._shared: Bucket | None = None
 
-    def take(self, token: str, now_ns: int) -> bool:
-        """Count one request; return False if the token is over its rate."""
-        bucket = self._buckets.get(token)
-        if bucket is None:
-            bucket = self._buckets[token] = Bucket(REQUESTS_HZ, REQUESTS_AT_ONCE, now_ns)
-        return bucket.take(now_ns)
-
-
-class Tries:
-    """Wrong tokens by address, counted in windows of one minute."""
-
-    def __init__(self) -> None:
-        self._since_ns: int | None = None
-        self._count: Counter[str] = Counter()
-
-    def spent(self, address: str, now_ns: int) -> bool:
-        """Return whether this address or all together used up this minute's guesses."""
-        if self._since_ns is None or now_ns - self._since_ns > MINUTE_NS:
-            self._since_ns = now_ns
-            self._count.clear()
-        return self._count[address] >= TRIES_OF_ONE or self._count.total() >= TRIES
-
-    def failed(self, address: str, now_ns: int) -> None:
-        """Count one wrong token."""
-        self.spent(address, now_ns)
-        self._count[address] += 1
+    def take(self, name: str, now_ns: int) -> bool:
+        """Consume one unit of this name; return False if it, or all together, have none left."""
+        if name not in self._buckets:
+            # A full bucket equals a new one. Without it, names cannot fill the memory.
+            self._buckets = {k: one for k, one in self._buckets.items() if not one.full(now_ns)}
+        own = self._buckets.setdefault(name, Bucket(self._of_one, now_ns))
+        if self._in_all is None:
+            return own.take(now_ns)
+        if self._shared is None:
+            self._shared = Bucket(self._in_all, now_ns)
+        # A name without units of its own must not consume those of the others.
+        return own.room(now_ns) and self._shared.take(now_ns) and own.take(now_ns)
 
 
 class Places:

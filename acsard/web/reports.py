@@ -57,7 +57,7 @@ ALONE_NS = 60 * NS_PER_S
 """A running drawing is given up if no client has asked for its progress for this long."""
 
 KEEP_NS = 900 * NS_PER_S
-"""A finished report is dropped if no client has asked for its progress for this long."""
+"""A finished report is dropped if no client has opened it or asked for it for this long."""
 
 LOOK_S = 1.0
 
@@ -146,9 +146,15 @@ class Reports:
         return Progress("drawing", percent=one.percent, seconds=round(seconds, 1))
 
     def drawn(self, name: str) -> bytes | None:
-        """Return the finished report of this recording, compressed by gzip, or None."""
+        """Return the finished report of this recording, compressed by gzip, or None.
+
+        This keeps the report for another `KEEP_NS`.
+        """
         one = self._one
-        return one.packed or None if one is not None and one.path.name == name else None
+        if one is None or one.path.name != name or not one.packed:
+            return None
+        one.asked_ns = clock.mono_ns()
+        return one.packed
 
     def tidy(self) -> None:
         """Give up a drawing that no client waits for, and drop an old report.

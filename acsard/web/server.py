@@ -22,7 +22,7 @@ from acsard.bus.session import client_session
 from acsard.client import Client
 from acsard.config.settings import Config
 from acsard.host.logs import Log
-from acsard.host.parent import end_with_parent
+from acsard.host.processes import end_with_parent
 from acsard.web.app import Page
 from acsard.web.calls import Calls
 from acsard.web.commands import SOURCE, Hand

@@ -44,9 +44,8 @@ class Token(Struct, frozen=True):
     """Creation time, seconds since 1970."""
     ends: int
     """Expiry time, seconds since 1970."""
-    robot: str = ""
-    """Id of the robot whose page the token opens; "" opens any robot (tokens from before this field
-    existed)."""
+    robot: str
+    """Id of the robot whose page the token opens."""
 
 
 class Vault:
@@ -55,7 +54,7 @@ class Vault:
     All robots of one user share the file, and each vault sees the tokens of its own robot only.
     """
 
-    def __init__(self, directory: Path, robot: str = "") -> None:
+    def __init__(self, directory: Path, robot: str) -> None:
         """Use the token file in `directory` for the robot with this id."""
         self.path, self.robot = directory / FILE, robot
         self._read: tuple[tuple[int, int] | None, list[Token]] = None, []
@@ -81,10 +80,7 @@ class Vault:
 
     def all(self) -> list[Token]:
         """Return this robot's tokens, including expired ones; none if the file cannot be read."""
-        return [one for one in self._shared() if self._ours(one)]
-
-    def _ours(self, token: Token) -> bool:
-        return token.robot in ("", self.robot)
+        return [one for one in self._shared() if one.robot == self.robot]
 
     def _shared(self) -> list[Token]:
         """Return the tokens of all robots that share the file."""
@@ -123,7 +119,7 @@ class Vault:
         with self._changing() as tokens:
             now_s = int(time.time())
             tokens[:] = [one for one in tokens if one.ends > now_s]
-            ours = [one for one in tokens if self._ours(one)]
+            ours = [one for one in tokens if one.robot == self.robot]
             if any(one.name == name for one in ours):
                 raise UsageError(f"there is a token {name} already: another --name, or --revoke it")
             if len(ours) >= MOST:
@@ -137,13 +133,13 @@ class Vault:
     def revoke(self, name: str) -> None:
         """Delete a token by name, effective at once; raises `UsageError` if it does not exist."""
         with self._changing() as tokens:
-            ours = [one for one in tokens if self._ours(one)]
+            ours = [one for one in tokens if one.robot == self.robot]
             if all(one.name != name for one in ours):
                 known = ", ".join(one.name for one in ours) or "none"
                 raise UsageError(
                     f"there is no token {name} of {self.robot} in {self.path}; there are: {known}"
                 )
-            tokens[:] = [one for one in tokens if one.name != name or not self._ours(one)]
+            tokens[:] = [one for one in tokens if (one.name, one.robot) != (name, self.robot)]
 
     @contextmanager
     def _changing(self) -> Iterator[list[Token]]:

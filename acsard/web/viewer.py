@@ -16,7 +16,7 @@ from aiohttp import web
 
 from acsard.bus.access import MAY
 from acsard.host import clock
-from acsard.host.own_name import sender_id
+from acsard.host.own_identity import sender_id
 from acsard.messages.signature import public_name
 from acsard.values import NS_PER_S
 from acsard.web import told
@@ -39,7 +39,7 @@ from acsard.web.frames import (
 )
 from acsard.web.guide import Guide
 from acsard.web.keys import Keys
-from acsard.web.limits import MESSAGES_AT_ONCE, MESSAGES_HZ, OVERRUNS, Bucket
+from acsard.web.limits import MESSAGES, OVERRUNS, Bucket
 from acsard.web.robots import Robots
 from acsard.web.to_browser import Outgoing
 from acsard.web.who import Who
@@ -81,7 +81,7 @@ class Viewer:
         self._socket = socket
         self._robots, self._hand, self._calls = robots, hand, calls
         self._fleet, self._guide, self._counts = fleet, guide, counts
-        self._bucket = Bucket(MESSAGES_HZ, MESSAGES_AT_ONCE, clock.mono_ns())
+        self._bucket = Bucket(MESSAGES, clock.mono_ns())
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts, who.origin)
         self._keys = Keys(self._out, robots, self._start, who.token or who.name)
@@ -145,7 +145,7 @@ class Viewer:
             if room or urgent:
                 self._obey(frame)
             else:
-                self._out.refuse("message", "too_fast", f"over {MESSAGES_HZ:g} messages a second")
+                self._out.refuse("message", "too_fast", f"over {MESSAGES.hz:g} messages a second")
         if self._overruns >= OVERRUNS:
             self.end("too many messages")
 

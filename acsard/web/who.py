@@ -131,11 +131,10 @@ def cookie_name(robot: str, port: int) -> str:
 def tokens_in(cookies: Mapping[str, str], robot: str, port: int) -> list[str]:
     """Return the cookie tokens that may be valid for this page, the likeliest first.
 
-    The page's own cookie comes first. Cookies of the same robot at other ports follow, and cookies
-    from before the names contained robot and port.
+    The page's own cookie comes first. Cookies of the same robot at other ports follow.
     """
     own, ours = cookie_name(robot, port), f"{COOKIE}-{robot}"
-    names = [name for name in cookies if name == COOKIE or name.rpartition("-")[0] == ours]
+    names = [name for name in cookies if name.rpartition("-")[0] == ours]
     return [cookies[name] for name in sorted(names, key=lambda name: name != own)][:MOST_COOKIES]
 
 

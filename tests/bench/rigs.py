@@ -13,10 +13,9 @@ from tempfile import TemporaryDirectory
 
 from msgspec.structs import replace
 
-from acsard.bench.matching import staircase
-from acsard.bench.record import Record, command_waits, feedback_fates
+from acsard.bench.matching import Record, command_waits, feedback_fates, staircase
+from acsard.bench.measure import bench_config, free_endpoint, write
 from acsard.bench.rig import ACSARD, Rig
-from acsard.bench.setup import bench_config, free_endpoint, write
 from acsard.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")

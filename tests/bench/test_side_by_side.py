@@ -15,8 +15,7 @@ from statistics import median
 
 import pytest
 
-from acsard.bench.matching import staircase
-from acsard.bench.record import feedback_fates
+from acsard.bench.matching import feedback_fates, staircase
 from acsard.bench.rig import ACSARD, SPACING_S
 from tests.bench.rigs import (
     BY_EVENTS,

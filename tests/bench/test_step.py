@@ -24,7 +24,7 @@ from acsard.drive.path import arc
 from acsard.mcu.codec import Codec
 from acsard.mcu.lines import LineReader
 from acsard.messages.encodings import encode
-from acsard.runtime.period import NO_PERIOD, Period
+from acsard.runtime.pacing import NO_PERIOD, Period
 from acsard.values import Instant, Outputs, Pose, PoseCovariance, Received
 from tests.scenarios.world import World
 

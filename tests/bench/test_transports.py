@@ -20,8 +20,7 @@ from statistics import median
 
 import pytest
 
-from acsard.bench.child import processor_ns
-from acsard.bench.rig import Rig
+from acsard.bench.rig import Rig, processor_ns
 from acsard.bus import outlets
 from acsard.bus.access import access_control
 from acsard.bus.bus import ZenohBus

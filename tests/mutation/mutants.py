@@ -1,5 +1,8 @@
 """The small faults a module may have: one changed, swapped or dropped piece of its syntax each.
 
+A whole number up to `LARGE` is changed by 1, a larger one by a quarter. A float is multiplied by
+1.25 and by 0.8.
+
 Not mutated: texts (words for people), annotations, and `zip(strict=...)` and `frozen=...` (checks
 of what is always so).
 """
@@ -35,6 +38,9 @@ ARITHMETIC: dict[type, type] = {
     ast.Pow: ast.Mult,
 }
 COMMUTATIVE = (ast.Add, ast.Mult, ast.BitXor, ast.BitAnd, ast.BitOr)
+LARGE = 20
+"""A whole number above this is changed by a quarter, one up to this by 1."""
+
 NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "sin": "cos", "cos": "sin"}
 MEMBERS = {"Mode": list(Mode.__members__)}
 
@@ -83,7 +89,9 @@ def variants(node: ast.AST, parent: ast.AST, field: str) -> Iterator[ast.AST]:
         case ast.Constant(value=bool(value)):
             yield ast.Constant(not value)
         case ast.Constant(value=int(value)):
-            yield from (ast.Constant(value + 1), ast.Constant(value - 1))
+            # One more or less of a large number says nothing about a test.
+            change = value // 4 if value > LARGE else 1
+            yield from (ast.Constant(value + change), ast.Constant(value - change))
         case ast.Constant(value=float(value)):
             yield from (ast.Constant(value * 1.25 or 1.0), ast.Constant(value * 0.8 or -1.0))
         case ast.Constant(value=bytes(value)) if value:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from acsard.config.settings import CommandsConfig, Config, McuConfig, Source
 from acsard.incoming.queries import Query
-from acsard.runtime.at_once import IDLE_WAKES
+from acsard.runtime.pacing import IDLE_WAKES
 from acsard.values import Outputs
 from tests.scenarios.world import World
 

@@ -16,7 +16,7 @@ from typing import Literal
 import msgspec
 import pytest
 
-from acsard.foxglove.hand import Hand, Wish
+from acsard.client.commander import Commander, Wish
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
 from acsard.values import NS_PER_S
@@ -529,7 +529,7 @@ class Panel(Speaker):
 
     def __init__(self, world: World) -> None:
         super().__init__(world, "signed")
-        self._server = Hand()
+        self._server = Commander(leads=True, gathers=True)
 
     def button(self, linear: float, seconds: float) -> None:
         """Hold a button."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import msgspec
 
 from acsard.config.settings import Config
-from acsard.incoming.bus import NOTHING, BusInput
+from acsard.incoming.bus_interface import NOTHING, BusInput
 from acsard.incoming.commands import Arrival
 from acsard.incoming.imu import OWN
 from acsard.incoming.queries import Query, Reply
@@ -25,7 +25,7 @@ from acsard.messages.topics import PUBLISHED
 from acsard.record.steps import BlackBox
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.kept_latches import LatchKeeper
-from acsard.runtime.period import NO_PERIOD, Period
+from acsard.runtime.pacing import NO_PERIOD, Period
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.told import turn_rate
 from acsard.sim.watched import Sight, WatchedMcu

@@ -69,7 +69,8 @@ class Run:
         self.failure: BrokenError | None = None
         self.todo: list[tuple[int, int, Callable[[], None]]] = []
         self._order = 0
-        self._calls: dict[int, Callable[[bytes], None]] = {}
+        self._calls: dict[int, tuple[dict[str, Any], int, Callable[[bytes], None]]] = {}
+        """Calls without an answer: the event, its arrival and the function for the answer."""
         self._ticket = 0
         self.active: list[tuple[str, tuple[Any, ...]]] = []
         self._fed_ns = 0
@@ -247,11 +248,11 @@ class Run:
                     witness.offs.append(true_ns)
                 case "set":
                     if not text.startswith("nothing new"):
-                        witness.set_limits(self.true_ns, event["settings"])
+                        witness.set_limits(self.true_ns, event["settings"], true_ns)
                 case "set_pose" | "reset_odometry":
                     self.pose.placed()
 
-        self._calls[ticket] = answered
+        self._calls[ticket] = event, true_ns, answered
         product.ask(at_ns, verb, ticket, payload, via, attachment)
 
     # the board and the host
@@ -366,17 +367,16 @@ class Run:
     def _restart(self, event: dict[str, Any], after_ns: int) -> None:
         product, witness = self.product, self.witness
         product.end(event["way"])
-        behind = product.disk.behind
-        if behind:
-            witness.stops.clear()
-            witness.offs.clear()
-            witness.fault_ns = None
-            witness.limits = dict(witness.file)
+        self._take_answers()
+        for call, arrived_ns, _ in self._calls.values():
+            witness.unanswered(call["verb"], call.get("settings", {}), arrived_ns)
         self._calls.clear()
+        if product.disk.behind:
+            witness.file_is_behind()
 
         def start() -> None:
             self.resumed_ns = product.now_ns
-            if product.disk.full:
+            if product.disk.full and not witness.stops:
                 witness.stops.append(self.true_ns)
             product.start()
             self.liveness.event()
@@ -392,8 +392,11 @@ class Run:
     def _fed(self, at_ns: int) -> None:
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
-        if gap_ns > 11 * NS // 10 and self._stalled_ns < self._fed_ns:
-            self._disarmed(true_ns)
+        if gap_ns > 9 * NS // 10:
+            # Behind a stall of the host the kernel may hold lines, so the link may not be lost.
+            self.liveness.event()
+            if gap_ns > 11 * NS // 10 and self._stalled_ns < self._fed_ns:
+                self._disarmed(true_ns)
         self._fed_ns, self._linked = true_ns, True
 
     def _disarmed(self, true_ns: int) -> None:
@@ -409,13 +412,17 @@ class Run:
         except BrokenError as error:
             self.failure = error
 
+    def _take_answers(self) -> None:
+        """Hand each answer of the daemon to the call that it belongs to."""
+        for ticket, reply in self.product.replies():
+            if ticket in self._calls:
+                _, _, answered = self._calls.pop(ticket)
+                answered(reply)
+
     def _judge(self, seen: Seen) -> None:
         witness, offset = self.witness, self.slept_ns - START_NS
         true_ns = seen.at_ns + offset
-        for ticket, reply in self.product.replies():
-            answered = self._calls.pop(ticket, None)
-            if answered is not None:
-                answered(reply)
+        self._take_answers()
         witness.pending = self.product.disk.full and bool(self._calls)
         if witness.pending:
             self.pose.placed()

@@ -73,6 +73,8 @@ class Liveness:
         run = self.run
         if not self._since or run.active != run.lasting or run.witness.held is not None:
             return
+        if not run.product.plugged:
+            return
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]
             quiet = now_ns - self._event_ns > SETTLES_NS
@@ -156,6 +158,8 @@ class Liveness:
         witness, limits = run.witness, run.witness.limits
         takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
         if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
+            return
+        if witness.unsure:
             return
         got, told = witness.twist(witness.last), witness.clamped(speed, turn)
         room = witness.radius * 0.02, witness.radius * 0.02 / witness.half

@@ -223,11 +223,14 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
         sender["loss"] = dice.choice((0.0, 0.02, 0.2))
     if "disorder" in kinds:
         sender["twice"], sender["swap"] = dice.choice((0.0, 0.05)), dice.choice((0.0, 0.05))
-    if "hostile senders" in kinds and dice.random() < 0.4:
+    shared = way in ("header", "plain", "bridge", "bridged")
+    if "hostile senders" in kinds and dice.random() < (0.8 if shared else 0.4):
         sender["junk"] = dice.choice((0.02, 0.3))
-        sender["churn"] = dice.random() < 0.3 and way in ("client", "signed", "rmw")
-        if dice.random() < 0.2:
+        sender["churn"] = dice.random() < 0.6 and way in ("client", "signed", "rmw")
+        if dice.random() < 0.2 and not shared:
             sender["hz"] = 400.0
+        elif sender["churn"]:
+            sender["hz"] = 50.0  # enough names to fill a table that has no bound
     if "congestion" in kinds:
         t = dice.uniform(0.0, 20.0)
         while t < seconds:

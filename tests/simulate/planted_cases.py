@@ -7,7 +7,6 @@ code did then, or the part of it that mattered.
 from __future__ import annotations
 
 from tests.simulate.planted_faults import (
-    FRESHNESS,
     GUARD,
     LIFECYCLE,
     LIMITS,
@@ -17,7 +16,9 @@ from tests.simulate.planted_faults import (
     SESSION,
     VALUES,
     Edit,
+    Fault,
     fault,
+    judging,
 )
 
 CASES = (
@@ -35,14 +36,10 @@ CASES = (
         "elif now_ns >= since_ns and not command.shared:",
         "elif now_ns >= since_ns:",
     ),
-    fault(
+    Fault(
         "case 3",
         "a congested link is taken for a clock that was adjusted",
-        FRESHNESS,
-        "if command.steady and self._later_than_lowest(delay, silence) > timeout_ns:",
-        "if False:",
-        Edit(FRESHNESS, "        if steady:  #", "        if False:  #"),
-        Edit(FRESHNESS, "if hidden > self._budget and not self._paused:", "if False:"),
+        (judging("self.believe(verdict, clock, at_ns, delay, timeout_ns)"),),
     ),
     fault(
         "case 4",
@@ -51,12 +48,15 @@ CASES = (
         "self.blocked = self._held_up and (self.blocked or (long and not late))",
         "self.blocked = False",
     ),
-    fault(
+    Fault(
         "case 5",
         "an older command after a newer one is obeyed",
-        FRESHNESS,
-        'if verdict == "fresh" and self._superseded(mark):',
-        "if False:",
+        (
+            judging(
+                '"fresh" if verdict == "stale" and not newer '
+                "and delay <= self.lowest[clock] + timeout_ns else verdict"
+            ),
+        ),
     ),
     fault(
         "case 6",

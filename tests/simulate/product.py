@@ -74,24 +74,31 @@ class Disk:
     def __init__(self) -> None:
         self.full = False
         self.trouble = ""
-        self._newest = Latches()
-        self._data = encode("acsar", self._newest)
+        self._running = True
+        self._newest = self._written = Latches()
+        """The latches that the daemon wants to keep, and those in the file."""
+        self._data = encode("acsar", self._written)
 
     @property
     def behind(self) -> bool:
         """Return whether the file lacks the newest latches."""
-        return self._data != encode("acsar", self._newest)
+        return self._written != self._newest
 
     def fill(self, full: bool) -> None:
         """Begin or end a time in which nothing can be written; the daemon tries again by itself."""
         self.full = full
-        self.keep(self._newest)
+        if self._running:
+            self.keep(self._newest)
 
     def keep(self, latches: Latches) -> None:
         self._newest = latches
         self.trouble = unwritable("FILE", "no space left on device") if self.full else ""
         if not self.full:
-            self._data = encode("acsar", latches)
+            self._data, self._written = encode("acsar", latches), latches
+
+    def end(self) -> None:
+        """Note that the daemon has ended: it writes nothing any more."""
+        self._running = False
 
     def holds(self, latches: Latches) -> bool:
         return not self.full
@@ -107,10 +114,12 @@ class Disk:
             found = decode("acsar", self._data)
         except LatchFileError as error:
             found = stopped(Latches(), unreadable("FILE", str(error)), now)
+        self._running, self.trouble = True, ""
+        self._newest = self._written = found
         if self.full:
-            self._newest = stopped(found, at_start(unwritable("FILE", "no space")), now)
-            return self._newest
-        return found
+            self.trouble = unwritable("FILE", "no space left on device")
+            self._newest = stopped(found, at_start(self.trouble), now)
+        return self._newest
 
 
 class Product:
@@ -352,6 +361,7 @@ class Product:
             # The unit sends zeros when the process has ended.
             stop = world.loop.robot.session.codec.stop
             world.port.mcu.receive(world.now_ns + 50_000_000, b"\r\n" + stop)
+        self.disk.end()
         self.alive = False
 
     def start(self) -> None:

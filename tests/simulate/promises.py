@@ -37,6 +37,10 @@ HARMLESS = {
 }  # fmt: skip
 """Troubles of the board that are no reason to latch a fault."""
 
+MAYBE_SPEEDS = ("garbage", "not a number", "huge", "fields")
+"""Refused messages that may have been speeds of a program that shares its identity, so a zero
+before them arms nobody."""
+
 
 class BrokenError(AssertionError):
     """A promise did not hold."""
@@ -63,6 +67,9 @@ class Witness:
         ]
         self.file = dict(config["limits"])
         self.limits = dict(config["limits"])
+        """The limits in force, or the highest value that an unsure one can have."""
+        self.unsure: set[str] = set()
+        """Limits that may be lower: a `set` had no answer, or the latch file was behind."""
         commands = config["commands"]
         self.neutral_first = commands.get("neutral_first", True)
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
@@ -106,6 +113,8 @@ class Witness:
         for name, value in self.file.items():
             kept = not name.endswith("_deceleration") and "jerk" not in name
             self.limits[name] = min(value, self.limits[name]) if kept else value
+            if not kept:
+                self.unsure.discard(name)
         self.before = dict(self.limits)
         self.changed_ns = at_ns
         self.softest = dict(self.limits)
@@ -129,7 +138,11 @@ class Witness:
         self.delivered += 1
         source = sender["source"]
         if message.junk not in ("", "cancels"):
-            return  # it is neither a speed nor a zero
+            if sample.shared and message.junk in MAYBE_SPEEDS:
+                other = self.senders.setdefault((source, sample.identity), Sender())
+                self._arm(other, arrived_ns)
+                other.zeros.clear()
+            return
         if message.junk == "cancels":
             v, w = 0.0, 0.0
         else:
@@ -201,13 +214,14 @@ class Witness:
                 raise BrokenError(promise, asked_ns, text)
         latched[:] = later
 
-    def set_limits(self, at_ns: int, settings: dict[str, float]) -> None:
-        """Note settings that the daemon says it has taken."""
+    def set_limits(self, at_ns: int, settings: dict[str, float], asked_ns: int) -> None:
+        """Note settings that the daemon says it has taken; on a full disk it says so late."""
         self.before, self.changed_ns = dict(self.limits), at_ns
         for key, value in settings.items():
             parts = key.split(".")
             if parts[0] == "limits":
                 self.limits[parts[1]] = value
+                self.unsure.discard(parts[1])
                 low = self.softest.get(parts[1], value)
                 self.softest[parts[1]] = (
                     min(low, value) if "deceleration" in key else max(low, value)
@@ -219,7 +233,34 @@ class Witness:
             else:
                 self.timeout[parts[2]] = int(value * NS)
             if before_ns != (self.pause_ns, self.timeout):
-                self.arming(at_ns)
+                self.arming(asked_ns)
+
+    def unanswered(self, verb: str, settings: dict[str, float], arrived_ns: int) -> None:
+        """Note a call whose answer did not come before the daemon ended.
+
+        It may be in force after the restart, or not.
+        """
+        match verb:
+            case "stop":
+                self.stops = [at_ns for at_ns in self.stops if at_ns != arrived_ns]
+            case "clear":
+                self.stops.clear()
+                self.fault_ns = None
+            case "activate":
+                self.offs.clear()
+            case "set":
+                for key, value in settings.items():
+                    name = key.removeprefix("limits.")
+                    if name != key:
+                        self.unsure.add(name)
+                        self.limits[name] = max(value, self.limits[name])
+
+    def file_is_behind(self) -> None:
+        """Note that the daemon ended before the latch file had what was in force."""
+        self.stops.clear()
+        self.offs.clear()
+        self.fault_ns = None
+        self.limits, self.unsure = dict(self.file), set(self.file)
 
     # what the daemon showed
 

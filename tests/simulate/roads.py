@@ -50,6 +50,9 @@ class Sample(NamedTuple):
 def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) -> list[Message]:
     """Return all messages of a sender in the order of their arrival. `wall_ns` is at time 0."""
     dice = random.Random(f"{seed} {sender['name']}")
+    # Most senders of junk send few kinds of it, because one kind may hide what another one does.
+    swarm = random.Random(f"junk {seed} {sender['name']}")
+    kinds = swarm.sample(JUNK, swarm.choice((1, 1, 2, len(JUNK))))
     found: list[Message] = []
     last_ns, number, t = 0, 0, float(sender["from"])
     phases, place = sender["phases"], -1
@@ -63,7 +66,7 @@ def messages(sender: dict[str, Any], seed: int, seconds: float, wall_ns: int) ->
             late = sender["delay"] + _jitter(sender["jitter"], chance[0]) + _held(sender, t)
             arrives_ns = int((t + late) * NS)
             lost = chance[1] < sender["loss"]
-            junk = JUNK[int(chance[2] * 1e6) % len(JUNK)] if chance[3] < sender["junk"] else ""
+            junk = kinds[int(chance[2] * 1e6) % len(kinds)] if chance[3] < sender["junk"] else ""
             if not lost:
                 arrives_ns = last_ns = max(last_ns + 1000, arrives_ns)
                 if chance[4] < sender["swap"]:

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import ast
+from typing import Any
 
 import pytest
 
+from acsard.values import REST, Command
 from tests.simulate.planted import edited
 from tests.simulate.planted_cases import CASES
-from tests.simulate.planted_faults import FAULTS, Fault
+from tests.simulate.planted_faults import FAULTS, FRESHNESS, Fault
 
 ALL = (*FAULTS, *CASES)
+ADDED = [fault for fault in ALL if not all(edit.old for edit in fault.edits)]
 
 
 @pytest.mark.parametrize("fault", ALL, ids=lambda fault: fault.name)
 def test_a_fault_fits_the_product_and_is_still_a_program(fault: Fault) -> None:
     for text in edited(fault).values():
         ast.parse(text)
+
+
+@pytest.mark.parametrize("fault", ADDED, ids=lambda fault: fault.name)
+def test_code_that_a_fault_adds_to_freshness_runs_there(fault: Fault) -> None:
+    names: dict[str, Any] = {"__name__": "planted"}
+    exec(compile(edited(fault)[FRESHNESS], FRESHNESS, "exec"), names)
+    verdict = names["Freshness"]().judge(Command("app", REST, 5, 3, "clock"), 10**9)
+    assert verdict in ("first", "unproven", "fresh")
 
 
 def test_there_are_fifty_faults_and_eleven_cases() -> None:

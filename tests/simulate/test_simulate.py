@@ -10,17 +10,20 @@ from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from acsard.values import Latches
+from tests.scenarios.world import START
 from tests.simulate import __main__ as main
 from tests.simulate import pairs, shrink
 from tests.simulate.actors import Result, played
 from tests.simulate.pairs import OURS, Pair, Trace
 from tests.simulate.plan import KINDS, Plan, made
-from tests.simulate.product import problems
+from tests.simulate.product import Disk, problems
 from tests.simulate.promises import BrokenError, Witness
-from tests.simulate.roads import NS, messages
+from tests.simulate.roads import NS, Message, messages, sample
 
 PLAIN = next(p for p in map(made, range(99)) if "odd configuration" not in p["kinds"])
 EMPTY: Plan = {
@@ -152,6 +155,62 @@ def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> N
         witness.cleared(9 * NS, 4 * NS, "cleared; each sender must send a zero", "ann")
     witness.cleared(9 * NS, 6 * NS, "cleared; each sender must send a zero", "ann")
     assert witness.held is None
+
+
+@pytest.mark.parametrize(("junk", "armed"), [("not a number", False), ("stranger", True)])
+def test_a_zero_before_what_may_be_a_speed_of_the_same_identity_arms_nobody(
+    junk: str, armed: bool
+) -> None:
+    witness = witnessed()
+    sender = made(1)["senders"][0] | {"way": "plain", "source": "app", "churn": False}
+    for at_s, v, kind in ((1.0, 0.0, ""), (1.5, 0.0, junk), (2.5, 0.3, "")):
+        one = Message(int(at_s * NS), int(at_s * NS), v, 0.0, 0, 0, kind)
+        witness.command(sender, one, sample(sender, one, PLAIN["config"], 0), one.arrives_ns)
+    assert (witness.wishes[-1][1].armed_ns == NS) is armed
+
+
+def test_a_set_that_had_no_answer_may_be_in_force_after_a_restart_or_not() -> None:
+    witness = witnessed()
+    limit = witness.file["wheel_speed"]
+    witness.unanswered("set", {"limits.wheel_speed": 0.5 * limit}, 4 * NS)
+    witness.new_life(5 * NS)
+    assert (witness.limits["wheel_speed"], witness.unsure) == (limit, {"wheel_speed"})
+    witness.set_limits(6 * NS, {"limits.wheel_speed": 0.7 * limit})
+    assert (witness.limits["wheel_speed"], witness.unsure) == (0.7 * limit, set())
+
+
+def test_a_daemon_that_has_ended_writes_nothing_when_the_disk_has_room_again() -> None:
+    disk = Disk()
+    disk.fill(True)
+    disk.keep(Latches(lowered={"limits.wheel_speed": 1.0}))
+    assert disk.behind
+    disk.end()
+    disk.fill(False)
+    assert disk.read(START).lowered == {}
+    assert not disk.behind
+
+
+def test_a_stop_that_had_no_answer_may_be_gone_after_a_restart() -> None:
+    witness = witnessed()
+    witness.stops += [2 * NS, 4 * NS]
+    witness.unanswered("stop", {}, 4 * NS)
+    assert witness.stops == [2 * NS]
+
+
+def with_a_set_before_sigterm(settings: dict[str, float]) -> Plan:
+    """A plan whose `set` has no answer when SIGTERM ends the daemon: the disk is full."""
+    call = {"verb": "set", "settings": settings, "late": 0.0, "lost": False, "twice": False}
+    events: list[dict[str, Any]] = [
+        {"at": 1.0, "do": "disk", "for": 0.6},
+        {"at": 1.5, "do": "call", "by": "ann", "via": "native", **call},
+        {"at": 1.505, "do": "restart", "way": "term", "for": 0.2},
+    ]
+    return quiet() | {"seconds": 3.0, "events": events}
+
+
+def test_a_limit_that_was_lowered_on_the_way_down_is_no_finding() -> None:
+    lowered = {"limits.wheel_speed": 0.1 * PLAIN["config"]["limits"]["wheel_speed"]}
+    assert played(with_a_set_before_sigterm(lowered)).finding == ""
 
 
 # shrinking

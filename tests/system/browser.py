@@ -15,6 +15,7 @@ from typing import Any
 
 import aiohttp
 
+from acsard.config.parsing import parse
 from acsard.values import Role
 from acsard.web.tokens import Vault
 from tests.system.harness import (
@@ -43,6 +44,7 @@ class Page(Program):
         self.here, self.away = f"http://127.0.0.1:{plain}", f"https://{at or NAME}:{secure}"
         self.state, self.tls = where / "state", where / "tls"
         self.env = environment(XDG_STATE_HOME=str(self.state), **more)
+        self._config = daemon.config
         self.told = ["--config", str(daemon.config), "--address", self.here]
         if self.tls.is_dir():
             self.told += ["--address", f"https://{at or '127.0.0.1'}:{secure}"]
@@ -60,9 +62,14 @@ class Page(Program):
         assert done.code == 0, done
         return done.out
 
+    @property
+    def vault(self) -> Vault:
+        """The tokens of this page."""
+        return Vault(self.state / "acsard-web", parse(self._config.read_bytes()).robot.id)
+
     def invite(self, role: Role, name: str) -> str:
         """Invite a client and return its token."""
-        return Vault(self.state / "acsard-web").invite(role, name, 1)[0]
+        return self.vault.invite(role, name, 1)[0]
 
     def client(self, token: str = "", address: str = "") -> aiohttp.ClientSession:
         """Open a session of a program from another host, with or without a token."""

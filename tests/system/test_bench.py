@@ -11,10 +11,9 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.bench.measure import measure
-from acsard.bench.setup import bench_config
+from acsard.bench.measure import bench_config, measure
 from acsard.config.settings import Config, ControlConfig
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError
 from tests.system.harness import (
     ZERO_LINE,
     Daemon,

@@ -20,10 +20,10 @@ import zenoh
 
 from acsard.bus.session import client_session
 from acsard.calibration.guided.recorder import Recorder, Sample
-from acsard.calibration.guided.riding import HELD_UP
 from acsard.calibration.guided.steps import Ask, GuideError
-from acsard.cli import calibrate_robot
-from acsard.cli.calibrate_robot import POSITIONS, Sensor
+from acsard.client import legs
+from acsard.client.legs import POSITIONS, Sensor
+from acsard.client.riding import HELD_UP
 from acsard.config.parsing import parse
 from acsard.config.settings import JointsConfig
 from acsard.mcu.whose_silence import is_ours
@@ -402,7 +402,7 @@ def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free
 def test_what_is_no_position_and_what_does_not_come_is_told(
     free: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(calibrate_robot, "FIRST_S", 0.2)
+    monkeypatch.setattr(legs, "FIRST_S", 0.2)
     with router(free) as said, client_session(free, "") as heard:
         sensor = Sensor(heard, "slam/pose", POSITIONS)
         with pytest.raises(GuideError, match="does not come on slam/pose"):

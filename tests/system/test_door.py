@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
+import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,3 +177,22 @@ def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
                 return
             assert door.ended(10.0) == 1
             assert "door_alone" in door.stdout + door.stderr
+
+
+def test_a_door_whose_daemon_ended_without_reading_its_signs_of_life_ends_in_order(
+    tmp_path: Path, certificates: Certificates
+) -> None:
+    """The kernel then reports a reset connection in place of its end."""
+    bus = {"listen": [free_endpoint(), free_tls_endpoint()], "tls": str(certificates.robot)}
+    config = write_config(tmp_path / "door.toml", {"bus": bus})
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        door = subprocess.Popen(
+            acsard("door", "--held", "--config", str(config)),
+            stdin=theirs.fileno(), stderr=subprocess.PIPE, cwd=tmp_path, text=True,
+        )  # fmt: skip
+        theirs.close()
+        until(lambda: select.select([ours], [], [], 0)[0], 10.0, "a sign of life")
+        ours.close()
+        _, told = door.communicate(timeout=10.0)
+    assert (door.returncode, told) == (0, "")

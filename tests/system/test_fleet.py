@@ -25,7 +25,7 @@ from acsard.client import connect
 from acsard.config.contradictions import warnings
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
 from acsard.values import ROLES

@@ -121,7 +121,7 @@ def test_the_published_sender_does_not_take_the_robot_from_another_program(robot
 def test_a_stolen_secret_does_not_take_the_robot_under_another_certificate(robot: Robot) -> None:
     with connect(robot.plain, source="teleop") as victim, Bus(robot.plain) as bus:
         refused = bus.count("command_other_certificate")
-        states = attacked(robot, victim, victim._sender_id)
+        states = attacked(robot, victim, victim._sender._id)
         assert bus.count("command_other_certificate") > refused
         assert (
             "its sender id was first seen under the robot's own machine" in bus.state()["refused"]

@@ -16,7 +16,7 @@ import pytest
 
 from acsard import __version__
 from acsard.client import connect
-from acsard.host.own_name import own_name
+from acsard.host.own_identity import own_name
 from acsard.messages.signature import public_name
 from tests.system.harness import Bus, Daemon, Peer, acsard, until
 

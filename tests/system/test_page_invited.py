@@ -8,7 +8,6 @@ from contextlib import contextmanager
 import pytest
 
 from acsard.lan.authority import Authority
-from acsard.web.tokens import Vault
 from tests.system.browser import NAME, Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, until
@@ -109,7 +108,7 @@ def test_a_token_that_has_ended_is_told_as_that_and_a_new_link_in_its_tab_lets_i
 ) -> None:
     stranger.opens(stranger.server.invite("viewer", "lent"))
     stranger.shows("role", "viewer")
-    Vault(stranger.server.state / "acsard-web").revoke("lent")
+    stranger.server.vault.revoke("lent")
     before = stranger.tries
     stranger.knocks_no_more(before, 2)  # the socket, and the reason
     assert "this token has ended" in stranger.browser.text("reason")

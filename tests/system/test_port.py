@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import array
 import asyncio
 import errno
+import fcntl
 import itertools
 import os
 import select
@@ -14,17 +16,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 import pytest
+import serial
 
 from acsard.config.settings import McuConfig
 from acsard.host import clock
-from acsard.host.asleep import Asleep
+from acsard.host.clock import Asleep
 from acsard.mcu.check import seal
 from acsard.mcu.session import McuSession
-from acsard.serial.port import SerialPort
+from acsard.serial.device import open_raw
+from acsard.serial.port import HUNG, SerialPort
 from acsard.values import NS_PER_S, STILL, Event, Instant, Received
+from tests.system.harness import until
 
 PERIOD_NS = 10_000_000
 STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+TIOCGEXCL = 0x80045440
+"""From asm-generic/ioctls.h: ask whether a terminal is exclusive."""
+
 GO = b"ap05.00,bp05.00,cp05.00,dp05.00\r\n"
 
 
@@ -270,6 +278,40 @@ def test_a_port_whose_driver_takes_nothing_is_told_though_it_still_receives() ->
         os.set_blocking(slave, False)
         seen = asyncio.run(links(master, slave))
         assert seen == [("down", False), ("up", False), ("stale", True), ("up", False)]
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_device_that_opened_too_late_is_not_left_exclusive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opens, opened = threading.Event(), threading.Event()
+
+    def open_late(path: str, baud_rate: int) -> serial.Serial:
+        opens.wait(10.0)
+        device = open_raw(path, baud_rate)
+        opened.set()
+        return device
+
+    async def trouble() -> str:
+        async with SerialPort(path, 115200, STOP, PERIOD_NS, lambda: None, lambda _: None) as port:
+            return port.trouble
+
+    def exclusive() -> bool:
+        mark = array.array("i", [0])
+        fcntl.ioctl(slave, TIOCGEXCL, mark)
+        return bool(mark[0])
+
+    monkeypatch.setattr("acsard.serial.port.OPEN_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("acsard.serial.port.open_raw", open_late)
+    master, slave = os.openpty()
+    try:
+        path = os.ttyname(slave)
+        assert HUNG in asyncio.run(trouble())
+        opens.set()
+        assert opened.wait(10.0)
+        until(lambda: not exclusive(), 1.0, "others may open the device")
     finally:
         os.close(master)
         os.close(slave)

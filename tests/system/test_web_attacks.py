@@ -19,7 +19,6 @@ from yarl import URL
 
 from acsard.web.gate import REQUEST_S, SOCKETS_OF_ONE
 from acsard.web.requests import BODY_S
-from acsard.web.tokens import Vault
 from tests.system.browser import NAME, Hands, Page, hands, run
 from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
 
@@ -89,7 +88,7 @@ def tokens(page: Page) -> dict[str, str]:
     """Return one token of each kind: none, wrong, expired, revoked, and a viewer's."""
     revoked = page.invite("maintainer", "revoked")
     page.tokens("--revoke", "revoked")
-    vault = Vault(page.state / "acsard-web")
+    vault = page.vault
     return {
         "": "",
         "wrong": "x" * 43,

@@ -56,7 +56,7 @@ class Inside:
         self.fleet, self.gate = Fleet(self.robots), Gate(self.counts)
         self.page = Page(
             self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
-            Vault(where), frozenset(), self.gate, Guide(Reach("", "", "acsar", ""), "sim"),
+            Vault(where, "acsar"), frozenset(), self.gate, Guide(Reach("", "", "acsar", ""), "sim"),
         )  # fmt: skip
 
     @asynccontextmanager

@@ -26,7 +26,6 @@ from acsard.web.limits import (
     CONNECTIONS_OF_TOKEN,
 )
 from acsard.web.server import TIDY_S
-from acsard.web.tokens import Vault
 from tests.system.browser import Page, hands, run
 from tests.system.bystander import lost
 from tests.system.harness import PATIENCE_S, Bus, Daemon, until
@@ -156,7 +155,7 @@ def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_st
             await ours.say(subscribe="state", rate=10)
             await ours.until_driving(0.3)
             holding = asyncio.create_task(ours.hold(0.3, PATIENCE_S))
-            Vault(page.state / "acsard-web").revoke("trusted")
+            page.vault.revoke("trusted")
             begun = time.monotonic()
             async with asyncio.timeout(PATIENCE_S):
                 while (message := await ours.socket.receive()).type == aiohttp.WSMsgType.TEXT:
@@ -324,7 +323,7 @@ def test_who_was_refused_is_told_by_address_and_by_the_name_of_the_token(
 
 def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page, bus: Bus) -> None:
     """A connection that ends before the close was answered is equivalent to a lost radio link."""
-    vault = Vault(page.state / "acsard-web")
+    vault = page.vault
     trusted = ssl.create_default_context(cafile=str(page.tls / "ca.pem"))
     wishes = (json.dumps({"cmd": {"linear_x": 0}, "stamp": 1.8e12 + n}) for n in itertools.count())
 

@@ -34,7 +34,7 @@ from acsard.config.settings import (
 from acsard.drive.odometry import TAKEN_BACK
 from acsard.drive.words import waiting
 from acsard.guard import Guard
-from acsard.mcu.feedback import BRIDGED_S
+from acsard.mcu.clock_of_reports import BRIDGED_S
 from acsard.robot import Robot
 from acsard.values import (
     NS_PER_S,

@@ -2,6 +2,6 @@
 
 Each method of calibration is a generator (in `tour.py`, `tape.py`, `wall.py` and `umbmark.py`). It
 yields the legs to drive and the numbers to ask for (`steps.py`) and is sent the answers, so that
-its code reads from top to bottom in the order of events. `riding.py` drives one leg: messages and
-keys go in, commands come out.
+its code reads from top to bottom in the order of events. `client/riding.py` drives one leg:
+messages and keys go in, commands come out.
 """

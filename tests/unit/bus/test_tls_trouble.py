@@ -30,3 +30,20 @@ def test_a_host_that_is_not_there_is_not_one_on_which_nobody_listens(
     found = trouble("tls/robot.local:7449", "")
     assert told in found
     assert untold not in found
+
+
+@pytest.mark.parametrize("options", ["?prio=0-5", "#iface=eth0", "?prio=0-5#iface=eth0"])
+def test_the_options_of_an_endpoint_are_not_part_of_its_port(
+    options: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def connection(address: tuple[str, int], *_: Any) -> None:
+        asked.append(address)
+        raise TimeoutError
+
+    monkeypatch.setattr(socket, "create_connection", connection)
+    assert trouble(f"tls/robot.local:7449{options}", "") == (
+        "robot.local is silent on port 7449: is it on, and does a firewall drop connections?"
+    )
+    assert asked == [("robot.local", 7449)]

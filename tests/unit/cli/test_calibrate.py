@@ -13,8 +13,7 @@ from mcap.writer import Writer
 
 from acsard.cli import calibrate
 from acsard.config.parsing import parse
-from acsard.host.errors import UnreachableError, UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UnreachableError, UsageError
 from tests.unit.calibration.cut import usual
 
 GOOD = usual().csv(places=False)

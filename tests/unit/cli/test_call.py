@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.cli import main
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 
 
 @pytest.mark.parametrize(

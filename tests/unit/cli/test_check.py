@@ -10,7 +10,7 @@ import pytest
 
 from acsard.cli.check import main
 from acsard.config.parsing import from_builtins, parse
-from acsard.host.exits import ExitError
+from acsard.host.errors import ExitError
 
 
 def test_a_good_file_is_printed_with_its_place_and_its_warnings(

@@ -19,8 +19,7 @@ from acsard.config.parsing import parse
 from acsard.config.settings import Config
 from acsard.host import config_file
 from acsard.host.config_file import PLACES, find, writable
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 
 
 class Places:

@@ -12,7 +12,7 @@ import pytest
 
 from acsard.cli import VERBS, main
 from acsard.cli.completion import SHELLS
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from tests.system.harness import Program, environment, until
 from tests.system.test_cli import Terminal
 from tests.system.typed import typed

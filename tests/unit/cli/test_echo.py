@@ -9,7 +9,7 @@ import pytest
 
 from acsard.cli import main
 from acsard.cli.echo import _shown, json_line
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.messages.schema import Header, Twist, TwistStamped, Vector3
 from tests.unit.messages.examples import OUTPUTS

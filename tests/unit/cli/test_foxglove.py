@@ -11,8 +11,7 @@ import sys
 import pytest
 
 from acsard.cli import foxglove
-from acsard.host.errors import UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 
 
 def test_without_its_library_it_says_which_extra_to_install(

@@ -28,8 +28,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.cli import main
 from acsard.config.parsing import parse
-from acsard.host.addresses import own_addresses
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
+from acsard.host.own_identity import own_addresses
 
 ROLES = ("viewer", "operator", "maintainer")
 

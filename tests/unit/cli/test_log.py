@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from acsard.cli import main
 from acsard.cli.log import SERVICE
 from acsard.config.settings import Config, RecordConfig
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit
 from acsard.record.directory import Ring
 from acsard.record.file import Recording, Writing
 from acsard.record.recovery import recover

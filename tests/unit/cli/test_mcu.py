@@ -24,8 +24,7 @@ from acsard.cli import mcu
 from acsard.cli.exits import code_of
 from acsard.config.parsing import parse
 from acsard.config.settings import Config
-from acsard.host.errors import NoPortError, UsageError
-from acsard.host.exits import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Busy, Robot
@@ -127,7 +126,7 @@ def test_findings_are_told_also_when_the_file_cannot_be_written(
     def full(*given: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("acsard.host.files.replace", full)
+    monkeypatch.setattr("acsard.host.config_file.replace", full)
     with pytest.raises(ExitError, match="No space left"):
         called(tmp_path, "--port", "sim", "--yes", "--json", "--write")
     assert json.loads(capsys.readouterr().out)["written"] is None

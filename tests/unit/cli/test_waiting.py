@@ -26,7 +26,7 @@ def await_end() -> None:
 def test_a_wait_is_explained_in_one_line_that_is_no_output(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with explained(lambda: "waiting for\x1b[2J acsard/ghost/state", 0.0):
+    with explained(lambda: "waiting for\x1b[2J acsard/ghost/state", after_s=0.0):
         await_end()
     told = capsys.readouterr()
     assert told.out == ""
@@ -36,7 +36,7 @@ def test_a_wait_is_explained_in_one_line_that_is_no_output(
 
 
 def test_what_has_come_is_not_explained(capsys: pytest.CaptureFixture[str]) -> None:
-    with explained(lambda: "why", NEVER_S) as heard:
+    with explained(lambda: "why", after_s=NEVER_S) as heard:
         assert not ended()
         heard()
         await_end()
@@ -51,7 +51,7 @@ def test_what_comes_while_it_looks_is_not_explained(capsys: pytest.CaptureFixtur
         come.wait(10.0)
         return "why"
 
-    with explained(look, 0.0) as heard:
+    with explained(look, after_s=0.0) as heard:
         assert looking.wait(10.0)
         heard()
         come.set()
@@ -60,7 +60,7 @@ def test_what_comes_while_it_looks_is_not_explained(capsys: pytest.CaptureFixtur
 
 
 def test_who_leaves_leaves_nobody_behind() -> None:
-    with explained(lambda: "why", NEVER_S):
+    with explained(lambda: "why", after_s=NEVER_S):
         pass
     await_end()
 
@@ -76,7 +76,7 @@ def told(lines: int, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_what_ceases_is_explained_once_for_each_silence(capsys: pytest.CaptureFixture[str]) -> None:
-    with explained(lambda: "", 0.01, lambda: "its certificate has ended") as heard:
+    with explained(lambda: "", lambda: "its certificate has ended", 0.01) as heard:
         for _ in range(2):
             heard()
             assert told(1, capsys) == "acsard: its certificate has ended\n"
@@ -88,7 +88,7 @@ def test_a_silence_in_which_nothing_is_wrong_is_looked_at_again(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     found = iter(["", "", "the way to it is cut"])
-    with explained(lambda: "", 0.001, lambda: next(found)) as heard:
+    with explained(lambda: "", lambda: next(found), 0.001) as heard:
         heard()
         assert told(1, capsys) == "acsard: the way to it is cut\n"
     await_end()

@@ -9,7 +9,6 @@ import pytest
 
 from acsard.cli import main
 from acsard.lan.authority import Authority
-from acsard.web.tokens import Vault
 
 
 def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(
@@ -77,12 +76,3 @@ def test_a_second_robot_of_the_same_user_has_tokens_of_its_own(told: Callable[..
     assert "operator" in told("--tokens")
     assert "operator" not in told("--tokens", robot="robot2")
     assert "no tokens of robot3" in told("--tokens", robot="robot3")
-
-
-def test_tokens_of_before_they_had_a_robot_are_told(
-    told: Callable[..., str], tmp_path: Path
-) -> None:
-    Vault(tmp_path / "state").invite("viewer", "tv", 1)
-    told("--invite", "operator", "--name", "phone")
-    for robot in ("robot1", "robot2"):
-        assert "open the page of any here: tv; --revoke" in told("--tokens", robot=robot)

@@ -14,15 +14,9 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.client import driving
-from acsard.client.driving import (
-    DEAD_S,
-    GRACE_S,
-    OPENED_S,
-    SETTLED_S,
-    UnheardError,
-    drive,
-    objection,
-)
+from acsard.client.commander import GRACE_S, OPENED_S, objection
+from acsard.client.driving import SETTLED_S, UnheardError, drive
+from acsard.client.follower import FIRST_S, SILENT_S
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
 from acsard.messages.encodings import encode, encoding_name
 from acsard.messages.schema import RobotState, SourceState, Time
@@ -224,8 +218,8 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
     ("outranked on the way", after(0.9, HIGHER), NotDrivenError, "higher", 0.9 + GRACE_S, True),
     ("another sender", after(0, replace(FOLLOWED, sender=OTHER)), NotDrivenError, OTHER, OPENED_S,
      False),
-    ("dead", after(0, None), NoAnswerError, "no word", DEAD_S, False),
-    ("killed on the way", after(1.0, None), NoAnswerError, "no word", 0.9 + DEAD_S, True),
+    ("dead", after(0, None), NoAnswerError, "no word", FIRST_S, False),
+    ("killed on the way", after(1.0, None), NoAnswerError, "no word", 0.9 + SILENT_S, True),
 ]  # fmt: skip
 
 
@@ -280,7 +274,7 @@ def test_a_robot_that_died_does_not_drive_because_a_storage_still_has_its_state(
     with pytest.raises(NoAnswerError, match="no word"):
         world.drive(monkeypatch, seconds)
     assert world.asked
-    assert world.now - 100.0 <= dies + DEAD_S + 0.3
+    assert world.now - 100.0 <= dies + SILENT_S + 0.3
     assert world.sent[-1] == 0.0
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from acsard import client
 from acsard.client import Client, NoAnswerError
+from acsard.client.commander import SPACING_S
 from acsard.client.driving import UnheardError
-from acsard.client.synchronous import SPACING_S
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
 from acsard.incoming.commands import Arrival, Receiver

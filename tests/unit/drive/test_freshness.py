@@ -205,7 +205,7 @@ def test_after_so_long_a_silence_that_drift_is_a_delay_a_clock_is_as_good_as_new
 def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first() -> None:
     clock = Clock()
     for number in range(1023):
-        clock.sends(0.0, 0.0, f"sender {number}")
+        clock.sends(0.0, 1e-3, f"sender {number}")
     assert clock.sends(0.0) == "fresh"
     for number in range(1024):
         clock.sends(0.0, 1e-3, f"another {number}")

@@ -259,6 +259,14 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 
 
+def test_a_stop_that_comes_with_the_first_step_is_none_from_the_start() -> None:
+    life = ready()
+    life.begin(at(10.0))
+    stop(life, 10.0)
+    with pytest.raises(RefusedError, match=r"stopped by ann 1\.0 s ago"):
+        clear(life, 11.0)
+
+
 def test_a_named_clear_releases_a_stop_from_the_start_at_once() -> None:
     life = Lifecycle(active=True, latches=Latches(stop=STOP))
     life.begin(at(10.0))
@@ -319,6 +327,13 @@ def test_the_first_fault_stays() -> None:
     assert not life.fault("second", at(2.0))
     assert mode(life) is Mode.FAULT
     assert life.why == f"first, latched at {AT}:01 UTC; call srv/clear"
+
+
+def test_a_stop_is_cleared_two_seconds_after_its_fault() -> None:
+    life = both()
+    clear(life, 5.0)
+    clear(life, 5.0 + LOOK_FIRST_S)
+    assert mode(life) is Mode.READY
 
 
 def test_a_fault_keeps_the_stop_and_each_is_cleared_by_itself() -> None:

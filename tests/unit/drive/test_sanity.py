@@ -499,3 +499,65 @@ def test_a_healthy_wheel_is_never_a_fault_whatever_it_is_told(
             speed += (told * gain - speed) * (DT / (lag + DT))
             seen = speed + dice.uniform(-0.2, 0.2)
             assert sanity.watch(only(0, told), only(0, seen), DT) == ""
+
+
+# the limits themselves
+
+
+def test_a_change_of_the_limit_and_two_counts_is_possible() -> None:
+    # 100 rad/s2 x 10 ms, 2 rad/s of slack and twice 0.5 rad/s
+    sanity = Sanity(FeedbackConfig(wheel_acceleration=100.0))
+    assert sanity.impossible(stepping(STILL, 0.5)) == ""
+    assert sanity.impossible(stepping(only(0, 4.0), 0.5)) == ""
+
+
+@pytest.mark.parametrize(("sent", "pushed"), [(0.0045, True), (0.005, False), (0.006, False)])
+def test_a_command_of_5_mrad_a_second_is_one(sent: float, pushed: bool) -> None:
+    sanity = Sanity(FeedbackConfig(fault_time=0.0))
+    told = [bool(sanity.watch(only(0, sent), TEN, 0.1) or sanity.turned) for _ in range(5)]
+    assert any(told) is pushed
+
+
+@pytest.mark.parametrize(("speed", "lines"), [(2.0, 0), (2.5, 3)])
+def test_wheels_are_turned_by_hand_above_2_rad_a_second_for_over_a_fifth_of_a_second(
+    speed: float, lines: int
+) -> None:
+    sanity, told = Sanity(FeedbackConfig()), list[bool]()
+    for _ in range(10):
+        sanity.watch(STILL, only(0, speed), 0.1)
+        told.append(bool(sanity.turned))
+    assert (told.index(True) + 1 if lines else any(told)) == lines
+
+
+def test_a_wheel_that_has_slowed_to_2_rad_a_second_has_come_to_rest() -> None:
+    sanity, told = driven(10.0), list[bool]()
+    sanity.watch(STILL, only(0, 2.0), 0.1)
+    for _ in range(4):
+        assert sanity.watch(STILL, only(0, 3.0), 0.1) == ""
+        told.append(bool(sanity.turned))
+    assert any(told)
+
+
+def test_a_wheel_at_one_and_a_half_times_its_command_and_2_rad_a_second_is_no_runaway() -> None:
+    sanity = Sanity(FeedbackConfig())
+    for step in range(1, 81):
+        told, seen = 0.5 * step, 0.75 * step + 2.0
+        assert sanity.watch(only(0, told), only(0, seen), DT) == ""
+
+
+def test_a_wheel_that_is_slower_by_2_rad_a_second_is_not_slowing_down() -> None:
+    sanity = Sanity(FeedbackConfig())
+    faults = [sanity.watch(only(0, 1.0), only(0, speed), 0.125) for speed in (50.0, *[48.0] * 5)]
+    assert not any(faults[:-1])
+    assert "front_right wheel turns faster" in faults[-1]
+
+
+def test_a_wheel_that_turns_back_while_it_should_slow_to_a_creep_is_reversed() -> None:
+    settings = FeedbackConfig(response_time=5.0)
+    sanity, fault, speed = Sanity(settings), "", 0.0
+    for step in range(600):
+        speed += (30.0 - speed) * 0.01
+        assert sanity.watch(only(0, 30.0), only(0, speed + step % 2 / 10), 0.05) == ""
+    for step in range(12):
+        fault = fault or sanity.watch(only(0, 0.03), only(0, -15.0 - step % 2 / 10), 0.05)
+    assert "front_right wheel turns against its command" in fault

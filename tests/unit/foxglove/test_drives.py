@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 import zenoh
 
+from acsard import values
 from acsard.client import Client
+from acsard.client.commander import STALE_NS, Wish
 from acsard.config.settings import DriveConfig, JointsConfig
 from acsard.drive.kinematics import Kinematics
-from acsard.foxglove.drives import Drives
-from acsard.foxglove.hand import STALE_NS
+from acsard.foxglove.drives import Drives, Viewer
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 from acsard.incoming.commands import Arrival, Receiver
@@ -25,6 +26,8 @@ from tests.system.harness import until
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 
 AHEAD, STILL = Twist(Vector3(x=0.3), Vector3()), Twist(Vector3(), Vector3())
+
+AHEAD_AT = values.Twist(0.3, 0.0)
 
 HOLD_S = 5.0
 
@@ -125,7 +128,7 @@ def test_what_waited_behind_another_s_bus_that_is_locked_is_too_old_to_go(
     first, second = viewers.sessions.values()
     first.locked = True
     # the sender thread waits for this lock, so both commands fall due in one round
-    with viewers.drives._news:
+    with viewers.drives.outbox._news:
         for viewer in viewers.sessions:
             viewers.publish(viewer, AHEAD)
         given_ns = clock.mono_ns()
@@ -148,6 +151,23 @@ def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers
     viewers.sessions[1].broken = False
     viewers.publish(1, AHEAD)
     viewers.heard(1, 1)
+
+
+@pytest.mark.parametrize(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
+def test_a_panel_that_publishes_too_seldom_is_known(rate: float, slow: bool) -> None:
+    assert told_slow(NS_PER_S / rate) is slow
+
+
+def test_single_presses_are_no_slow_panel() -> None:
+    assert not told_slow(4.0 * NS_PER_S)
+
+
+def told_slow(every_ns: float) -> bool:
+    """Return whether a panel that publishes at this interval is told that it is slow."""
+    robot: Any = None
+    viewer = Viewer(robot)
+    times = [round(n * every_ns) for n in range(6)]
+    return [viewer.is_slow(viewer.commander.take(Wish(AHEAD_AT), at)) for at in times][-1]
 
 
 def said(notices: Notices) -> list[str]:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from acsard.foxglove.objections import OBJECTS_NS, Objections
+from acsard.client.commander import GRACE_S
+from acsard.foxglove.objections import Objections
+from acsard.values import NS_PER_S
+
+OBJECTS_NS = int(GRACE_S * NS_PER_S)
 
 WHY = "stopped by request"
 

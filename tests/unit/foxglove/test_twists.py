@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.foxglove.hand import Wish
+from acsard.client.commander import Wish
 from acsard.foxglove.twists import encoding_of, wish
 from acsard.messages.encodings import DecodeError, encode
 from acsard.messages.schema import Header, Time, TwistStamped, Vector3

@@ -1,4 +1,4 @@
-"""Both clocks are read for the same moment, even if the process loses its core in between."""
+"""Tests of the clock, and of the report of each suspend."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import time
 import pytest
 
 from acsard.host import clock
+from acsard.host.clock import MOMENT_NS, Asleep, asleep_ns
 
 WALL_NS = 1_800_000_000_000_000_000
 
@@ -52,3 +53,25 @@ def test_an_instant_is_in_whole_microseconds(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(time, "time_ns", lambda: WALL_NS + 1_999)
     at = clock.now()
     assert (at.mono_ns % 1000, at.wall_ns) == (0, WALL_NS + 1_000)
+
+
+def test_a_sleep_is_told_once_and_the_next_one_too() -> None:
+    slept = [5 * MOMENT_NS]
+    asleep = Asleep(lambda: slept[0])
+    assert not asleep.was()
+    for _ in range(2):
+        slept[0] += MOMENT_NS
+        assert asleep.was()
+        assert not asleep.was()
+
+
+def test_who_loses_the_processor_between_the_two_clocks_has_not_slept() -> None:
+    readings = [0, 3 * MOMENT_NS, 0, 0]
+    asleep = Asleep(lambda: readings.pop(0))
+    assert not asleep.was()
+    assert not asleep.was()
+
+
+def test_this_machine_is_awake() -> None:
+    asleep = Asleep(asleep_ns)
+    assert not any(asleep.was() for _ in range(1000))

@@ -1,16 +1,195 @@
-"""Tests of a log line: its fields, and that no value can break out of its field."""
+"""Tests of the log: its formats, its queue, and the journal's protocol on a real socket."""
 
 from __future__ import annotations
 
+import io
 import json
+import os
+import socket
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from acsard.config.settings import LogConfig
-from acsard.host.logs import MAX_VALUE, Log
+from acsard.host.logs import MAX_VALUE, JournalStream, Log, is_journal, render
 from acsard.values import Event
+
+
+class Journal:
+    """The journal's end of the socket."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = str(path)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(self.path)
+        self._socket.settimeout(5.0)
+
+    def entry(self) -> dict[str, str]:
+        """Return the fields of the next entry."""
+        return fields(self._socket.recv(65536).decode())
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def fields(text: str) -> dict[str, str]:
+    """Parse a datagram in which each line must be NAME=value.
+
+    The journal must accept the name.
+    """
+    found: dict[str, str] = {}
+    for line in text.removesuffix("\n").split("\n"):
+        name, equals, value = line.partition("=")
+        assert equals, f"{line!r} is no assignment"
+        # The journal drops other names without a message.
+        assert name.replace("_", "").isalnum(), name
+        assert name.isascii(), name
+        assert name == name.upper(), name
+        assert name[0].isalpha(), name
+        assert len(name) <= 64, name
+        assert name not in found, f"{name} twice"
+        found[name] = value
+    return found
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[Journal]:
+    journal = Journal(tmp_path / "journal")
+    yield journal
+    journal.close()
+
+
+def rendered(**line: Any) -> dict[str, str]:
+    return fields(render(None, "info", line))
+
+
+# fields of a log line
+
+
+def test_an_event_is_its_message_and_its_fields() -> None:
+    line = rendered(timestamp="now", level="warning", event="link_down", text="cable pulled")
+    assert line == {
+        "MESSAGE": "link_down: cable pulled",
+        "PRIORITY": "4",
+        "SYSLOG_IDENTIFIER": "acsard",
+        "ACSARD_EVENT": "link_down",
+        "ACSARD_TEXT": "cable pulled",
+    }
+
+
+def test_a_line_without_a_text_shows_its_fields_in_the_message() -> None:
+    line = rendered(level="info", event="started", robot="acsar", rate=100.0)
+    assert line["MESSAGE"] == "started robot=acsar rate=100.0"
+    assert line["ACSARD_ROBOT"] == "acsar"
+    assert line["ACSARD_RATE"] == "100.0"
+
+
+@pytest.mark.parametrize(
+    ("level", "priority"),
+    [("debug", "7"), ("info", "6"), ("warning", "4"), ("error", "3"), ("odd", "6")],
+)
+def test_levels_are_syslog_s_priorities(level: str, priority: str) -> None:
+    assert rendered(level=level, event="x")["PRIORITY"] == priority
+
+
+@given(st.text())
+def test_no_text_can_forge_a_field(text: str) -> None:
+    line = rendered(level="info", event="heard", text=text)
+    assert set(line) == {
+        "MESSAGE",
+        "PRIORITY",
+        "SYSLOG_IDENTIFIER",
+        "ACSARD_EVENT",
+        "ACSARD_TEXT",
+    }
+    assert line["PRIORITY"] == "6"
+
+
+def test_a_line_end_in_a_value_becomes_a_space() -> None:
+    line = rendered(level="info", event="heard", text="ap10.00\nPRIORITY=0")
+    assert line["ACSARD_TEXT"] == "ap10.00 PRIORITY=0"
+
+
+# the stream
+
+
+def test_each_write_is_a_datagram(journal: Journal) -> None:
+    stream = JournalStream(journal.path)
+    stream.write("MESSAGE=one\n")
+    stream.write("MESSAGE=two\n")
+    assert [journal.entry(), journal.entry()] == [{"MESSAGE": "one"}, {"MESSAGE": "two"}]
+
+
+def test_what_is_no_utf_8_is_replaced(journal: Journal) -> None:
+    JournalStream(journal.path).write("MESSAGE=\udcff")
+    assert journal.entry() == {"MESSAGE": "?"}
+
+
+def test_where_no_journal_is_the_stream_says_so(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No such file"):
+        JournalStream(str(tmp_path / "nothing"))
+
+
+# which stream is the journal's
+
+
+def test_a_stream_is_the_journal_s_when_the_environment_names_it() -> None:
+    with socket.socketpair()[0].makefile("w") as stream:
+        found = os.fstat(stream.fileno())
+        assert is_journal(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"})
+        assert not is_journal(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino + 1}"})
+        assert not is_journal(stream, {"JOURNAL_STREAM": ""})
+        assert not is_journal(stream, {})
+
+
+def test_a_stream_in_memory_or_closed_is_not_the_journal(tmp_path: Path) -> None:
+    with (tmp_path / "log").open("w") as closed:
+        pass
+    for stream in (io.StringIO(), closed):
+        assert not is_journal(stream, {"JOURNAL_STREAM": "1:2"})
+
+
+# the log as a whole
+
+
+def test_an_event_of_the_log_arrives_with_its_fields(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(JournalStream.__init__, "__defaults__", (journal.path,))
+    log = Log(LogConfig(format="journal"))
+    log.event(Event("link_up", "linked", "info"))
+    entry = journal.entry()
+    log.close()
+    assert entry["ACSARD_EVENT"] == "link_up"
+    assert entry["MESSAGE"] == "link_up: linked"
+
+
+def test_without_a_journal_the_log_goes_on_as_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(JournalStream.__init__, "__defaults__", (str(tmp_path / "nothing"),))
+    with (tmp_path / "log").open("w+") as stream:
+        log = Log(LogConfig(format="journal"), stream)
+        log.event(Event("link_up", "linked", "info"))
+        log.close()
+        stream.seek(0)
+        assert '"event": "link_up"' in stream.read()
+
+
+def test_a_journal_that_goes_away_stops_nobody(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(JournalStream.__init__, "__defaults__", (journal.path,))
+    log = Log(LogConfig(format="journal"))
+    journal.close()
+    os.unlink(journal.path)
+    for _ in range(10):
+        log.event(Event("link_up", "linked", "info"))
+    log.close()
 
 
 def written(

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.incoming.asker import asker
+from acsard.incoming.commands import asker
 from acsard.messages.signature import DIGITS, MAX_NAME, public_name
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.incoming.bindings import BOUND_NS, MAX_BOUND, Bindings
+from acsard.incoming.commands import BOUND_NS, MAX_BOUND, Bindings
 
 
 def test_the_first_certificate_keeps_the_sender_for_as_long_as_it_speaks() -> None:

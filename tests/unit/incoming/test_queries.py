@@ -197,6 +197,29 @@ def test_a_wildcard_gives_the_schema_of_every_type(asked: str) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ("schema/Odo$*", ["Odometry"]),
+        ("schema/Twist$*", [name for name in SCHEMAS if name.startswith("Twist")]),
+        ("schema/$*met$*", [name for name in SCHEMAS if "met" in name[1:-1]]),
+        ("schema/O$*m$*t$*y", ["Odometry"]),
+        ("schema/Odometry$*y", []),
+        ("schema/*/Odometry", []),
+        ("schema/Odometry/**", ["Odometry"]),
+        ("*/Odometry", ["Odometry"]),
+        ("**/Odometry", ["Odometry"]),
+        ("acsard/*/schema/Odometry", ["Odometry"]),
+        ("acsard/*/state/*", []),
+        ("**/" + "$*a" * 10_000, []),
+    ],
+)
+def test_a_wildcard_gives_the_schemas_whose_key_it_includes(asked: str, found: list[str]) -> None:
+    assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
+        f"schema/{name}" for name in found
+    ]
+
+
 @pytest.mark.parametrize("name", ["", "Nothing", "odometry", "Odometry/x", "<Type>"])
 def test_there_is_no_schema_of_what_is_no_type(name: str) -> None:
     assert answers(query("schema/<Type>", f"schema/{name}")) == []

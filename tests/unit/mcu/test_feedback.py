@@ -215,6 +215,25 @@ def test_what_is_missing_for_a_second_is_a_gap() -> None:
     assert bench.line().dt == 0.01
 
 
+def test_lines_of_a_backlog_with_missing_lines_are_as_far_apart_as_their_stamps() -> None:
+    bench = reporting(Bench(counts=0))
+    for ms in range(0, 390, 10):
+        bench.timeline.left(bench.now_ns + ms * MS)
+    found = read(bench, 390, 3, silent=True)
+    stamps = [f.at.mono_ns / 1e9 for f in found]
+    assert [f.dt for f in found] == pytest.approx([0.38 / 3] * 3)
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([0.38 / 3] * 2, abs=1e-3)
+
+
+def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> None:
+    bench = reporting(Bench(counts=0))
+    for ms in range(0, 1500, 10):
+        bench.timeline.left(bench.now_ns + ms * MS)
+    first, second = read(bench, 1500, 2, silent=True)
+    assert (first.dt, first.bridged, second.dt, second.bridged) == (0.0, 0.0, 0.01, 0.0)
+    assert first.gap == pytest.approx(1.49, abs=0.01)
+
+
 def test_a_line_that_is_none_was_one_when_it_was_made() -> None:
     bench = reporting(Bench(counts=0))
     bench.now_ns += 10 * MS

@@ -121,7 +121,7 @@ BODIES: dict[str, bytes] = {
     "what a room has imported": named("acsard.robot", "Counter"),
     "a room's builtins": named("acsard.robot", "__builtins__"),
     "a function of a room": named("acsard.drive.words", "chosen"),
-    "another room": named("acsard.host.files", "replace"),
+    "another room": named("acsard.host.atomic_file", "replace"),
     "a room that is not loaded": named("acsard.mcu.gate", "Port"),
     "a room that is none": named("acsard.drive.none", "None"),
     "colours": named("\x1b[31mred", "\x1b]0;title\x07"),

@@ -17,13 +17,12 @@ from acsard.mcu.lattice import Search
 from acsard.record.export import export
 from acsard.record.file import Recording
 from acsard.record.replayed import Onlooker, live
-from acsard.record.state import MOVED, StateError, freeze, thaw
+from acsard.record.state import StateError, freeze, thaw
 from acsard.report.course import Course
 from acsard.robot import Robot
 from acsard.values import NS_PER_S, REST, Command, Instant
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
-from tests.unit.record.attacks import text
 
 MEMORY = Memory(b"line", 5, None, 7, 8)
 
@@ -50,15 +49,6 @@ def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
     later_ns = 8 * NS_PER_S
     freshness.judge(Command("app", REST, later_ns, later_ns, "me"), NS_PER_S // 4)
     assert len(pickle.dumps(freshness)) < len(freeze(Robot(Config()), Memory())) / 10
-
-
-def test_a_robot_of_parts_that_have_moved_since_comes_back_as_it_was() -> None:
-    data = freeze(Robot(Config()), MEMORY)
-    older = data
-    for before, now in MOVED.items():
-        assert text(now) in data
-        older = older.replace(text(now), text(before))
-    assert freeze(thaw(older).robot, MEMORY) == data
 
 
 @pytest.mark.parametrize("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])

@@ -1,12 +1,15 @@
-"""Tests of the words and numbers that the plotting library receives."""
+"""Tests of the words, numbers and paths that the plotting library receives."""
 
 from __future__ import annotations
 
 import math
 from itertools import combinations
 
-from acsard.report.drawing import COMMANDERS, commander, label, numbers
-from tests.unit.report.seen import column
+import pytest
+
+from acsard.report.drawing import COMMANDERS, commander, label, numbers, path
+from tests.unit.report.driven import drive_of_two
+from tests.unit.report.seen import column, trace
 
 
 def test_what_strangers_wrote_is_no_markup_and_fits() -> None:
@@ -30,3 +33,23 @@ def test_whoever_comes_after_them_has_a_pattern() -> None:
     assert len(set(looks)) == 40
     assert [pattern for _, pattern in looks[:8]] == [""] * 8
     assert all(pattern for _, pattern in looks[8:])
+
+
+def test_the_path_is_in_metres_with_equal_axes() -> None:
+    course, _ = drive_of_two()
+    drawn, places = path(course), course.path.places()
+    assert drawn.layout["yaxis"]["scaleanchor"] == "x"
+    assert drawn.layout["yaxis"]["scaleratio"] == 1
+    assert column(trace(drawn, "path")["x"]) == [place.x for place in places]
+    assert column(trace(drawn, "end")["y"]) == [places[-1].y]
+    assert len(column(trace(drawn, "stop")["x"])) == 1
+
+
+def test_arrows_show_the_heading() -> None:
+    course, _ = drive_of_two()
+    heading = trace(path(course), "heading")
+    by_place = {(place.x, place.y): place.yaw for place in course.path.places()}
+    places = zip(column(heading["x"]), column(heading["y"]), strict=True)
+    told = [math.radians(90 - angle) for angle in heading["marker"]["angle"]]
+    assert len(told) >= 8
+    assert told == pytest.approx([by_place[place] for place in places], abs=1e-3)

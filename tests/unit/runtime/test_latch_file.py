@@ -15,9 +15,9 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.settings import Config
+from acsard.host.atomic_file import replace as replace_file
+from acsard.host.atomic_file import sync as sync_file
 from acsard.host.errors import InUseError
-from acsard.host.files import replace as replace_file
-from acsard.host.files import sync as sync_file
 from acsard.runtime import latch_file as module
 from acsard.runtime.kept_latches import MAX_BYTES, encode
 from acsard.runtime.latch_file import LatchFile, place

@@ -17,8 +17,7 @@ from serial import SerialException
 
 from acsard.cli.exits import code_of
 from acsard.host import clock
-from acsard.host.errors import InUseError, NoPortError
-from acsard.host.exits import Exit
+from acsard.host.errors import Exit, InUseError, NoPortError
 from acsard.serial.device import close, draining, open_raw, refusal, require, unsent
 
 

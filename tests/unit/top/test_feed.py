@@ -10,11 +10,12 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.client import Client, Subscription
+from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
 from acsard.host.errors import ReplyError
 from acsard.messages.encodings import DecodeError, encode, encoding_name
 from acsard.messages.schema import Info, RobotState, Time
 from acsard.top import feed as top_feed
-from acsard.top.feed import GAPS, Feed, anew, silence
+from acsard.top.feed import Feed
 from tests.unit.top.screens import BEFORE, INFO, STATE
 
 KEY = "acsard/acsar/state"
@@ -27,6 +28,12 @@ class Robot:
         self.now = 100.0
         self.state: RobotState | DecodeError = STATE
         self.queue: deque[Any] = deque()
+        self.answers = False
+
+    def ask(self, name: str, take: Any) -> None:
+        if self.answers:
+            self.state = replace(STATE, stamp=Time(int(self.now * 10)))
+            take(sample_of(self.state))
 
     def key(self, name: str) -> str:
         return f"acsard/acsar/{name}"
@@ -46,9 +53,13 @@ class Robot:
         return self.queue.popleft() if self.queue else None
 
     def tells(self, state: RobotState, key: str = KEY) -> None:
-        payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
-        encoding = encoding_name("msgpack", "RobotState")
-        self.queue.append(SimpleNamespace(key_expr=key, encoding=encoding, payload=payload))
+        self.queue.append(sample_of(state, key))
+
+
+def sample_of(state: RobotState, key: str = KEY) -> Any:
+    payload = SimpleNamespace(to_bytes=lambda: encode(state, "msgpack"))
+    encoding = encoding_name("msgpack", "RobotState")
+    return SimpleNamespace(key_expr=key, encoding=encoding, payload=payload)
 
 
 @pytest.fixture
@@ -65,13 +76,6 @@ def feed_of(robot: Robot) -> Feed:
 def at(sec: int, lines: int = 1300) -> RobotState:
     counters = STATE.counters | {"lines": lines}
     return replace(STATE, stamp=Time(sec), counters=counters)
-
-
-def came_every(robot: Robot, feed: Feed, seconds: float, times: int) -> None:
-    for _ in range(times):
-        robot.now += seconds
-        robot.tells(STATE)
-        feed.poll()
 
 
 def test_the_state_of_this_moment_is_there_without_one_that_comes(robot: Robot) -> None:
@@ -127,44 +131,36 @@ def test_a_state_of_another_version_is_told_as_that(robot: Robot) -> None:
     assert feed.seen().undecodable == 1
 
 
-@pytest.mark.parametrize(("period", "seconds"), [(0.1, 2.0), (0.5, 2.0), (1.0, 3.0), (10.0, 30.0)])
-def test_a_silence_is_three_states_that_did_not_come(
-    robot: Robot, period: float, seconds: float
-) -> None:
+def test_a_silence_is_told_sooner_once_a_state_has_arrived(robot: Robot) -> None:
+    feed = feed_of(robot)
+    robot.now += FIRST_S - 0.01
+    assert not feed.seen().silent
+    robot.now += 0.02
+    assert feed.seen().silent
+    robot.tells(STATE)
+    feed.poll()
+    robot.now += SILENT_S - 0.01
+    assert not feed.seen().silent
+    robot.now += 0.02
+    assert feed.seen().silent
+
+
+def test_a_robot_that_publishes_seldom_is_queried_and_never_silent(robot: Robot) -> None:
     feed = feed_of(robot)
     feed.ask()
-    came_every(robot, feed, period, 2)
-    assert feed.seen().silence == pytest.approx(seconds)
+    robot.answers = True
+    for _ in range(100):
+        feed.poll()
+        robot.now += 0.25
+        assert feed.seen().age < 2 * ASK_S + 0.5
+        assert not feed.seen().silent
 
 
-def test_a_burst_of_changes_makes_no_silence_of_a_slow_state(robot: Robot) -> None:
+def test_the_rates_begin_again_when_another_daemon_answers(robot: Robot) -> None:
     feed = feed_of(robot)
-    came_every(robot, feed, 10.0, 2)
-    came_every(robot, feed, 0.1, GAPS - 1)
-    assert feed.seen().silence == pytest.approx(30.0)
-
-
-def test_until_two_states_came_they_may_be_as_slow_as_any(robot: Robot) -> None:
-    feed = feed_of(robot)
-    assert feed.seen().silence == 2.0  # no state has arrived
-    feed.ask()
-    robot.now += 9.0
-    seen = feed.seen()
-    assert seen.age == pytest.approx(9.0)
-    assert seen.age < seen.silence
-
-
-def test_an_outage_is_no_interval_for_long(robot: Robot) -> None:
-    feed = feed_of(robot)
-    came_every(robot, feed, 0.1, 20)
-    came_every(robot, feed, 600.0, 1)
-    assert feed.seen().silence == pytest.approx(30.0)
-    came_every(robot, feed, 0.1, GAPS)
-    assert feed.seen().silence == 2.0
-    assert silence([]) == 30.0
-
-
-def test_counters_that_began_again_are_another_daemon_s() -> None:
-    assert not anew(BEFORE, STATE)
-    assert anew(STATE, BEFORE)
-    assert anew(STATE, replace(STATE, counters={}))
+    robot.tells(STATE)
+    feed.poll()
+    robot.now += 0.1
+    robot.tells(BEFORE)  # its counters are smaller
+    feed.poll()
+    assert (feed.seen().before, feed.seen().state) == (BEFORE, BEFORE)

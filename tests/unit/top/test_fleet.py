@@ -11,10 +11,11 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
+from acsard.client.follower import FLEET_ASK_S
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Info, Message, Time
 from acsard.top import fleet as fleets
-from acsard.top.fleet import ASK_S, Fleet
+from acsard.top.fleet import Fleet
 from acsard.top.roster import table
 from tests.unit.top.screens import STATE
 
@@ -113,6 +114,18 @@ def test_a_robot_whose_token_goes_is_not_here(session: Session) -> None:
     assert fleet.more == ""
 
 
+def test_the_version_of_a_robot_that_publishes_its_state_often_is_asked_for(
+    session: Session, clock: Clock
+) -> None:
+    fleet = fleet_of(session, ("robot1",), ("robot1",))
+    session.comes("robot1")
+    for _ in range(3):
+        fleet._state(sample_of("robot1", "state", STATE), asked=False)
+        version = fleet.rows()[0].version
+        clock.now += 0.1
+    assert version == "0.1"
+
+
 @pytest.mark.parametrize(
     ("ids", "answering", "here", "whole"),
     [
@@ -133,7 +146,7 @@ def test_it_is_whole_once_each_who_was_named_is_here_and_has_said_all(
     # the first query may be answered by a storage, the second one only by the robot
     for _ in range(2):
         fleet.rows()
-        clock.now += ASK_S
+        clock.now += FLEET_ASK_S
     assert fleet.whole is whole
 
 

@@ -35,7 +35,7 @@ def test_robots_are_in_the_order_of_their_names() -> None:
     ("row", "words"),
     [
         (replace(ROW, here=False, age=90.0), "GONE, was: commanded by app"),
-        (replace(ROW, age=7.0), "SILENT, was: commanded by app"),
+        (replace(ROW, age=7.0, silent=True), "SILENT, was: commanded by app"),
         (replace(ROW, state=None), "waiting for its state"),
         (replace(ROW, state=None, here=False), "not there"),
     ],
@@ -85,7 +85,7 @@ IN_NEED = {
     "fault": replace(ROW, state=replace(STATE, mode="fault", reason="fault: a wheel is stuck")),
     "stopped": replace(ROW, state=replace(STATE, mode="stopped", reason="stopped by request")),
     "gone": replace(ROW, here=False, age=90.0),
-    "silent": replace(ROW, age=7.0),
+    "silent": replace(ROW, age=7.0, silent=True),
     "not there": replace(ROW, state=None, here=False),
 }
 

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.messages.schema import Figure, SourceState, Time
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.sections import FIGURES
 from tests.unit.top.screens import (
     BEFORE,

@@ -12,7 +12,7 @@ from rich.cells import cell_len
 
 from acsard.drive.modes import Mode
 from acsard.messages.schema import Figure, RobotState, SourceState, Spread, Time
-from acsard.runtime.figures import NAMES
+from acsard.runtime.latencies import NAMES
 from acsard.top.seen import MODES, Seen
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
@@ -72,19 +72,19 @@ def test_before_the_first_state_it_says_what_it_waits_for() -> None:
 
 @pytest.mark.parametrize("state", [STATE, None])
 def test_silence_is_said_big(state: RobotState | None) -> None:
-    seen = replace(SEEN, state=state, age=3.4)
+    seen = replace(SEEN, state=state, age=3.4, silent=True)
     assert "NO NEWS FOR 3 s: is the daemon running?" in lines_of(seen)[2]
     assert painted(seen).count("41m") == 3  # three lines in red
     assert not any("DRIVING" in line for line in lines_of(seen))
 
 
 def test_a_slow_state_is_not_silent_before_its_time() -> None:
-    assert "NO NEWS" not in "".join(lines_of(replace(SEEN, age=9.0, silence=30.0)))
-    assert "NO NEWS FOR 30 s" in lines_of(replace(SEEN, age=30.0, silence=30.0))[2]
+    assert "NO NEWS" not in "".join(lines_of(replace(SEEN, age=9.0)))
+    assert "NO NEWS FOR 30 s" in lines_of(replace(SEEN, age=30.0, silent=True))[2]
 
 
 def test_what_was_known_before_the_silence_stays_dimmed() -> None:
-    seen = replace(SEEN, age=100.0)
+    seen = replace(SEEN, age=100.0, silent=True)
     assert "NO NEWS FOR 1 min 40 s" in lines_of(seen)[2]
     assert "+1.250 m" in line_with("yaw", seen)
     assert len(lines_of(seen)) == 24
@@ -102,7 +102,9 @@ def test_without_a_link_no_old_speed_is_shown(width: int) -> None:
 
 def test_messages_of_another_form_are_told_from_silence() -> None:
     (told,) = [
-        line for line in lines_of(replace(SEEN, age=3.0, undecodable=9)) if "FOR 3 s" in line
+        line
+        for line in lines_of(replace(SEEN, age=3.0, undecodable=9, silent=True))
+        if "FOR 3 s" in line
     ]
     assert "another version" in told
 

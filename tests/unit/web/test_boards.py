@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.host.ports import SerialDevice
 from acsard.host.processes import Holder
+from acsard.host.serial_ports import SerialDevice
 from acsard.web.boards import boards
 
 MEGA = SerialDevice(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 from acsard.values import NS_PER_S
@@ -11,45 +12,67 @@ from acsard.web.limits import (
     CONNECTIONS_HERE,
     CONNECTIONS_OF_ONE,
     CONNECTIONS_OF_TOKEN,
-    REQUESTS_AT_ONCE,
-    TRIES,
-    TRIES_OF_ONE,
+    GUESSES,
+    GUESSES_OF_ONE,
+    REQUESTS,
     Bucket,
-    Paces,
+    Buckets,
     Places,
+    Rate,
     Seats,
     Shares,
-    Tries,
 )
 
 
 def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
-    bucket = Bucket(10.0, 20.0, 0)
+    bucket = Bucket(Rate(10.0, 20.0), 0)
     assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
     taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
     assert 99 <= taken <= 100  # within ten seconds
 
 
 def test_a_bucket_holds_no_more_than_its_most_after_a_long_rest() -> None:
-    bucket = Bucket(10.0, 20.0, 0)
+    bucket = Bucket(Rate(10.0, 20.0), 0)
     assert sum(bucket.take(3600 * NS_PER_S) for _ in range(100)) == 20
 
 
 def test_wrong_tokens_are_enough_after_some_and_a_minute_forgets_them() -> None:
-    tries = Tries()
-    for _ in range(TRIES_OF_ONE):
-        assert not tries.spent("a", 0)
-        tries.failed("a", 0)
-    assert tries.spent("a", 0)
-    assert not tries.spent("b", 0)
-    assert not tries.spent("a", 61 * NS_PER_S)
+    guesses, most = Buckets(GUESSES_OF_ONE, GUESSES), int(GUESSES_OF_ONE.most)
+    assert [guesses.take("a", 0) for _ in range(most + 1)] == [True] * most + [False]
+    assert guesses.take("b", 0)
+    assert all(guesses.take("a", 61 * NS_PER_S) for _ in range(most))
+
+
+def test_an_address_has_no_moment_at_which_it_may_guess_twice_as_often() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    assert guesses.take("b", 0)
+    tenths = [n * NS_PER_S // 10 for n in range(595, 610) for _ in range(20)]
+    assert sum(guesses.take("a", at_ns) for at_ns in tenths) <= GUESSES_OF_ONE.most + 1
 
 
 def test_many_addresses_together_are_held_too() -> None:
-    tries = Tries()
-    for n in range(TRIES):
-        tries.failed(f"10.0.0.{n}", 0)
-    assert tries.spent("never seen", 0)
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    assert all(guesses.take(f"10.0.0.{n}", 0) for n in range(int(GUESSES.most)))
+    assert not guesses.take("never seen", 0)
+
+
+def test_an_address_that_may_guess_no_more_uses_up_nothing_of_the_others() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    for _ in range(2 * int(GUESSES.most)):
+        guesses.take("a", 0)
+    assert guesses.take("b", 0)
+
+
+def test_a_name_that_rests_is_forgotten_so_that_names_fill_no_memory() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    tracemalloc.start()
+    try:
+        for n in range(10_000):
+            guesses.take(f"address {n}", n * NS_PER_S // 10)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 200_000  # bytes; all names together take 2.3 MB
 
 
 def test_places_are_bounded_by_address_and_in_all() -> None:
@@ -142,8 +165,8 @@ def test_the_page_tells_the_places_that_there_are() -> None:
 
 
 def test_each_token_has_a_pace_of_its_own() -> None:
-    paces = Paces()
-    taken = [paces.take("one", 0) for _ in range(int(REQUESTS_AT_ONCE) + 1)]
-    assert taken == [True] * int(REQUESTS_AT_ONCE) + [False]
+    paces, most = Buckets(REQUESTS), int(REQUESTS.most)
+    taken = [paces.take("one", 0) for _ in range(most + 1)]
+    assert taken == [True] * most + [False]
     assert paces.take("another", 0)
     assert paces.take("one", NS_PER_S)

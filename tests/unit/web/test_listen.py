@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from acsard.cli import web
-from acsard.host.addresses import own_addresses
 from acsard.host.errors import CertificateError, InUseError, UsageError
+from acsard.host.own_identity import own_addresses
 from acsard.lan.authority import Authority
 from acsard.web.listen import (
     Listen,

@@ -14,7 +14,7 @@ import pytest
 
 from acsard.values import NS_PER_S
 from acsard.web import reports
-from acsard.web.reports import BYTES, NICE, Progress, Reports
+from acsard.web.reports import BYTES, KEEP_NS, NICE, Progress, Reports
 
 PATIENCE_S = 30.0
 
@@ -167,6 +167,27 @@ def test_what_nobody_asks_for_any_more_is_given_up_and_its_process_ends(
             found.tidy()
             while Path(f"/proc/{told.read_text()}").exists():
                 await asyncio.sleep(0.01)
+        assert found.drawn("a.mcap") is None
+
+    run(story)
+
+
+def test_who_opens_a_report_keeps_it_for_another_quarter_of_an_hour(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now_ns = 0
+    monkeypatch.setattr("acsard.web.reports.clock.mono_ns", lambda: now_ns)
+
+    async def story() -> None:
+        nonlocal now_ns
+        found = drawn_by(DRAWS)
+        await become(found, A, "ready")
+        for _ in range(3):
+            now_ns += KEEP_NS - NS_PER_S
+            found.tidy()
+            assert found.drawn("a.mcap")
+        now_ns += KEEP_NS + NS_PER_S
+        found.tidy()
         assert found.drawn("a.mcap") is None
 
     run(story)

@@ -15,7 +15,7 @@ from acsard.web.tokens import Token, Vault
 
 
 def test_an_invitation_is_somebody_until_it_is_revoked(tmp_path: Path) -> None:
-    keeper, server = Vault(tmp_path / "state"), Vault(tmp_path / "state")
+    keeper, server = Vault(tmp_path / "state", "robot1"), Vault(tmp_path / "state", "robot1")
     assert server.all() == []
     text, _ = keeper.invite("operator", "phone", 30)
     who = server.who(text)
@@ -28,7 +28,7 @@ def test_an_invitation_is_somebody_until_it_is_revoked(tmp_path: Path) -> None:
 
 
 def test_the_token_itself_is_nowhere_on_the_disk(tmp_path: Path) -> None:
-    vault = Vault(tmp_path / "state")
+    vault = Vault(tmp_path / "state", "robot1")
     text, _ = vault.invite("viewer", "tv", 1)
     kept = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
     assert text.encode() not in kept
@@ -37,7 +37,7 @@ def test_the_token_itself_is_nowhere_on_the_disk(tmp_path: Path) -> None:
 
 
 def test_one_that_has_ended_is_nobody(tmp_path: Path) -> None:
-    vault = Vault(tmp_path)
+    vault = Vault(tmp_path, "robot1")
     text, token = vault.invite("viewer", "tv", 1)
     vault.path.write_bytes(msgspec.json.encode([replace(token, ends=token.made - 1)]))
     assert vault.who(text) is None
@@ -46,20 +46,20 @@ def test_one_that_has_ended_is_nobody(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["", "x", "x" * 10_000, "ü", "\0", "\udcff"])
 def test_what_never_was_a_token_is_nobody(tmp_path: Path, text: str) -> None:
-    vault = Vault(tmp_path)
+    vault = Vault(tmp_path, "robot1")
     vault.invite("viewer", "tv", 1)
     assert vault.who(text) is None
 
 
 def test_a_damaged_file_lets_nobody_in(tmp_path: Path) -> None:
-    vault = Vault(tmp_path)
+    vault = Vault(tmp_path, "robot1")
     text, _ = vault.invite("maintainer", "me", 1)
     vault.path.write_bytes(vault.path.read_bytes()[:-3])
     assert vault.who(text) is None
 
 
 def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
-    vault = Vault(tmp_path)
+    vault = Vault(tmp_path, "robot1")
     vault.invite("maintainer", "me", 1)
     damaged = vault.path.read_bytes()[:-3]
     vault.path.write_bytes(damaged)
@@ -72,15 +72,15 @@ def test_a_damaged_file_is_not_written_over(tmp_path: Path) -> None:
 def test_who_invites_beside_a_service_is_told_that_it_does_not_know_the_token(
     tmp_path: Path,
 ) -> None:
-    own, service = Vault(tmp_path / "own"), tmp_path / "service"
+    own, service = Vault(tmp_path / "own", "robot1"), tmp_path / "service"
     assert own.unknown_to(service) == ""
     service.mkdir()
     assert "sudo" in own.unknown_to(service)
-    assert Vault(service).unknown_to(service) == ""
+    assert Vault(service, "robot1").unknown_to(service) == ""
 
 
 def test_those_that_count_are_told_at_once(tmp_path: Path) -> None:
-    vault = Vault(tmp_path)
+    vault = Vault(tmp_path, "robot1")
     _, first = vault.invite("viewer", "tv", 1)
     _, second = vault.invite("operator", "phone", 1)
     assert vault.counting() == {first.digest, second.digest}
@@ -89,7 +89,7 @@ def test_those_that_count_are_told_at_once(tmp_path: Path) -> None:
 
 
 def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Path) -> None:
-    vault = Vault(tmp_path)
+    vault = Vault(tmp_path, "robot1")
     vault.invite("viewer", "tv", 1)
     with pytest.raises(UsageError, match="--revoke"):
         vault.invite("operator", "tv", 1)
@@ -101,7 +101,7 @@ def test_a_name_is_given_once_and_an_unknown_one_cannot_be_revoked(tmp_path: Pat
 def test_where_one_may_not_write_it_says_so(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(NotPermittedError, match="sudo"):
-        Vault(tmp_path / "state").invite("viewer", "tv", 1)
+        Vault(tmp_path / "state", "robot1").invite("viewer", "tv", 1)
 
 
 def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) -> None:
@@ -118,20 +118,6 @@ def test_robots_that_share_the_file_know_their_own_tokens_alone(tmp_path: Path) 
     assert (first.all(), [one.name for one in second.all()]) == ([], ["phone"])
     with pytest.raises(UsageError, match="there are: none"):
         first.revoke("phone")
-
-
-def test_tokens_of_before_they_had_a_robot_count_for_any(tmp_path: Path) -> None:
-    text, token = Vault(tmp_path).invite("operator", "phone", 1)
-    older = msgspec.to_builtins(token)
-    del older["robot"]
-    Vault(tmp_path).path.write_bytes(msgspec.json.encode([older]))
-    for robot in ("robot1", "robot2"):
-        vault = Vault(tmp_path, robot)
-        assert vault.who(text) is not None
-        with pytest.raises(UsageError, match="there is a token phone already"):
-            vault.invite("viewer", "phone", 1)
-    Vault(tmp_path, "robot1").revoke("phone")
-    assert Vault(tmp_path, "robot2").who(text) is None
 
 
 def test_what_is_kept_has_no_more_than_it_needs() -> None:

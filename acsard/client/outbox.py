@@ -1,0 +1,106 @@
+"""Sends the commands of several senders from one thread, so that no caller waits for the bus.
+
+Each sender has a `Commander`, which keeps its newest wish only. A sender that leaves is released:
+its last zero goes out even if the bus was blocked for long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from threading import Condition, Thread
+from typing import Never
+
+from acsard.client.commander import Commander, Wish
+from acsard.host import clock
+from acsard.values import NS_PER_S
+
+Put = Callable[[Wish], object]
+"""Sends one command on the bus; it may block."""
+
+
+class Outbox:
+    """The senders that command the robot, and the thread that sends their commands."""
+
+    def __init__(self, dropped: Callable[[], object] = lambda: None) -> None:
+        """Start the thread; it calls `dropped` for each speed that became too old to be sent."""
+        self._dropped = dropped
+        self._senders: dict[Commander, Put] = {}
+        self._zeros: list[tuple[Put, Wish]] = []
+        self._news = Condition()
+        self._busy = self._ended = False
+        self.dead: Future[Never] = Future()
+        """Holds the exception that ended the thread, after which nothing is sent any more."""
+        self._thread = Thread(target=self._live, name="outbox", daemon=True)
+        self._thread.start()
+
+    def take(self, commander: Commander, put: Put, wish: Wish) -> int | None:
+        """Take a wish, and return what `Commander.take` returns."""
+        with self._news:
+            silence = commander.take(wish, clock.mono_ns())
+            self._senders[commander] = put
+            self._news.notify_all()
+        return silence
+
+    def release(self, commander: Commander) -> None:
+        """Forget a sender; send a zero first if the robot may still follow it."""
+        with self._news:
+            put, zero = self._senders.pop(commander, None), commander.end(clock.mono_ns())
+            if put is not None and zero is not None:
+                self._zeros.append((put, zero))
+            self._news.notify_all()
+
+    def flush(self, seconds: float) -> None:
+        """Wait until nothing waits to be sent, at most `seconds`."""
+        with self._news:
+            self._news.wait_for(
+                lambda: not (self._busy or self._zeros or self._times()), timeout=seconds
+            )
+
+    def end(self, seconds: float) -> None:
+        """Send the commands that are due, and end the thread within `seconds`."""
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+        self._thread.join(seconds)
+
+    def _live(self) -> None:
+        try:
+            while self._round():
+                pass
+        except BaseException as error:  # noqa: BLE001 - passed on to the program
+            self.dead.set_exception(error)
+
+    def _round(self) -> bool:
+        """Send what is due; return whether to go on."""
+        with self._news:
+            self._busy = False
+            self._news.notify_all()
+            while not ((due := self._due()) or self._zeros or self._ended):
+                times = self._times()
+                left_ns = min(times) - clock.mono_ns() if times else None
+                self._news.wait(None if left_ns is None else max(0, left_ns) / NS_PER_S)
+            self._busy = True
+            zeros, self._zeros = self._zeros, []
+        for put, zero in zeros:
+            put(zero)
+        for commander, put in due:
+            # The bus may have blocked the previous command, so judge the age by the present time.
+            with self._news:
+                stale = commander.stale
+                wish = commander.send(clock.mono_ns())
+            if wish is not None:
+                put(wish)
+            elif commander.stale > stale:
+                self._dropped()
+        return bool(zeros or due)
+
+    def _times(self) -> list[int]:
+        times = (commander.due_ns() for commander in self._senders)
+        return [due_ns for due_ns in times if due_ns is not None]
+
+    def _due(self) -> list[tuple[Commander, Put]]:
+        """Return the senders with a command that is due."""
+        now_ns = clock.mono_ns()
+        known = [(commander.due_ns(), commander, put) for commander, put in self._senders.items()]
+        return [(one, put) for due_ns, one, put in known if due_ns is not None and due_ns <= now_ns]

@@ -1,0 +1,236 @@
+"""One leg: decides the command from the daemon's messages and from key presses.
+
+It sends zeros until the daemon accepts them, then the moves by their durations, then zeros until
+the wheels stand. Any unexpected condition halts the leg for good; `halted` has the reason.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from acsard.calibration.guided.steps import Leg
+from acsard.client.commander import NEVER, OPENED_S, OPENING_S
+from acsard.client.follower import QUIET_S
+from acsard.config.settings import DriveConfig
+from acsard.messages.schema import RobotState
+from acsard.values import REST, Twist
+
+HELD_UP = "this computer was too busy to run the calibration: end what else runs on it"
+
+OBEYED_S = 1.5
+"""Time allowed for the robot to follow a changed command, s. The ramp takes a part of it."""
+
+DOUBT_S = 1.0
+"""Time for which the robot may deviate from the command before the leg is halted, s."""
+
+LINEAR_OFF, ANGULAR_OFF, OFF_SHARE = 0.05, 0.15, 0.3
+"""Deviation that is allowed: m/s, rad/s, and a fraction of the command in addition."""
+
+STILL = 0.02
+"""Speed below which a wheel stands, rad/s."""
+
+STANDING_S, STANDS_S = 0.5, 6.0
+"""Time for which the wheels must stand, and time within which they must come to rest, s."""
+
+ENTER = "\r\n"
+PRESSED = "a key was pressed"
+
+
+class Phase(StrEnum):
+    OPENING = "opening"
+    MOVING = "moving"
+    SETTLING = "settling"
+    DONE = "done"
+    HALTED = "halted"
+
+
+class Riding:
+    """A leg while it is driven. All times are in s of the same clock."""
+
+    def __init__(
+        self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str = ""
+    ) -> None:
+        """Start a leg.
+
+        `sender` is the identity in our commands, for a daemon that reports which sender it follows.
+        """
+        self._leg, self._source, self._drive, self._sender = leg, source, drive, sender
+        self.phase = Phase.OPENING
+        self.halted = ""
+        """The reason why the leg was cut short, or ""."""
+        self._begun = self._heard = self._stepped = self._changed = now
+        self._number, self._ends = -1, now
+        self._command = REST
+        self._waits: str | None = "a daemon that hears us"
+        self._another = ""
+        """Another program that drives as our source, as a sentence, or ""."""
+        self._still_since: float | None = None
+        self._doubted: float | None = None
+
+    @property
+    def over(self) -> bool:
+        return self.phase in (Phase.DONE, Phase.HALTED)
+
+    def progress(self, now: float) -> float:
+        """Return the fraction of the leg that is done; 1 when it is over."""
+        if self.over:
+            return 1.0
+        if self._number < 0:
+            return 0.0
+        behind = sum(move.seconds for move in self._leg.moves[: self._number + 1])
+        return min(0.99, max(0.0, (behind - self._ends + now) / self._leg.seconds))
+
+    def key(self, pressed: str, now: float) -> None:
+        """Handle a key press.
+
+        Enter is ignored at first, because the finger that started the leg may still rest on the
+        key.
+        """
+        if self.phase is Phase.OPENING and pressed in ENTER:
+            return
+        if self.phase is Phase.MOVING and now - self._stepped > QUIET_S / 2:
+            self._halt(HELD_UP)  # the person may have pressed it because the robot had stopped
+        last = self._number == len(self._leg.moves) - 1
+        if self.phase is Phase.MOVING and self._leg.by_key and last:
+            self._settle(now)
+        elif self.phase is not Phase.SETTLING or not self._leg.by_key:
+            self._halt(PRESSED)
+
+    def state(self, state: RobotState, now: float) -> None:
+        """Handle a `state` message of the daemon."""
+        self._heard = now
+        if state.mode in (*NEVER, "waiting"):
+            self._halt(f"the robot is {state.mode}: {state.reason}")
+        elif state.source not in ("", self._source):
+            self._halt(f"{state.source} commands the robot now")
+        elif self._driven_by_another(state) and self.phase is not Phase.OPENING:
+            self._halt(self._another)
+        elif self.phase is Phase.OPENING:
+            self._waits = self._another or self._missing(state)
+        elif self.phase is Phase.MOVING:
+            self._doubt(self._objection(state, now), now)
+
+    def wheels(self, fastest: float, now: float) -> None:
+        """Handle wheel feedback: the fastest wheel turns at `fastest` rad/s."""
+        self._heard = now
+        if fastest > STILL:
+            self._still_since = None
+        elif self._still_since is None:
+            self._still_since = now
+
+    def step(self, now: float) -> Twist:
+        """Return the command for this time."""
+        held_up, self._stepped = now - self._stepped, now
+        # After a pause of this process, it is unknown whether the daemon was silent. The robot has
+        # braked meanwhile, and the time of a move may be over, so that the next one would begin at
+        # the wrong place.
+        if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
+            self._halt(HELD_UP)
+        elif now - self._heard > QUIET_S:
+            self._halt("no word from the daemon" if held_up <= QUIET_S / 2 else HELD_UP)
+        if self.phase is Phase.OPENING:
+            self._open(now)
+        if self.phase is Phase.MOVING and now >= self._ends:
+            self._next(now)
+        if self.phase is Phase.SETTLING:
+            self._stand(now)
+        return self._command
+
+    def _open(self, now: float) -> None:
+        passed = now - self._begun
+        if passed >= OPENING_S and not self._waits:
+            self.phase, self._ends = Phase.MOVING, now
+        elif passed >= OPENED_S:
+            waits = f"the daemon does not take our commands: it waits for {self._waits}"
+            self._halt(self._another or waits)
+
+    def _next(self, now: float) -> None:
+        self._number += 1
+        if self._number >= len(self._leg.moves):
+            if self._leg.by_key:
+                self._halt("no key was pressed when the robot had come round")
+            else:
+                self._settle(now)
+            return
+        move = self._leg.moves[self._number]
+        self._command = Twist(move.linear, move.angular)
+        # Count from the planned end of the last move, so that a late step does not lengthen the
+        # drive.
+        self._ends, self._changed = self._ends + move.seconds, now
+
+    def _settle(self, now: float) -> None:
+        self.phase, self._command = Phase.SETTLING, REST
+        self._ends, self._still_since = now, None
+
+    def _stand(self, now: float) -> None:
+        if self._still_since is not None and now - self._still_since >= STANDING_S:
+            self.phase = Phase.DONE
+        elif now - self._ends > STANDS_S:
+            self._halt("the wheels do not come to rest though zero is commanded")
+
+    def _doubt(self, why: str, now: float) -> None:
+        """Halt the leg if a deviation lasts for `DOUBT_S`.
+
+        A computer that is busy for a moment sends late, so that the robot slows down; this is
+        tolerated.
+        """
+        if not why:
+            self._doubted = None
+        elif self._doubted is None:
+            self._doubted = now
+        elif now - self._doubted >= DOUBT_S:
+            self._halt(why)
+
+    def _objection(self, state: RobotState, now: float) -> str:
+        """Return why the robot does not follow the command, or "".
+
+        The wheels decide this, not a gyro: a gyro shows the turn that remains after skidding, which
+        is not disobedience.
+        """
+        if waits := self._missing(state):
+            return f"the daemon does not follow us, it waits for {waits}"
+        if now - self._changed < OBEYED_S:
+            return ""
+        if not state.wheels:
+            return "the microcontroller sends no feedback"
+        right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
+        linear = self._drive.wheel_radius * (right + left) / 4
+        track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier
+        angular = self._drive.wheel_radius * (right - left) / 2 / track
+        for told, does, off, unit in (
+            (self._command.linear, linear, LINEAR_OFF, "m/s"),
+            (self._command.angular, angular, ANGULAR_OFF, "rad/s"),
+        ):
+            if abs(does - told) > off + OFF_SHARE * abs(told):
+                return (
+                    f"the wheels do {does:.2f} {unit} where {told:.2f} are commanded: another "
+                    "commander, a limit or an obstacle"
+                )
+        return ""
+
+    def _driven_by_another(self, state: RobotState) -> bool:
+        """Return whether another program drives as our source, for example a second calibration."""
+        other = bool(self._sender) and state.sender not in ("", self._sender)
+        self._another = (
+            f"another program drives the robot as {self._source}, {state.sender}: a calibration or "
+            "a client; end it, or wait until it is done"
+            if other and state.source == self._source
+            else ""
+        )
+        return bool(self._another)
+
+    def _missing(self, state: RobotState) -> str:
+        """Return the condition that our commands wait for, or "" if they are accepted."""
+        for one in state.sources:
+            if one.name == self._source:
+                heard = one.age is not None and one.age < OPENING_S
+                # With several senders, the daemon lists the others as waiting although it follows
+                # us.
+                followed = state.mode == "driving" and state.sender == self._sender != ""
+                waits_for = "" if followed else one.waits_for
+                return waits_for if heard else waits_for or "a command"
+        return f"a source {self._source} in commands.sources"
+
+    def _halt(self, why: str) -> None:
+        if not self.over:
+            self.phase, self._command, self.halted = Phase.HALTED, REST, why

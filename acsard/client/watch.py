@@ -1,0 +1,76 @@
+"""Binds a `Follower` to the bus: subscribes to `state`, and queries it if it is late."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+import zenoh
+
+from acsard.bus.subscription import QUEUED, Subscription, encoded
+from acsard.client.follower import Follower
+from acsard.messages.encodings import DecodeError, Decoder
+from acsard.messages.schema import RobotState
+
+STATE = "state"
+
+
+class Followed(Protocol):
+    """Interface of a client as a watch uses it."""
+
+    def subscribe(self, name: str) -> Subscription:
+        """Subscribe to a key."""
+
+    def ask(self, name: str, take: Callable[[zenoh.Sample], object]) -> None:
+        """Query a key, and call `take` with the reply, if one comes."""
+
+
+class Watch(Follower):
+    """The newest state of the robot of a client. One thread uses it."""
+
+    def __init__(
+        self, robot: Followed, now: float, wake: Callable[[], object] | None = None
+    ) -> None:
+        """Subscribe; `wake` is called on a thread of Zenoh when a state arrives."""
+        super().__init__(now)
+        self._robot, self._decoder = robot, Decoder(RobotState)
+        self._states = robot.subscribe(STATE)
+        if wake is not None:
+            self._states.wakes(wake)
+        self._answers: deque[zenoh.Sample] = deque()
+        """Replies to queries. A thread of Zenoh appends them here and does nothing else."""
+
+    def look(self, now: float) -> list[RobotState]:
+        """Take the states that have arrived, query a late one, and return those that are news.
+
+        Raises `ZError` after the session was closed.
+        """
+        news = []
+        # Replies come first, because a published state is newer.
+        while self._answers:
+            state = self._read(self._answers.popleft())
+            if state is not None and self.answered(state, now):
+                news.append(state)
+        for _ in range(QUEUED):  # bounded, so that a flood cannot hold the caller
+            sample = self._states.try_recv()
+            if sample is None:
+                break
+            state = self._read(sample)
+            if state is not None:
+                self.published(state, now)
+                news.append(state)
+        if self.asks(now):
+            self._robot.ask(STATE, self._answers.append)
+        return news
+
+    def _read(self, sample: zenoh.Sample) -> RobotState | None:
+        try:
+            return self._decoder.decode(*encoded(sample))
+        except DecodeError:
+            self.unreadable += 1
+            return None
+
+    def end(self) -> None:
+        """Unsubscribe from `state`."""
+        self._states.undeclare()

@@ -1,0 +1,162 @@
+"""Changes of a machine as values: the user reads the steps before they are carried out."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+from msgspec import Struct
+
+from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
+
+OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d", "acsard-web.service.d")
+"""Directories that are removed with the last file in them."""
+
+RUN_S = 60.0
+"""Time limit of a command, s. A command that takes longer has hung."""
+
+
+class File(Struct, frozen=True):
+    """One file of the service."""
+
+    path: Path
+    content: bytes
+    mode: int = 0o644
+    kept: bool = False
+    """True for a file that the user may change. It is not replaced, nor removed if changed."""
+
+    def found(self) -> bytes | None:
+        """Return the present content of the path, or None if the file does not exist."""
+        try:
+            return self.path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise _unreadable(self.path, error) from None
+
+    def condition(self) -> str:
+        """Return the file's condition in a word or two."""
+        try:
+            found = self.found()
+        except MendableError:
+            return "unreadable"
+        if found is None:
+            return "missing"
+        return "as installed" if found == self.content else "changed"
+
+
+class Write(Struct, frozen=True):
+    """Step that writes a file."""
+
+    file: File
+
+    def __str__(self) -> str:
+        return (
+            f"write   {self.file.path}  ({len(self.file.content)} bytes, mode {self.file.mode:o})"
+        )
+
+    def do(self) -> None:
+        """Write the file. New directories are open to the service's user, whatever the umask."""
+        path = self.file.path
+        made = [place for place in path.parents if not place.exists()]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for place in made:
+            place.chmod(0o755)
+        # A link is replaced, not written through.
+        path.unlink(missing_ok=True)
+        path.write_bytes(self.file.content)
+        path.chmod(self.file.mode)
+
+
+class Remove(Struct, frozen=True):
+    """Step that removes a file, and the directories made for it if they are empty."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return f"remove  {self.path}"
+
+    def do(self) -> None:
+        """Remove the file."""
+        self.path.unlink()
+        self.tidy(self.path)
+
+    @staticmethod
+    def tidy(path: Path) -> None:
+        """Remove acsard's own directories that have become empty."""
+        for place in path.parents:
+            if place.name not in OURS:
+                return
+            try:
+                place.rmdir()
+            except OSError:
+                # The directory holds something else.
+                return
+
+
+class RemoveAll(Struct, frozen=True):
+    """Step that removes a file, or a directory with everything in it."""
+
+    path: Path
+
+    def __str__(self) -> str:
+        return f"remove  {self.path}" + ("/ and all in it" if self.path.is_dir() else "")
+
+    def do(self) -> None:
+        """Remove the file or the directory."""
+        if self.path.is_dir() and not self.path.is_symlink():
+            shutil.rmtree(self.path)
+            Remove.tidy(self.path)
+        else:
+            Remove(self.path).do()
+
+
+class Keep(Struct, frozen=True):
+    """Step that leaves a file as it is, with the reason."""
+
+    path: Path
+    why: str = ""
+
+    def __str__(self) -> str:
+        return f"keep    {self.path}" + (f"  ({self.why})" if self.why else "")
+
+    def do(self) -> None:
+        """Do nothing."""
+
+
+class Run(Struct, frozen=True):
+    """Step that runs a command."""
+
+    words: tuple[str, ...]
+    may_fail: bool = False
+    """True if a failure must not end the installation: the machine may have no udev, or a unit
+    that never failed cannot be reset.
+    """
+
+    def __str__(self) -> str:
+        return f"run     {' '.join(self.words)}"
+
+    def do(self) -> None:
+        """Run the command; raise `ExitError` with its error output, unless it may fail."""
+        try:
+            done = called(self.words, RUN_S)
+            failed = done.stderr.strip() if done.returncode else ""
+        except (OSError, subprocess.TimeoutExpired) as error:
+            failed = str(error)
+        if failed and not self.may_fail:
+            raise ExitError(Exit.FAILURE, f"{' '.join(self.words)}: {failed}")
+
+
+Step = Write | Remove | RemoveAll | Keep | Run
+
+
+def _unreadable(path: Path, error: OSError) -> MendableError:
+    if isinstance(error, PermissionError):
+        return NotPermittedError(f"no permission to read {path}; run it by sudo")
+    return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; look what it is")
+
+
+def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; raise `OSError` or `subprocess.TimeoutExpired`."""
+    return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

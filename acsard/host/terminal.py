@@ -1,0 +1,37 @@
+"""The terminal: whether output may contain colours, and single key presses for driving by keys."""
+
+from __future__ import annotations
+
+import os
+import sys
+import termios
+import tty
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TextIO
+
+
+def coloured(stream: TextIO) -> bool:
+    """Return whether the stream is a terminal with colours, and NO_COLOR is not set."""
+    wanted = not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    return wanted and stream.isatty()
+
+
+@contextmanager
+def one_by_one() -> Iterator[None]:
+    """Deliver the keys of standard input one by one, and restore the terminal at the end.
+
+    Ctrl-S is an ordinary key meanwhile. Otherwise it would block the program's output, and with it
+    the program that drives the robot.
+    """
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    now = termios.tcgetattr(sys.stdin)
+    now[0] &= ~termios.IXON
+    termios.tcsetattr(sys.stdin, termios.TCSANOW, now)
+    try:
+        yield
+    finally:
+        # The terminal may have been closed.
+        with suppress(OSError, termios.error):
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

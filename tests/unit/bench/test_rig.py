@@ -1,0 +1,32 @@
+"""Tests of the sentences that say why a process of a benchmark ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acsard.bench.rig import daemon_ended
+from acsard.host.errors import Exit
+
+JSON = '{"event": "ended"}\n'
+
+
+@pytest.mark.parametrize(
+    ("code", "log", "wanted", "text"),
+    [
+        (-9, JSON, Exit.FAILURE, "the daemon was ended by signal 9"),
+        (0, JSON, Exit.FAILURE, "the daemon ended with 0"),
+        (3, "what\n", Exit.FAILURE, "the daemon ended with 3: what"),
+        (75, JSON, Exit.FAILURE, "the daemon ended with 75"),
+        (75, f"acsard: in use\n{JSON}\n", Exit.IN_USE, "in use"),
+        (1, "Traceback ...\nKeyError: 1\n", Exit.FAILURE, "KeyError: 1"),
+    ],
+)
+def test_the_daemons_own_words_are_told_if_it_has_any(
+    tmp_path: Path, code: int, log: str, wanted: Exit, text: str
+) -> None:
+    file = tmp_path / "log"
+    file.write_text(log)
+    told = daemon_ended(code, file)
+    assert (told.code, str(told)) == (wanted, text)

@@ -1,0 +1,192 @@
+"""Tests of the wishes that are sent to the robot, of their times, and of the last zero."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.client.commander import (
+    DRIVES_NS,
+    GATHER_NS,
+    LONGEST_NS,
+    SILENCE_NS,
+    STALE_NS,
+    Commander,
+    Sender,
+    Wish,
+)
+from acsard.values import NS_PER_S, REST, Twist
+
+AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)
+MS = NS_PER_S // 1000
+
+
+class Panel:
+    """A commander with a clock and a record of the twists it sent."""
+
+    def __init__(self) -> None:
+        self.commander, self.now = Commander(leads=True, gathers=True), 10 * NS_PER_S
+        self.gone: list[Twist] = []
+
+    def wait(self, span_ns: int) -> None:
+        """Let time pass and send everything that falls due."""
+        end = self.now + span_ns
+        while (due := self.commander.due_ns()) is not None and due <= end:
+            self.now = max(self.now, due)
+            wish = self.commander.send(self.now)
+            if wish is not None:
+                self.gone.append(wish.twist)
+        self.now = end
+
+    def press(self, twist: Twist, times: int = 1, every_ns: int = 100 * MS) -> None:
+        for _ in range(times):
+            self.commander.take(Wish(twist), self.now)
+            self.wait(every_ns)
+
+
+@pytest.fixture
+def panel() -> Panel:
+    return Panel()
+
+
+def test_each_wish_is_sent_once_after_one_zero(panel: Panel) -> None:
+    panel.press(AHEAD, times=5)
+    assert panel.gone == [REST, *[AHEAD] * 5]
+
+
+def test_nothing_is_sent_without_a_wish(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    before = len(panel.gone)
+    panel.wait(100 * NS_PER_S)
+    assert len(panel.gone) == before
+    assert panel.commander.due_ns() is None
+
+
+def test_a_silence_is_followed_by_a_zero_first(panel: Panel) -> None:
+    panel.press(AHEAD)
+    panel.wait(SILENCE_NS)
+    panel.press(LEFT)
+    assert panel.gone == [REST, AHEAD, REST, LEFT]
+
+
+def test_a_burst_that_was_held_back_moves_nothing(panel: Panel) -> None:
+    panel.press(AHEAD, times=3)
+    panel.wait(2 * NS_PER_S)
+    for _ in range(20):
+        panel.commander.take(Wish(AHEAD), panel.now)
+        panel.now += MS
+    panel.wait(NS_PER_S)
+    assert panel.gone == [REST, *[AHEAD] * 3, REST]
+    assert panel.commander.stale == 1
+    assert panel.commander.replaced == 19
+
+
+def test_after_a_burst_the_present_wish_is_sent(panel: Panel) -> None:
+    panel.press(AHEAD, times=4, every_ns=0)
+    panel.wait(100 * MS)
+    panel.press(LEFT, times=2)
+    assert panel.gone == [REST, LEFT, LEFT]
+
+
+def test_of_the_wishes_that_wait_the_newest_is_sent(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.commander.take(Wish(AHEAD), panel.now)
+    panel.commander.take(Wish(LEFT), panel.now)
+    panel.wait(0)
+    assert panel.gone == [REST, AHEAD, AHEAD, LEFT]
+    assert panel.commander.replaced == 1
+
+
+def test_a_speed_that_waited_too_long_is_not_sent(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.commander.take(Wish(AHEAD), panel.now)
+    assert panel.commander.send(panel.now + STALE_NS + 1) is None
+    assert panel.commander.stale == 1
+    assert panel.commander.due_ns() is None
+
+
+def test_only_the_first_wish_after_a_silence_waits_for_a_burst(panel: Panel) -> None:
+    panel.commander.take(Wish(AHEAD), panel.now)
+    assert panel.commander.send(panel.now) == Wish(REST)
+    assert panel.commander.send(panel.now + GATHER_NS - 1) is None
+    assert panel.commander.send(panel.now + GATHER_NS) == Wish(AHEAD)
+    panel.now += 100 * MS
+    panel.commander.take(Wish(AHEAD), panel.now)
+    assert panel.commander.send(panel.now) == Wish(AHEAD)
+
+
+def test_a_sender_that_leaves_while_it_drives_leaves_one_zero(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.commander.take(Wish(AHEAD), panel.now)
+    assert panel.commander.end(panel.now) == Wish(REST)
+    assert panel.commander.end(panel.now) is None
+    assert panel.commander.due_ns() is None
+
+
+def test_a_sender_that_does_not_drive_leaves_nothing(panel: Panel) -> None:
+    assert panel.commander.end(panel.now) is None
+    panel.press(AHEAD, times=2)
+    panel.press(REST)
+    assert panel.commander.end(panel.now) is None
+    panel.press(AHEAD, times=2)
+    assert panel.commander.end(panel.now + LONGEST_NS + NS_PER_S) is None
+
+
+def test_a_sender_drives_while_it_asks_for_a_speed(panel: Panel) -> None:
+    assert not panel.commander.drives(panel.now)
+    panel.press(AHEAD)
+    assert panel.commander.drives(panel.now)
+    assert not panel.commander.drives(panel.now + DRIVES_NS)
+    panel.press(REST)
+    assert not panel.commander.drives(panel.now)
+
+
+def test_a_stamp_goes_with_its_wish_and_zeros_are_by_the_same_clock(panel: Panel) -> None:
+    panel.commander.take(Wish(AHEAD, 1000), panel.now)
+    assert panel.commander.send(panel.now + 3) == Wish(REST, 1003)
+    panel.now += GATHER_NS
+    assert panel.commander.send(panel.now) == Wish(AHEAD, 1000)
+    panel.commander.take(Wish(LEFT, 1000 + 2 * GATHER_NS), panel.now)
+    assert panel.commander.send(panel.now) == Wish(LEFT, 1000 + 2 * GATHER_NS)
+    assert panel.commander.end(panel.now + 5) == Wish(REST, 1005 + 2 * GATHER_NS)
+
+
+def test_a_sender_that_stamps_no_more_has_zeros_without_a_stamp(panel: Panel) -> None:
+    panel.commander.take(Wish(AHEAD, 1000), panel.now)
+    panel.commander.take(Wish(AHEAD), panel.now)
+    assert panel.commander.send(panel.now) == Wish(REST)
+
+
+def test_a_zero_is_never_too_old_to_be_sent(panel: Panel) -> None:
+    panel.press(AHEAD, times=2)
+    panel.commander.take(Wish(REST), panel.now)
+    assert panel.commander.send(panel.now + 100 * STALE_NS) == Wish(REST)
+
+
+def test_a_zero_at_the_end_of_a_burst_is_sent(panel: Panel) -> None:
+    for twist in (AHEAD, AHEAD, REST):
+        panel.commander.take(Wish(twist), panel.now)
+    panel.wait(NS_PER_S)
+    assert panel.gone == [REST, REST]
+
+
+def test_a_sender_with_zeros_and_stamps_of_its_own_is_passed_on_as_it_is() -> None:
+    commander = Commander()
+    for n, wish in enumerate((Wish(AHEAD, 1), Wish(AHEAD, 2, True), Wish(REST, 3))):
+        commander.take(wish, n * NS_PER_S)
+        assert commander.due_ns() == n * NS_PER_S
+        assert commander.send(n * NS_PER_S) == wish
+        assert commander.due_ns() is None
+
+
+def test_the_last_zero_of_a_sender_with_a_steady_clock_is_by_that_clock() -> None:
+    commander = Commander()
+    commander.take(Wish(AHEAD, 1000, True), 0)
+    commander.send(0)
+    assert commander.end(7) == Wish(REST, 1007, True)
+
+
+def test_the_commands_of_a_sender_are_numbered() -> None:
+    sender = Sender("joe/aa")
+    signed = [sender.sign(9, steady=False) for _ in range(3)]
+    assert [one.sequence for one in signed] == [1, 2, 3]
+    assert {one.sender for one in signed} == {"joe/aa"}

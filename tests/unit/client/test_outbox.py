@@ -1,0 +1,105 @@
+"""The thread that sends commands drops those that are too old, and never dies unnoticed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from threading import Event
+
+import pytest
+
+from acsard.client.commander import STALE_NS, Commander, Wish
+from acsard.client.outbox import Outbox
+from acsard.host import clock
+from acsard.values import REST, Twist
+from tests.system.harness import until
+
+PATIENCE_S = 20.0
+
+AHEAD, LEFT = Wish(Twist(0.5, 0.0)), Wish(Twist(0.0, 1.0))
+ZERO = Wish(REST)
+
+
+class Bus:
+    """A bus that records commands and can be blocked."""
+
+    def __init__(self) -> None:
+        self.sent: list[Wish] = []
+        self.entered, self.free = Event(), Event()
+        self.free.set()
+
+    def put(self, wish: Wish) -> None:
+        self.entered.set()
+        assert self.free.wait(PATIENCE_S)
+        self.sent.append(wish)
+
+    def block(self) -> None:
+        self.free.clear()
+        self.entered.clear()
+
+
+@pytest.fixture
+def bus() -> Iterator[Bus]:
+    bus = Bus()
+    yield bus
+    bus.free.set()
+
+
+def test_of_the_wishes_behind_a_blocked_bus_only_the_newest_is_sent(bus: Bus) -> None:
+    outbox, blocker, one = Outbox(), Commander(), Commander()
+    bus.block()
+    outbox.take(blocker, bus.put, ZERO)
+    assert bus.entered.wait(PATIENCE_S)
+    for wish in (AHEAD, AHEAD, ZERO):
+        outbox.take(one, bus.put, wish)
+    bus.free.set()
+    outbox.flush(PATIENCE_S)
+    assert bus.sent == [ZERO, ZERO]
+    assert one.replaced == 2
+
+
+def test_a_speed_that_became_too_old_is_dropped_and_a_zero_is_sent(bus: Bus) -> None:
+    dropped: list[bool] = []
+    outbox = Outbox(lambda: dropped.append(True))
+    blocker, ahead, zero = Commander(), Commander(), Commander()
+    bus.block()
+    outbox.take(blocker, bus.put, ZERO)
+    assert bus.entered.wait(PATIENCE_S)
+    outbox.take(ahead, bus.put, AHEAD)
+    outbox.take(zero, bus.put, ZERO)
+    given_ns = clock.mono_ns()
+    until(lambda: clock.mono_ns() - given_ns > STALE_NS, PATIENCE_S, "that it is too old")
+    bus.free.set()
+    outbox.flush(PATIENCE_S)
+    assert bus.sent == [ZERO, ZERO]
+    assert dropped == [True]
+
+
+def test_a_sender_that_leaves_while_the_bus_is_blocked_still_gets_its_zero(bus: Bus) -> None:
+    outbox, one = Outbox(), Commander()
+    bus.block()
+    outbox.take(one, bus.put, AHEAD)
+    assert bus.entered.wait(PATIENCE_S)
+    outbox.take(one, bus.put, LEFT)
+    outbox.release(one)
+    bus.free.set()
+    outbox.flush(PATIENCE_S)
+    assert bus.sent == [AHEAD, ZERO]
+
+
+def test_the_last_zero_is_sent_before_the_thread_ends(bus: Bus) -> None:
+    outbox, one = Outbox(), Commander()
+    outbox.take(one, bus.put, AHEAD)
+    outbox.flush(PATIENCE_S)
+    outbox.release(one)
+    outbox.end(PATIENCE_S)
+    assert bus.sent == [AHEAD, ZERO]
+    assert not outbox.dead.done()
+
+
+def test_a_thread_that_dies_is_known() -> None:
+    def deadly(wish: Wish) -> None:
+        raise SystemExit
+
+    outbox = Outbox()
+    outbox.take(Commander(), deadly, AHEAD)
+    assert isinstance(outbox.dead.exception(PATIENCE_S), SystemExit)

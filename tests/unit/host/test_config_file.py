@@ -1,0 +1,108 @@
+"""Edits to an acsard.toml keep its comments, and a failed edit leaves the file unchanged."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from tomlkit.exceptions import NonExistentKey
+
+from acsard.config.parsing import parse
+from acsard.host.config_file import change
+from acsard.host.errors import ExitError
+
+REFERENCE = Path(__file__).parents[3] / "acsard.toml"
+
+KEYS: dict[str, object] = {
+    "mcu.baud_rate": 57600,
+    "mcu.trailing_comma": True,
+    "mcu.reply_period": 0.1,
+    "mcu.wheels.rear_left": "-c",
+    "control.rate": 50.0,
+}
+
+
+def changed(file: Path) -> list[tuple[str, str]]:
+    """Return the lines that differ from those of the reference file."""
+    pairs = zip(REFERENCE.read_text().splitlines(), file.read_text().splitlines(), strict=True)
+    return [(before, after) for before, after in pairs if before != after]
+
+
+def test_only_the_values_of_the_reference_change(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(REFERENCE.read_text())
+    file.chmod(0o640)
+    change(file, KEYS)
+    assert [after for _, after in changed(file)] == [
+        "baud_rate = 57600",
+        "trailing_comma = true",
+        "reply_period = 0.1",
+        'rear_left = "-c"',
+        "rate = 50.0",
+    ]
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert os.listdir(tmp_path) == ["acsard.toml"]
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("[mcu]\n", {"mcu.baud_rate": 300}),
+        ("[mcu]\n", {"mcu.baud_rate": 9600}),
+        ("[mcu]\n", {"mcu.wheels.front_right": "+b"}),
+        ("[mcu\n", {"mcu.baud_rate": 57600}),
+        ("[mcu]\nbaud = 3\n", {"mcu.baud_rate": 57600}),
+    ],
+)
+def test_what_would_not_check_is_not_written(
+    tmp_path: Path, text: str, keys: dict[str, object]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(text)
+    with pytest.raises(ExitError, match="left as it was"):
+        change(file, keys)
+    assert file.read_text() == text
+    assert os.listdir(tmp_path) == ["acsard.toml"]
+
+
+def test_what_the_library_cannot_do_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(text: str) -> None:
+        raise NonExistentKey("mcu")
+
+    monkeypatch.setattr("tomlkit.parse", fails)
+    (tmp_path / "acsard.toml").write_text("# mine\n")
+    with pytest.raises(ExitError, match="left as it was"):
+        change(tmp_path / "acsard.toml", KEYS)
+    assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
+
+
+def test_a_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "real.toml").write_text("# mine\n")
+    link = tmp_path / "acsard.toml"
+    link.symlink_to("real.toml")
+    change(link, {"mcu.trailing_comma": True})
+    assert link.is_symlink()
+    assert "trailing_comma = true" in (tmp_path / "real.toml").read_text()
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ExitError):
+        change(tmp_path / "none.toml", KEYS)
+
+
+def test_a_new_file_is_made_only_where_that_is_meant(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    assert change(file, KEYS, new=True) == KEYS
+    assert parse(file.read_bytes()).mcu.baud_rate == 57600
+    assert file.stat().st_mode & 0o777 == 0o644
+    assert os.listdir(tmp_path) == ["acsard.toml"]
+
+
+def test_keys_may_be_made_from_what_the_file_says(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_bytes(b"# mine\r\n[mcu]\r\nencoder_counts = 5\r\n")
+    change(file, lambda config: {"mcu.encoder_counts": 2 * config.mcu.encoder_counts})
+    assert file.read_bytes() == b"# mine\r\n[mcu]\r\nencoder_counts = 10\r\n"

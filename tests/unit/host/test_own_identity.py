@@ -1,0 +1,51 @@
+"""Tests of the name that a process gives itself, for any user."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import sys
+
+import pytest
+
+from acsard.bus.inbox import ATTACHMENT_BYTES
+from acsard.host.own_identity import own_name, sender_id
+from acsard.messages.signature import MAX_NAME, MOST, Signature, public_name, unpack
+
+
+@pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("/home/joe/patrol.py", " patrol"),
+        ("/opt/venv/bin/acsard", " acsard"),
+        ("/opt/lib/acsard/__main__.py", " acsard"),
+        ("-c", ""),
+        ("", ""),
+    ],
+)
+def test_it_is_the_user_the_machine_and_the_program(
+    monkeypatch: pytest.MonkeyPatch, program: str, told: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", [program])
+    user, machine = pwd.getpwuid(os.getuid()).pw_name, os.uname().nodename.partition(".")[0]
+    assert own_name() == f"{user}@{machine}{told}"
+
+
+def test_a_user_that_nobody_knows_is_a_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: 4_000_000_000)
+    assert own_name().startswith("4000000000@")
+
+
+@pytest.mark.parametrize("name", ["joe", "a/b/c", "\U0001f916" * 100])
+def test_a_sender_id_fits_into_an_attachment_and_no_two_are_alike(name: str) -> None:
+    one, other = sender_id(name), sender_id(name)
+    assert one != other
+    assert one.rpartition("/")[0] == name[:MAX_NAME]
+    signature = Signature(one, MOST, MOST)
+    assert unpack(signature.pack()) == signature
+    assert len(signature.pack()) <= ATTACHMENT_BYTES
+
+
+def test_a_program_that_keeps_its_secret_keeps_its_public_name() -> None:
+    assert public_name(sender_id("joe", "s3cret")) == public_name("joe/s3cret")
+    assert public_name(sender_id("joe")) != public_name(sender_id("joe"))

@@ -1,0 +1,291 @@
+"""Tests of keyboard driving: a key press drives for a while, then zeros follow, then silence."""
+
+from __future__ import annotations
+
+from collections import deque
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.client.commander import GRACE_S, ZEROS
+from acsard.client.follower import ASK_S, SILENT_S
+from acsard.messages.encodings import encode
+from acsard.messages.schema import RobotState, Time
+from acsard.top import keyboard
+from acsard.top.keyboard import HOLD_S, Keyboard, Ride, split
+from acsard.values import REST, Twist
+from tests.unit.top.screens import STATE
+
+UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
+
+MOVES = [
+    ("i", 1, 0), ("o", 1, -1), ("u", 1, 1), ("j", 0, 1), ("l", 0, -1),
+    (",", -1, 0), (".", -1, 1), ("m", -1, -1),
+    (UP, 1, 0), (DOWN, -1, 0), (LEFT, 0, 1), (RIGHT, 0, -1),
+]  # fmt: skip
+"""Key bindings of teleop_twist_keyboard (moveBindings: x and th), and of the arrow keys."""
+
+SPEEDS = [
+    ("q", 1.1, 1.1), ("z", 0.9, 0.9), ("w", 1.1, 1.0), ("x", 0.9, 1.0), ("e", 1.0, 1.1),
+    ("c", 1.0, 0.9),
+]  # fmt: skip
+
+
+def silent() -> Keyboard:
+    """Return a keyboard at 0.5 m/s and 2 rad/s whose initial zeros were sent."""
+    keys = Keyboard(0.5, 2.0)
+    while keys.wish(0.0) is not None:
+        pass
+    return keys
+
+
+def pressed(key: str, now: float) -> Keyboard:
+    """Return a keyboard after a silence and this key."""
+    keys = silent()
+    keys.press(key, now)
+    return keys
+
+
+def test_it_opens_with_three_zeros_and_falls_silent() -> None:
+    keys = Keyboard(0.5, 2.0)
+    assert [keys.wish(n / 20) for n in range(6)] == [REST] * 3 + [None] * 3
+    assert ZEROS == 3
+
+
+@pytest.mark.parametrize(("key", "linear", "angular"), MOVES)
+def test_each_key_drives_its_way(key: str, linear: int, angular: int) -> None:
+    keys = pressed(key, 10.0)
+    assert keys.wish(10.0) == Twist(0.5 * linear, 2.0 * angular)
+
+
+def test_a_press_drives_for_its_hold_then_come_three_zeros_then_silence() -> None:
+    keys = pressed("i", 10.0)
+    assert keys.wish(10.0 + HOLD_S - 0.001) == Twist(0.5, 0.0)
+    assert [keys.wish(10.0 + HOLD_S) for _ in range(5)] == [REST] * 3 + [None] * 2
+
+
+def test_the_hold_is_longer_than_the_delay_of_a_keyboard_and_no_longer_than_a_second() -> None:
+    assert 0.5 < HOLD_S <= 1.0
+
+
+def test_a_repeated_press_extends_the_hold() -> None:
+    keys = pressed("i", 10.0)
+    for n in range(20):
+        keys.press("i", 10.0 + n * 0.5)
+        assert keys.wish(10.0 + n * 0.5 + 0.499) == Twist(0.5, 0.0)
+    assert keys.wish(19.5 + HOLD_S) == REST
+
+
+def test_another_key_changes_the_way_at_once() -> None:
+    keys = pressed("i", 10.0)
+    keys.press("j", 10.1)
+    assert keys.wish(10.1) == Twist(0.0, 2.0)
+    assert keys.wish(10.0 + HOLD_S) == Twist(0.0, 2.0)
+
+
+@pytest.mark.parametrize("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
+def test_any_other_key_stops_at_once(key: str) -> None:
+    keys = pressed("i", 10.0)
+    keys.press(key, 10.1)
+    assert [keys.wish(10.1) for _ in range(4)] == [REST] * 3 + [None]
+
+
+def test_a_stop_at_rest_sends_its_zeros_too() -> None:
+    keys = silent()
+    keys.press(" ", 10.0)
+    assert [keys.wish(10.0) for _ in range(4)] == [REST] * 3 + [None]
+
+
+@pytest.mark.parametrize(("key", "linear", "angular"), SPEEDS)
+def test_speed_keys_change_ten_percent_and_do_not_move(
+    key: str, linear: float, angular: float
+) -> None:
+    keys = silent()
+    keys.press(key, 10.0)
+    assert (keys.linear, keys.angular) == pytest.approx((0.5 * linear, 2.0 * angular))
+    assert keys.wish(10.0) is None
+
+
+def test_a_speed_key_while_driving_counts_at_once_and_does_not_hold_longer() -> None:
+    keys = pressed("u", 10.0)
+    keys.press("w", 10.5)
+    assert keys.wish(10.5) == Twist(0.5 * 1.1, 2.0)
+    assert keys.wish(10.0 + HOLD_S) == REST
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("", []),
+        ("i", ["i"]),
+        ("iii", ["i", "i", "i"]),
+        (UP, [UP]),
+        (UP + UP, [UP, UP]),
+        ("i" + LEFT + "k", ["i", LEFT, "k"]),
+        ("\x1b", ["\x1b"]),
+        ("\x1bi", ["\x1b", "i"]),
+        ("\x1b[", ["\x1b["]),
+        ("\x1b" + RIGHT, ["\x1b", RIGHT]),
+        ("�,", ["�", ","]),
+    ],
+)
+def test_what_a_terminal_gives_is_cut_into_keys(text: str, keys: list[str]) -> None:
+    assert split(text) == keys
+
+
+@given(st.text(alphabet="i,k\x1b[ABé", max_size=40))
+def test_cutting_loses_nothing(text: str) -> None:
+    keys = split(text)
+    assert "".join(keys) == text
+    assert all(len(key) == 1 or key.startswith("\x1b[") for key in keys)
+
+
+@given(st.lists(st.sampled_from([*"io,k ", UP, DOWN, LEFT, RIGHT])))
+def test_whole_keys_come_back_as_they_were(keys: list[str]) -> None:
+    assert split("".join(keys)) == keys
+
+
+# the robot's published state
+
+
+class Robot:
+    """A client whose robot has published these states.
+
+    A storage in the router keeps the last one.
+    """
+
+    source, sender = "teleop", "joe/1/aa"
+
+    def __init__(self, *said: RobotState) -> None:
+        self.said = deque(map(sample_of, said))
+        self.stored: RobotState | None = None
+        self.sent: list[float] = []
+
+    def subscribe(self, name: str) -> Any:
+        return SimpleNamespace(try_recv=lambda: self.said.popleft() if self.said else None)
+
+    def ask(self, name: str, take: Any) -> None:
+        if self.stored is not None:
+            take(sample_of(self.stored))
+
+    def send(self, linear: float, angular: float = 0.0) -> None:
+        self.sent.append(linear)
+
+
+def sample_of(state: RobotState) -> Any:
+    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
+    return SimpleNamespace(encoding="application/json", payload=payload)
+
+
+class Drive:
+    """A ride with a clock that the test sets."""
+
+    def __init__(self, robot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(keyboard, "time", SimpleNamespace(monotonic=lambda: self.now))
+        self.ride = Ride(robot, Keyboard(0.5, 2.0), "acsar", "tcp/127.0.0.1:7448")
+
+    def step(self, typed: str = "", times: int = 1) -> None:
+        for _ in range(times):
+            self.ride.step(typed)
+            self.now += 0.05
+
+
+def test_only_a_drive_after_a_silence_is_led_by_a_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step(times=20)
+    assert robot.sent == [0.0] * ZEROS
+    robot.sent.clear()
+    drive.step("i", times=3)
+    assert robot.sent == [0.0, 0.5, 0.5]
+    drive.step("m")
+    assert robot.sent[-1] == -0.5
+
+
+def test_the_last_commands_are_zeros_and_then_nothing_is_sent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step("i")
+    drive.step(times=40)
+    assert robot.sent[-ZEROS - 1 :] == [0.5] + [0.0] * ZEROS
+    sent = len(robot.sent)
+    drive.step(times=100)
+    assert len(robot.sent) == sent
+    drive.ride.end()
+    assert robot.sent[sent:] == [0.0] * ZEROS
+
+
+def test_a_space_stops_at_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot()
+    drive = Drive(robot, monkeypatch)
+    drive.step("i", times=5)
+    drive.step(" ")
+    assert robot.sent[-2:] == [0.5, 0.0]
+
+
+def test_the_operator_is_told_that_a_robot_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot(STATE)
+    drive = Drive(robot, monkeypatch)
+    drive.step("i")
+    assert not drive.ride.seen().silent
+    drive.now += SILENT_S
+    assert drive.ride.seen().silent
+
+
+def test_the_operator_is_told_why_keys_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    stopped = replace(STATE, mode="stopped", reason="stopped by request", source="")
+    robot = Robot(stopped)
+    drive = Drive(robot, monkeypatch)
+    drive.step(times=10)
+    drive.step("i", times=round(GRACE_S / 0.05))
+    assert drive.ride.seen().objection == ""
+    drive.step("i", times=3)
+    assert drive.ride.seen().objection == "stopped by request"
+
+
+def heard_after(robot: Any, seconds: float, monkeypatch: pytest.MonkeyPatch) -> float:
+    """Return the age of the state that is displayed after this many seconds, s."""
+    drive = Drive(robot, monkeypatch)
+    while drive.now < 100.0 + seconds:
+        drive.ride.take()
+        drive.now += 0.05
+    return drive.ride.seen().age
+
+
+@pytest.mark.parametrize("said", [(STATE,), ()], ids=["it died on the way", "it is long dead"])
+def test_what_a_storage_still_has_of_a_dead_robot_is_no_news(
+    said: tuple[RobotState, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot(*said)
+    robot.stored = STATE
+    assert heard_after(robot, 10 * ASK_S, monkeypatch) == pytest.approx(10 * ASK_S, abs=0.11)
+
+
+def test_the_answers_of_a_robot_that_publishes_seldom_are_news(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Alive(Robot):
+        def ask(self, name: str, take: Any) -> None:
+            before = self.stored or STATE
+            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
+            super().ask(name, take)
+
+    assert heard_after(Alive(), 10 * ASK_S, monkeypatch) < 2 * ASK_S
+
+
+def test_so_are_they_when_its_clock_was_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    class SetBack(Robot):
+        def ask(self, name: str, take: Any) -> None:
+            before = self.stored or replace(STATE, stamp=Time(1))
+            self.stored = replace(before, stamp=Time(before.stamp.sec + 1))
+            super().ask(name, take)
+
+    said = replace(STATE, stamp=Time(10**6))
+    assert heard_after(SetBack(said), 10 * ASK_S, monkeypatch) < 2 * ASK_S
