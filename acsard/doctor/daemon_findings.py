@@ -13,6 +13,7 @@ from acsard.config.settings import Config
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, answers, asked
 from acsard.drive.gyro import WORDS
+from acsard.formatting import many
 from acsard.host.errors import NoAnswerError
 from acsard.mcu.whose_silence import BUSY, is_ours
 from acsard.messages.diagnostics import NO_ROUTER
@@ -48,7 +49,8 @@ def link(running: Running) -> Iterator[Finding]:
     often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
     # The built-in simulator is late whenever the daemon is, and it is never unplugged.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_late'}", 0):
-        text = f"lost {late} times since the daemon's start because this computer did not run"
+        late_times = many(late, "time")
+        text = f"lost {late_times} since the daemon's start because this computer did not run"
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
     problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
     for text in problems:
@@ -90,8 +92,8 @@ def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return the number of lost links that this computer did not cause, with a description."""
     times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
     text = (
-        f"it was lost {times} times since the daemon's start: the board starts anew, is silent "
-        "at times or was unplugged; the log says when (link_stale, link_down)"
+        f"it was lost {many(times, 'time')} since the daemon's start: the board starts anew, is "
+        "silent at times or was unplugged; the log says when (link_stale, link_down)"
     )
     return [(times, text)] if times > 0 else []
 
