@@ -13,9 +13,8 @@ import zenoh
 
 from acsard.asking.attendant import Attendant
 from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.calibration.guided.recorder import Recorder
-from acsard.calibration.guided.riding import Riding
-from acsard.calibration.guided.steps import GuideError, Leg
+from acsard.calibration.guided.legs import GuideError, Leg
+from acsard.calibration.guided.riding import Recorder, Riding
 from acsard.calibration.runs import Run
 from acsard.client import Client
 from acsard.client.driving import SEND_PERIOD_S

@@ -19,9 +19,8 @@ import pytest
 import zenoh
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration.guided.recorder import Recorder, Sample
-from acsard.calibration.guided.riding import HELD_UP
-from acsard.calibration.guided.steps import Ask, GuideError
+from acsard.calibration.guided.legs import Ask, GuideError
+from acsard.calibration.guided.riding import HELD_UP, Recorder, Sample
 from acsard.cli import calibrate_robot
 from acsard.cli.calibrate_robot import POSITIONS, Sensor
 from acsard.config.parsing import parse

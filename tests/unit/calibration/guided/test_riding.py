@@ -7,8 +7,8 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
+from acsard.calibration.guided.legs import Leg, Move
 from acsard.calibration.guided.riding import HELD_UP, OPENED_S, SILENT_S, Phase, Riding
-from acsard.calibration.guided.steps import Leg, Move
 from acsard.config.settings import DriveConfig
 from acsard.messages.schema import RobotState, SourceState, Time
 from acsard.values import REST, Twist

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.error_budget.budget import Basis, Budget, Cause, Share
-from acsard.error_budget.text import WIDTH, advice, text
+from acsard.error_budget.budget_report import WIDTH, advice, text
 
 DRIVEN = Budget(
     10.0, 4.0, 400.0, 1000, 3, 0.25, 0.004, 0.01, 0, gyro=False, still=False,
