@@ -16,7 +16,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Self
 
 from acsard.host.errors import Exit, ExitError
-from acsard.host.terminal import coloured
+from acsard.host.terminal_modes import coloured
 
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, by_environment, require_one
 from acsard.host.config_file import find
-from acsard.host.terminal import coloured
+from acsard.host.terminal_modes import coloured
 
 if TYPE_CHECKING:
     from acsard.doctor.finding import Finding

@@ -22,7 +22,7 @@ from typing import Any, Literal, TextIO
 import structlog
 
 from acsard.config.settings import LogConfig
-from acsard.host.terminal import coloured
+from acsard.host.terminal_modes import coloured
 from acsard.values import Event, EventName
 
 SOCKET = "/run/systemd/journal/socket"
