@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Protocol
 
-from acsard.calibration.guided.steps import Ask, GuideError
+from acsard.calibration.guided.legs import Ask, GuideError
 
 COLUMNS = 88
 BAR = 30
@@ -134,7 +134,7 @@ class Person:
 @contextmanager
 def attending() -> Iterator[Person]:
     """Yield a terminal prompt that reads single keys, and restore the terminal at the end."""
-    from acsard.host.terminal import one_by_one
+    from acsard.host.terminal_modes import one_by_one
 
     with one_by_one():
         yield Person()

@@ -23,7 +23,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.asking.attendant import number_of
-from acsard.calibration.guided.steps import Ask
+from acsard.calibration.guided.legs import Ask
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
 from acsard.web.lines import Doing, Found, Progress, Question, Result, Subject, Told

@@ -1,6 +1,6 @@
 """Explains why no sample arrives on a key.
 
-Pure: `fleet.around` looks and this module interprets.
+Pure: `robot_discovery.around` looks and this module interprets.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import zenoh
 from acsard.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble
 from acsard.config.settings import TLS, BusConfig
 from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
-from acsard.host.terminal import coloured
+from acsard.host.terminal_modes import coloured
 from acsard.messages.topics import full_key, source_keys
 
 COMMAND_RATE_HZ = 1000.0

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base
+from acsard.calibration.log_table import Floats
 from acsard.calibration.search import Begin
-from acsard.calibration.table import Floats
 from acsard.values import AcsardError
 
 UNLIKE = 0.5

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
+from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Complexes
-from acsard.calibration.table import Floats
 
 LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE, DRIFT, STRETCH = range(9)
 COUNT = 9

@@ -13,13 +13,11 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.evidence import RATE, TURN, Base
-from acsard.calibration.fit import Fit
-from acsard.calibration.heading import Rows
-from acsard.calibration.multipliers import TURNING, Rates
+from acsard.calibration.fit import TURNING, Fit, Rates
+from acsard.calibration.heading import Rows, turned
+from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import Block
 from acsard.calibration.places import Grid, Spots, path, spread
-from acsard.calibration.table import Floats
-from acsard.calibration.turning import turned
 
 FOLDS = 5
 LEAST_RUNS = 3

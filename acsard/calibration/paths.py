@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
+from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Run
-from acsard.calibration.table import Floats
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
 """Distance of samples, in s and in usual periods, above both of which there is a gap.

@@ -24,9 +24,9 @@ from acsard.calibration.evidence import (
     Evidence,
     huber,
 )  # fmt: skip
+from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import Block, Wheels, cumulative
 from acsard.calibration.runs import Complexes, Run
-from acsard.calibration.table import Floats
 
 LEAST_POINTS = 5
 """Smallest number of positions in a block, which has three unknowns: shift (two) and rotation."""

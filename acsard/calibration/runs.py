@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.table import FOUR, TWO, Floats, LogError, Table
+from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table
 from acsard.formatting import many
 
 Complexes = npt.NDArray[np.complex128]

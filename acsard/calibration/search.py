@@ -19,10 +19,10 @@ from msgspec.structs import replace
 from acsard.calibration import places
 from acsard.calibration.evidence import LATE, LEFT, RIGHT, TURN, Base, Evidence
 from acsard.calibration.fit import fit
+from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import Wheels
 from acsard.calibration.places import Grid, Spots, grid, place
 from acsard.calibration.runs import Run
-from acsard.calibration.table import Floats
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
 """Ratios of configured to true track that are tried. They are finer in the usual range.

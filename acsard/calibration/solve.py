@@ -9,28 +9,35 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import fit as fitting
-from acsard.calibration import heading, places, turning
+from acsard.calibration import heading, places
 from acsard.calibration.doubts import RefusedError, UnlikeError, in_range, remarks
 from acsard.calibration.evidence import DRIFT, LATE, LEFT, RATE, RIGHT, STRETCH, TURN, Base
-from acsard.calibration.excitation import DRIVE, sure_enough, told_apart, turns_enough
-from acsard.calibration.fit import Fit, fit
-from acsard.calibration.gain import Gain, gain, seen_by_places
-from acsard.calibration.heading import Headings
-from acsard.calibration.multipliers import (
+from acsard.calibration.fit import (
     LEFT_RADIUS,
     RIGHT_RADIUS,
     SEPARATION,
+    Fit,
     Multipliers,
     Rates,
     configured,
+    fit,
     found,
     rates,
 )  # fmt: skip
+from acsard.calibration.gain import Gain, gain, seen_by_places
+from acsard.calibration.heading import Headings
+from acsard.calibration.log_table import Floats, noted
 from acsard.calibration.paths import Wheels, wheels
-from acsard.calibration.prepared import Prepared, prepared
+from acsard.calibration.prepared import (
+    DRIVE,
+    Prepared,
+    prepared,
+    sure_enough,
+    told_apart,
+    turns_enough,
+)
 from acsard.calibration.runs import Log, Run
-from acsard.calibration.table import Floats, noted
-from acsard.calibration.tape import Follow, Tape, Way, scaled
+from acsard.calibration.tape_distance import Follow, Tape, Way, scaled
 from acsard.config.settings import DriveConfig
 from acsard.values import AcsardError
 
@@ -132,11 +139,11 @@ def _calibration(
     if not fitted.converged:
         raise RefusedError(f"the search for the parameters does not settle: {DRIVE}")
     told_apart(fitted.apart())
-    by_wheels = turning.turned(rows, base, fitted.parameters)
+    by_wheels = heading.turned(rows, base, fitted.parameters)
     bias = headings.bias if headings is not None else 0.0
     drift, scale_of_gyro = float(fitted.parameters[DRIFT]), 1 + float(fitted.parameters[STRETCH])
     if headings is not None and headings.drifts:
-        drift = turning.bias(rows, by_wheels * scale_of_gyro)
+        drift = heading.bias(rows, by_wheels * scale_of_gyro)
     bias += drift
     rows = replace(rows, turned=(rows.turned - drift * rows.seconds) / scale_of_gyro)
     rate, truth = rates(rows, by_wheels), rows.turned
@@ -189,7 +196,7 @@ def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base
     """Yield a sentence for each source that agrees too well with the wheels for a true sensor."""
     rows = made.rows
     if headings is not None:
-        off = rows.turned - turning.turned(rows, base, fitted.parameters)
+        off = rows.turned - heading.turned(rows, base, fitted.parameters)
         off -= np.median(off / rows.seconds) * rows.seconds
         if float(off @ off) < PERFECT**2 * float(rows.turned @ rows.turned):
             yield _own(headings.source)

@@ -19,7 +19,7 @@ from acsard.host.errors import Exit, ExitError, UsageError
 if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonAttendant
     from acsard.calibration.solve import Calibration
-    from acsard.calibration.tape import Tape
+    from acsard.calibration.tape_distance import Tape
     from acsard.config.settings import DriveConfig
 
 DESCRIPTION = """\
@@ -88,10 +88,10 @@ def main(args: argparse.Namespace) -> int:
 def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
     import msgspec
 
+    from acsard.calibration.calibration_report import Refusal, keys, parts, report
     from acsard.calibration.doubts import RefusedError
-    from acsard.calibration.guided.steps import GuideError
-    from acsard.calibration.report import Refusal, keys, parts, report
-    from acsard.calibration.table import LogError
+    from acsard.calibration.guided.legs import GuideError
+    from acsard.calibration.log_table import LogError
     from acsard.terminal.output import SENTENCES, plain, show
 
     where, mine = load(args.config)
@@ -149,9 +149,9 @@ def _no_log(args: argparse.Namespace) -> argparse.Namespace:
 
 
 def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
+    from acsard.calibration.log_table import AS_CSV, LogError, noted, read
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
-    from acsard.calibration.table import AS_CSV, LogError, noted, read
     from acsard.record.walk import MAGIC
 
     if log.is_dir():
@@ -180,7 +180,7 @@ def _measured(log: Path) -> bytes:
 
     Raises `LogError` if the file is not a recording or if the recording has no gyro.
     """
-    from acsard.calibration.table import AS_CSV, LogError
+    from acsard.calibration.log_table import AS_CSV, LogError
     from acsard.host.errors import RecordingError
     from acsard.record.export import measured
     from acsard.record.file import Recording
@@ -196,7 +196,7 @@ def _measured(log: Path) -> bytes:
 
 
 def _distance(text: str) -> Tape:
-    from acsard.calibration.tape import Tape
+    from acsard.calibration.tape_distance import Tape
 
     run, _, metres = text.rpartition("=")
     try:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from acsard.asking.attendant import Attendant
     from acsard.asking.json_lines import JsonAttendant
-    from acsard.calibration.guided.setup import Setup
+    from acsard.calibration.guided.legs import Setup
     from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
@@ -70,8 +70,7 @@ def guided(
     `RefusedError`.
     """
     from acsard.bus.address import address_of
-    from acsard.calibration.guided.setup import setup
-    from acsard.calibration.guided.steps import GuideError
+    from acsard.calibration.guided.legs import GuideError, setup
     from acsard.calibration.guided.ways import KINDS
     from acsard.cli.common import require_one
     from acsard.client import connect
@@ -142,7 +141,7 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
     """
     import msgspec
 
-    from acsard.calibration.guided.steps import GuideError
+    from acsard.calibration.guided.legs import GuideError
     from acsard.config.settings import Config
 
     config = msgspec.convert(client.get("config"), Config)
@@ -208,7 +207,7 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
 
 
 def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Calibration:
-    from acsard.calibration.guided.steps import Leg
+    from acsard.calibration.guided.legs import Leg
 
     attendant.say(
         f"Calibration with {kind.needs}. {kind.told(made)} Stay beside the robot: any key stops it "

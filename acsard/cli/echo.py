@@ -167,7 +167,7 @@ def _record(
     import time
 
     from acsard.bus.subscription import encoded
-    from acsard.calibration.recorded import HEADER, KEYS, row
+    from acsard.calibration.log_table import HEADER, KEYS, row
     from acsard.host import clock
     from acsard.messages.encodings import Decoder
     from acsard.messages.schema import MESSAGES

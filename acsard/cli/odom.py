@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from acsard.client import Client, Subscription
     from acsard.config.settings import Config
     from acsard.error_budget.budget import Budget
-    from acsard.error_budget.feed import Feed
+    from acsard.error_budget.daemon_messages import Feed
 
 DESCRIPTION = """\
 Follow the robot while somebody drives it, and tell how much each cause alone makes its odometry
@@ -53,7 +53,7 @@ def main(args: argparse.Namespace) -> int:
     """Follow the robot and print its error budget."""
     from acsard.client import connect
     from acsard.error_budget.budget import budget
-    from acsard.error_budget.feed import KEYS, Feed
+    from acsard.error_budget.daemon_messages import KEYS, Feed
 
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -143,7 +143,7 @@ def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None
 def _print(found: Budget, as_json: bool) -> None:
     import msgspec
 
-    from acsard.error_budget.text import advice, parts
+    from acsard.error_budget.budget_report import advice, parts
     from acsard.terminal.output import SENTENCES, show
 
     if not as_json:

@@ -12,12 +12,11 @@ from typing import Any, Protocol
 import zenoh
 
 from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.calibration.guided.recorder import Recorder
-from acsard.calibration.guided.steps import GuideError, Leg
+from acsard.calibration.guided.legs import GuideError, Leg
 from acsard.calibration.runs import Run
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S
-from acsard.client.riding import Riding
+from acsard.client.riding import Recorder, Riding
 from acsard.client.synchronous import Client
 from acsard.config.settings import Config
 from acsard.messages.encodings import DecodeError, Decoder

@@ -26,8 +26,7 @@ from acsard.drive.path import Path
 from acsard.drive.twist_uncertainty import DECIMAL, TwistUncertainty
 from acsard.drive.uncertainty import GYRO_SCALE, PoseUncertainty
 from acsard.error_budget.drive_log import Line, Motion, motion
-from acsard.error_budget.rounding import rounding
-from acsard.error_budget.steps import Driving, Step, mirrored
+from acsard.error_budget.step_errors import Driving, Step, mirrored, rounding
 from acsard.values import REST
 
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]

@@ -21,7 +21,7 @@ from typing import Any, Literal, TextIO
 
 from acsard.config.settings import LogConfig
 from acsard.formatting import printable
-from acsard.host.terminal import coloured
+from acsard.host.terminal_modes import coloured
 from acsard.values import Event, EventName
 
 # structlog imports rich to draw tracebacks, and the log has none. The daemon's modules take 39 MB

@@ -27,7 +27,7 @@ CLOSE_S = 1.0
 
 
 class BlockingPort:
-    """One serial device that implements `checkup.outside.Wire`. The first `open` opens it."""
+    """One serial device that implements `checkup.board.Wire`. The first `open` opens it."""
 
     def __init__(self, path: str) -> None:
         self._path = path

@@ -1,6 +1,6 @@
 """A serial line to the simulated board in virtual time: no clock runs and waiting costs nothing.
 
-It implements the line that `acsard mcu check` uses (`checkup.outside.Wire`). A wrong baud rate
+It implements the line that `acsard mcu check` uses (`checkup.board.Wire`). A wrong baud rate
 garbles both directions.
 """
 

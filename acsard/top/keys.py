@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from acsard.host.terminal import one_by_one
+from acsard.host.terminal_modes import one_by_one
 
 LEAVES = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

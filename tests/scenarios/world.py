@@ -179,7 +179,7 @@ class World:
         self.steps = 0
         self._alarm_ns: int | None = None
         self._alarm_set_ns: int | None = None
-        """As `runtime.ticker.Alarm` keeps them: when it rings, what it was last set to."""
+        """As `runtime.wakeup.Alarm` keeps them: when it rings, what it was last set to."""
         self._missed = 0
 
     def _see(self, sight: Sight) -> None:

@@ -19,11 +19,10 @@ import pytest
 import zenoh
 
 from acsard.bus.zenoh_sessions import client_session
-from acsard.calibration.guided.recorder import Recorder, Sample
-from acsard.calibration.guided.steps import Ask, GuideError
+from acsard.calibration.guided.legs import Ask, GuideError
 from acsard.client import legs
 from acsard.client.legs import POSITIONS, Sensor
-from acsard.client.riding import HELD_UP
+from acsard.client.riding import HELD_UP, Recorder, Sample
 from acsard.config.parsing import parse
 from acsard.config.settings import JointsConfig
 from acsard.mcu.whose_silence import is_ours

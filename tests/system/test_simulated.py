@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from acsard.calibration.log_table import read
 from acsard.calibration.runs import runs
-from acsard.calibration.table import read
 from acsard.messages.encodings import encode
 from acsard.messages.schema import Header, Imu, Quaternion, Vector3
 from acsard.ros.attachments import Attachment

@@ -6,13 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from acsard.calibration import heading, turning
+from acsard.calibration import heading
 from acsard.calibration.doubts import RefusedError, remarks
 from acsard.calibration.evidence import RATE, TURN, Base
-from acsard.calibration.gain import Error, Gain
-from acsard.calibration.gain import constant as with_one_track
-from acsard.calibration.guided.readings import Found, Reading, found, joined, predicted
-from acsard.calibration.multipliers import (
+from acsard.calibration.fit import (
     LEFT_RADIUS,
     RIGHT_RADIUS,
     Rates,
@@ -20,9 +17,12 @@ from acsard.calibration.multipliers import (
     constant,
     rates,
 )  # fmt: skip
+from acsard.calibration.gain import Error, Gain
+from acsard.calibration.gain import constant as with_one_track
+from acsard.calibration.guided.readings import Found, Reading, found, joined, predicted
+from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import blocks, wheels
 from acsard.calibration.solve import Calibration, Drives
-from acsard.calibration.table import Floats
 from acsard.config.settings import DriveConfig
 
 BLOCK_S = 4.0
@@ -47,7 +47,7 @@ def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Cal
     told = found(readings, base)
     angles = [wheels(ride) for ride in rides]
     rows = heading.rows(None, rides, angles, blocks(rides, angles, BLOCK_S))
-    by_wheels = turning.turned(rows, base, told.parameters)
+    by_wheels = heading.turned(rows, base, told.parameters)
     rate = rates(rows, by_wheels)
     result = constant(told.parameters, told.covariance, rate, 0.0)
     _sure(told)

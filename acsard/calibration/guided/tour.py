@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from acsard.calibration.guided.setup import ROOM, Setup
-from acsard.calibration.guided.steps import Leg, Move, Way, ask, ride
+from acsard.calibration.guided.legs import ROOM, Leg, Move, Setup, Way, ask, ride
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import calibrate
-from acsard.calibration.tape import LEAST_M, Tape
+from acsard.calibration.tape_distance import LEAST_M, Tape
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
 """Rates of turns and curves as they would be without skidding, rad/s."""

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import math
 
+from acsard.calibration.guided.legs import EDGE, ROOM, Leg, Move, Part, Setup, Way, ask, ride
 from acsard.calibration.guided.measured import calibrated
-from acsard.calibration.guided.readings import Reading
-from acsard.calibration.guided.setup import EDGE, ROOM, Setup
-from acsard.calibration.guided.spins import (
+from acsard.calibration.guided.readings import (
+    Reading,
     deviation,
     effective,
     millimetres,
     once_round,
     slant,
 )  # fmt: skip
-from acsard.calibration.guided.steps import Leg, Move, Part, Way, ask, ride
 from acsard.calibration.runs import Run
-from acsard.calibration.tape import LEAST_M
+from acsard.calibration.tape_distance import LEAST_M
 
 SIDE_M = 1.2
 TURN = 0.9

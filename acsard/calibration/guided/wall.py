@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
+from acsard.calibration.guided.legs import ROOM, Leg, Move, Part, Setup, Way, ask, ride
 from acsard.calibration.guided.measured import calibrated
-from acsard.calibration.guided.readings import Reading
-from acsard.calibration.guided.setup import ROOM, Setup
-from acsard.calibration.guided.spins import (
+from acsard.calibration.guided.readings import (
+    Reading,
     deviation,
     effective,
     millimetres,
@@ -15,8 +15,7 @@ from acsard.calibration.guided.spins import (
     slant,
     turns,
 )  # fmt: skip
-from acsard.calibration.guided.steps import Leg, Move, Part, Way, ask, ride
-from acsard.calibration.tape import LEAST_M
+from acsard.calibration.tape_distance import LEAST_M
 
 TAPE_M = 0.005
 GAP_M = 0.2

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from msgspec import Struct
 
 from acsard.calibration.guided import tape, tour, umbmark, wall
+from acsard.calibration.guided.legs import WIDEST, Setup, Way
 from acsard.calibration.guided.needs import NEEDS
-from acsard.calibration.guided.setup import WIDEST, Setup
-from acsard.calibration.guided.steps import Way
 
 TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
 """Ratios of effective to geometric track for which the driving time is computed.

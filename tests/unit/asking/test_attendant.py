@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from acsard.asking.attendant import Nobody, Person, attending
-from acsard.calibration.guided.steps import Ask, GuideError
+from acsard.calibration.guided.legs import Ask, GuideError
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)

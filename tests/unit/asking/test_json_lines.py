@@ -18,7 +18,7 @@ import pytest
 from acsard.asking import json_lines
 from acsard.asking.attendant import interrupted_by
 from acsard.asking.json_lines import LINE_BYTES, JsonAttendant, JsonLines, JsonPerson
-from acsard.calibration.guided.steps import Ask
+from acsard.calibration.guided.legs import Ask
 from acsard.checkup.findings import Finding
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)

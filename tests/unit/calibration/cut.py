@@ -10,9 +10,9 @@ from acsard.calibration import paths, prepared, solve
 from acsard.calibration import runs as reading
 from acsard.calibration.evidence import Base
 from acsard.calibration.heading import of_gyro
+from acsard.calibration.log_table import read
 from acsard.calibration.prepared import Prepared
-from acsard.calibration.table import read
-from acsard.calibration.tape import Tape
+from acsard.calibration.tape_distance import Tape
 from acsard.config.settings import DriveConfig
 from tests.unit.calibration.robots import GUIDED, Drive, Plan, Robot, drive
 

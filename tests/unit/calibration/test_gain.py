@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.fit import fit
+from acsard.calibration.fit import Rates, fit
 from acsard.calibration.gain import constant, folds, gain, seen_by_places
-from acsard.calibration.multipliers import Rates
 from tests.unit.calibration.cut import BASE, ideal, ready
 from tests.unit.calibration.robots import GUIDED
 

@@ -1,4 +1,4 @@
-"""Tests of the gyro's bias and delay and of the rows that follow from them."""
+"""Tests of the gyro's bias and delay, of the rows that follow from them, and of their evidence."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from acsard.calibration import heading
+from acsard.calibration.evidence import AHEAD, ASIDE, COUNT, LATE, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
+from acsard.calibration.log_table import LogError
 from acsard.calibration.paths import blocks, wheels
-from acsard.calibration.table import LogError
-from tests.unit.calibration.cut import log_of, usual
+from tests.unit.calibration.cut import BASE, ideal, log_of, ready, usual
 from tests.unit.calibration.robots import GUIDED, Drive, wander
 
 
@@ -108,3 +110,34 @@ def test_degrees_are_told_from_radians(wrapped: bool) -> None:
     runs = log_of("t,left,right,yaw\n" + "\n".join(lines)).runs
     with pytest.raises(LogError, match="degrees"):
         of_yaw(runs, [wheels(run) for run in runs], 0.05 / 0.3)
+
+
+AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])
+
+
+def test_least_squares_find_both_sides_whatever_their_sign() -> None:
+    rows = ready(ideal().csv(places=False)).rows
+    left, right = heading.first(rows, BASE)
+    assert left == pytest.approx(0.998 / 1.6, rel=1e-3)
+    assert right == pytest.approx(1.002 / 1.6, rel=1e-3)
+    assert np.allclose(
+        heading.by_sides(rows, BASE, np.array([left, right])), rows.turned, atol=0.01
+    )
+
+
+def test_slopes_are_those_of_what_the_wheels_say() -> None:
+    rows = ready(ideal().csv(places=False)).rows
+    step = 1e-6
+    score = heading.evidence(rows, BASE, AT, len(rows.turned)).score.sum(axis=0)
+    for index in range(4):
+        more = AT.copy()
+        more[index] += step
+        slope = (heading.turned(rows, BASE, more) - heading.turned(rows, BASE, AT)) / step
+        residual = rows.turned - heading.turned(rows, BASE, AT)
+        usual = np.hypot(
+            heading.NOISE * rows.seconds, heading.SHARE * heading.turned(rows, BASE, AT)
+        )
+        weight = huber(residual / usual, 1.0)
+        # The other parameters also change the rate term, but only to second order.
+        assert score[index] == pytest.approx(float(slope @ (weight * residual)), rel=0.15)
+    assert not score[[LATE, AHEAD, ASIDE]].any()

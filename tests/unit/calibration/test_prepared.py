@@ -1,4 +1,4 @@
-"""Tests that prepare a log: it is cut, and the fit starts from nearly right values."""
+"""Tests that prepare a log: it is cut, it must have enough movement, and the fit starts near."""
 
 from __future__ import annotations
 
@@ -9,6 +9,17 @@ import pytest
 
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.evidence import LEFT, RIGHT, TURN
+from acsard.calibration.fit import Multipliers
+from acsard.calibration.heading import Rows
+from acsard.calibration.paths import Block
+from acsard.calibration.prepared import (
+    DRIVE,
+    drives_enough,
+    rolls_enough,
+    sure_enough,
+    told_apart,
+    turns_enough,
+)  # fmt: skip
 from tests.unit.calibration.cut import ready, usual
 
 
@@ -25,3 +36,45 @@ def test_sensors_of_another_time_are_refused() -> None:
     other = replace(drive, place_t=drive.place_t + 1000.0, gyro=np.zeros(0), gyro_t=np.zeros(0))
     with pytest.raises(RefusedError, match="one clock"):
         ready(other.csv(gyro=False))
+
+
+def rows(left: list[float], right: list[float]) -> Rows:
+    one = np.ones(len(left))
+    return Rows(one.astype(np.int64), one, np.array(left), np.array(right), one, one)
+
+
+def test_turns_and_straight_drives_are_enough() -> None:
+    rolls_enough(rows([9, -9, 9, -9], [9, -9, -9, 9]))
+    turns_enough(np.full(10, 1.0))
+    drives_enough([Block(0, 0, 4)] * 5)
+    told_apart(np.eye(3))
+    sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [([9, 9, 9], [9, 9, 9]), ([9, -9, 9], [-9, 9, -9]), ([5, 5, 5], [15, 15, 15])],
+)
+def test_one_movement_only_is_refused_with_what_to_drive(
+    left: list[float], right: list[float]
+) -> None:
+    with pytest.raises(RefusedError) as refused:
+        rolls_enough(rows(left, right))
+    assert DRIVE in str(refused.value)
+
+
+def test_little_of_it_is_refused() -> None:
+    with pytest.raises(RefusedError, match="57 deg"):
+        turns_enough(np.array([0.5, -0.5]))
+    with pytest.raises(RefusedError, match="8 s only"):
+        drives_enough([Block(0, 0, 4)] * 2)
+
+
+def test_what_comes_out_of_no_use_is_refused() -> None:
+    unsure = Multipliers(np.array([1.6, 1, 1]), np.diag([0, 1e-3, 1e-3]))
+    with pytest.raises(RefusedError, match="left to right"):
+        sure_enough(unsure, 0.01)
+    with pytest.raises(RefusedError, match="effective track"):
+        sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
+    with pytest.raises(RefusedError, match="told apart"):
+        told_apart(np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]]))

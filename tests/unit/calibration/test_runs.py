@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acsard.calibration.log_table import LogError, read
 from acsard.calibration.runs import runs
-from acsard.calibration.table import LogError, read
 
 HEADER = "t,left,right,yaw_rate,run\n"
 

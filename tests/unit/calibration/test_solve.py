@@ -14,7 +14,7 @@ import pytest
 
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.solve import Calibration
-from acsard.calibration.tape import Tape
+from acsard.calibration.tape_distance import Tape
 from tests.unit.calibration.cut import calibrated, usual
 from tests.unit.calibration.robots import (
     GUIDED,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
-from acsard.calibration.guided.steps import Leg, Move
+from acsard.calibration.guided.legs import Leg, Move
 from acsard.client.commander import OPENED_S
 from acsard.client.follower import QUIET_S
 from acsard.client.riding import HELD_UP, Phase, Riding

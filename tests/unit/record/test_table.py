@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.table import read
+from acsard.calibration.log_table import read
 from acsard.config.settings import Config
 from acsard.record.replay import lived
 from acsard.record.table import HEADER, MEASURED_HEADER, measured, rolled, rows, turned

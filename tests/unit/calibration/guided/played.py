@@ -11,11 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from acsard.calibration.guided.setup import Setup, setup
-from acsard.calibration.guided.steps import Ask, Leg, Way
+from acsard.calibration.guided.legs import Ask, Leg, Setup, Way, setup
+from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
-from acsard.calibration.table import Table
 from acsard.config.settings import Config
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 

@@ -10,8 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 
 from acsard.calibration.guided import tape, tour, umbmark, wall
-from acsard.calibration.guided.setup import Setup
-from acsard.calibration.guided.steps import Leg
+from acsard.calibration.guided.legs import Leg, Setup
 
 SIDE = 3.0
 STEP_S = 0.05

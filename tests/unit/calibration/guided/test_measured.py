@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.guided.measured import calibrated
 from acsard.calibration.guided.readings import Reading
-from acsard.calibration.report import keys, parts, report
 from acsard.config.parsing import parse
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.calibration.guided import tape
-from acsard.calibration.guided.steps import Ask, GuideError
+from acsard.calibration.guided.legs import Ask, GuideError
 from tests.unit.calibration.guided.played import Player, anyone, play, usual_setup
 from tests.unit.calibration.robots import Robot
 

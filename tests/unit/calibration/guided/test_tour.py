@@ -8,8 +8,8 @@ import pytest
 
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.guided import tour
-from acsard.calibration.guided.steps import Ask
-from acsard.calibration.table import LogError
+from acsard.calibration.guided.legs import Ask
+from acsard.calibration.log_table import LogError
 from tests.unit.calibration.guided.played import Player, anyone, play, usual_setup
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.guided import umbmark
-from acsard.calibration.guided.steps import Ask
+from acsard.calibration.guided.legs import Ask
 from tests.unit.calibration.cut import IDEAL
 from tests.unit.calibration.guided.played import Player, play, usual_setup
 from tests.unit.calibration.robots import SEPARATION, Robot

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.setup import MOST_S, setup
+from acsard.calibration.guided.legs import MOST_S, setup
 from acsard.calibration.guided.ways import KINDS
 from acsard.calibration.solve import Calibration
 from acsard.config.settings import Config, DriveConfig

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.config.settings import Config, McuConfig, RatesConfig
-from acsard.error_budget.feed import Feed
+from acsard.error_budget.daemon_messages import Feed
 from acsard.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.recorder import Recorder, Sample, times
-from acsard.calibration.table import LogError
+from acsard.calibration.log_table import LogError
+from acsard.client.riding import Recorder, Sample, times
 from acsard.config.settings import JointsConfig
 from acsard.messages.schema import (
     Header,

@@ -1,8 +1,11 @@
 """Reads the bytes of a CSV file into columns of numbers and the runs that they belong to.
 
-The header names the columns in any order. A cell may be empty, so that sensors of different rates
-share a file. A row that cannot be read is left out, counted and reported. A file with more than a
-few such rows is refused, since the rest would not be what was recorded.
+The header names the columns in any order, with their units, such as "t [ms]" and "yaw_rate
+(deg/s)". A cell may be empty, so that sensors of different rates share a file. A row that cannot be
+read is left out, counted and reported. A file with more than a few such rows is refused, since the
+rest would not be what was recorded. Impossible values are removed, counted and reported.
+
+`row` makes a line of such a log from a bus message.
 """
 
 from __future__ import annotations
@@ -11,19 +14,115 @@ import csv
 import math
 import re
 from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.calibration.spikes import bounded
-from acsard.calibration.units import SI, factor, parted
 from acsard.config.nearest import nearest
 from acsard.formatting import many, printable
-from acsard.values import AcsardError
+from acsard.messages.schema import Imu, JointState, Message, PoseStamped
+from acsard.values import NS_PER_S, AcsardError
+
+TIME = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+TIME |= {"\N{MICRO SIGN}s": 1e-6, "\N{GREEK SMALL LETTER MU}s": 1e-6}
+LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}
+ANGLE = {"rad": 1.0, "deg": math.radians(1.0), "°": math.radians(1.0), "mrad": 1e-3}
+TURNS = {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
+RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
+
+UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE}
+"""Known units by column, as factors to s, m and rad. All other columns are rates in rad/s."""
+
+SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad"}
+
+_NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
+
+
+def parted(cell: str) -> tuple[str, str]:
+    """Return the name and the unit of a column from a header cell.
+
+    The name is in lower case with "_" between words. The unit stands in brackets and ends at a
+    comma; without brackets it is "".
+    """
+    found = _NAME.match(cell.strip().lower())
+    assert found is not None
+    name = re.sub(r"[\s-]+", "_", found["name"].strip())
+    return name, re.sub(r"[\s^]", "", found["unit"].partition(",")[0])
+
+
+def factor(name: str, unit: str) -> float | None:
+    """Return the factor that converts this unit to SI, or None if the unit is unknown."""
+    known = UNITS.get(name, RATE)
+    return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
+
 
 Floats = npt.NDArray[np.float64]
+
+WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
+
+BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
+PLACE_BOUND = 1e9
+"""Bounds above which a value is impossible (rad/s, s, rad, m).
+
+They are wide enough for degrees and nanoseconds, so that later checks can name the wrong unit.
+"""
+
+RATES = frozenset((*WHEELS, "yaw_rate"))
+SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
+"""Definition of a spike, which is a misread number.
+
+It is more than `SPIKE` times as large as each neighbour and as the usual speed. Of the rates over
+`SLOW` rad/s, all but the fraction `FEW_VALUES` stay below the usual speed. A robot that stands for
+nearly the whole log also turns much faster than that, but never for a single sample.
+"""
+
+
+def bounded(columns: dict[str, Floats]) -> Iterator[str]:
+    """Replace impossible values with NaN in place. Yield a sentence for each column with any."""
+    order = np.argsort(columns["t"], kind="stable")
+    for name, values in columns.items():
+        with np.errstate(invalid="ignore"):
+            wild = np.abs(values) > BOUNDS.get(name, PLACE_BOUND)
+        if name in RATES:
+            wild |= _spikes(np.where(wild, math.nan, values), order)
+        if wild.any():
+            example = float(values[wild][0])
+            values[wild] = math.nan
+            count = int(wild.sum())
+            cells = f"{count} cell{'s' if count > 1 else ''}"
+            yield f"{cells} of {name} left out as impossible, like {example:g}"
+
+
+def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return a mask of the rows that are spikes; `order` sorts the rows by time.
+
+    A spike stands out among its neighbours both in the file and in time. In a shuffled file, or one
+    of several drives, a true turn stands out in only one of them.
+    """
+    sizes = np.abs(values)
+    moving = sizes[sizes > SLOW]
+    if len(moving) < 1 / FEW_VALUES:
+        return np.zeros(len(values), dtype=bool)
+    usual = float(np.quantile(moving, 1 - FEW_VALUES))
+    wild = _alone(sizes, usual)
+    wild[order] &= _alone(sizes[order], usual)
+    return wild
+
+
+def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
+    """Return a mask of the values far above `usual` and above both neighbours.
+
+    Missing values are skipped in the search for a neighbour.
+    """
+    held = np.flatnonzero(np.isfinite(sizes))
+    seen = np.concatenate([[0.0], sizes[held], [0.0]])
+    around = np.maximum(np.maximum(seen[:-2], seen[2:]), usual)
+    found = np.zeros(len(sizes), dtype=bool)
+    found[held[seen[1:-1] > SPIKE * around]] = True
+    return found
+
 
 FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 """Columns of wheel speeds in rad/s: of each wheel, or the mean of each side."""
@@ -297,3 +396,28 @@ class _Reader:
         }
         runs = np.array(self._runs, dtype=np.int64)
         return Table(columns, runs, tuple(self._known), (*notes, *bounded(columns)))
+
+
+HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
+
+KEYS = ("wheel_states", "imu", "sim/pose")
+"""Keys that a log can contain. Wheel speeds are in the order in which they are published."""
+
+
+def row(message: Message, arrived_ns: int) -> str:
+    """Return the row of one message of `KEYS`. Raises `ValueError` for any other message.
+
+    `arrived_ns` is the wall-clock time that a message without a stamp gets.
+    """
+    if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
+        cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]
+    elif isinstance(message, Imu):
+        cells = ["", "", "", "", f"{message.angular_velocity.z:.6g}", "", "", ""]
+    elif isinstance(message, PoseStamped):
+        where, turn = message.pose.position, message.pose.orientation
+        yaw = 2 * math.atan2(turn.z, turn.w)
+        cells = ["", "", "", "", "", f"{where.x:.4f}", f"{where.y:.4f}", f"{yaw:.5f}"]
+    else:
+        raise ValueError(f"{type(message).__name__} is no part of a log")
+    stamp_ns = message.header.stamp.to_ns() or arrived_ns
+    return ",".join([f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S // 1000:06d}", *cells])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from acsard.calibration.report import NAMES, keys, parts, report
+from acsard.calibration.calibration_report import NAMES, keys, parts, report
 from acsard.config.parsing import parse
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt

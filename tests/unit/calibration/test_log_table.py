@@ -1,4 +1,4 @@
-"""Tests of CSV files from other loggers: the rows read, the rows left out, and the refusals."""
+"""Tests of the table of a log: columns, units, spikes, and rows of recorded messages."""
 
 from __future__ import annotations
 
@@ -9,9 +9,32 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.table import LogError, read
+from acsard.calibration.log_table import (
+    HEADER,
+    KEYS,
+    Floats,
+    LogError,
+    bounded,
+    factor,
+    parted,
+    read,
+    row,
+)
+from acsard.messages.schema import (
+    Header,
+    Imu,
+    JointState,
+    Message,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    ServiceReply,
+    Time,
+    Vector3,
+)
+from acsard.messages.topics import by_key
 
-HEADER = b"t,left,right,yaw_rate\n"
+LOG_HEADER = b"t,left,right,yaw_rate\n"
 
 
 def test_columns_may_be_in_any_order_with_spaces_comments_units_and_empty_cells() -> None:
@@ -60,7 +83,7 @@ def test_a_run_may_have_any_sign_in_its_name(name: str, place: str) -> None:
     ],
 )
 def test_a_comment_is_behind_the_numbers_or_a_line_of_its_own(row: str) -> None:
-    table = read(HEADER + row.encode())
+    table = read(LOG_HEADER + row.encode())
     assert table.columns["yaw_rate"].tolist() == [4.0]
     assert not table.notes
 
@@ -72,7 +95,7 @@ def test_a_text_that_is_not_looked_at_may_have_a_number_sign() -> None:
 
 def test_a_number_that_a_sign_spoils_is_none() -> None:
     """C on Windows writes NaN like this. The number before the sign is not a speed."""
-    table = read(HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,--,4\n")
+    table = read(LOG_HEADER + b"1,2,3,4\n2,1.#QNAN,3,4\n3,#N/A,--,4\n")
     assert table.columns["t"].tolist() == [1.0, 3.0]
     assert np.isnan(table.columns["left"][1])
     assert np.isnan(table.columns["right"][1])
@@ -90,7 +113,7 @@ def test_runs_are_told_apart_by_any_name() -> None:
     [
         (b"", "it is empty"),
         (b"# only this\n", "it is empty"),
-        (HEADER, "no rows below the header"),
+        (LOG_HEADER, "no rows below the header"),
         (b"1,2,3,4\n", "line 1 is numbers"),
         (b"t,left,right\n1,2,3\n", "nothing to compare the wheels with"),
         (b"t,fr,fl,rr,yaw_rate\n1,2,3,4,5\n", "no column left, right"),
@@ -98,8 +121,8 @@ def test_runs_are_told_apart_by_any_name() -> None:
         (b"timestamp,left,right,yaw_rate\n1,2,3,4\n", "is timestamp it? rename it t"),
         (b"t left right yaw_rate\n1 2 3 4\n", "without commas"),
         (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left is there twice"),
-        (HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is no number'),
-        (HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
+        (LOG_HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is no number'),
+        (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
         (b"SQLite format 3\0\0\0", "not text"),
     ],
 )
@@ -110,18 +133,18 @@ def test_a_refusal_says_where_and_what(data: bytes, words: str) -> None:
 
 
 def test_few_bad_rows_are_left_out_and_told() -> None:
-    table = read(HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" + b"1,2")
+    table = read(LOG_HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" + b"1,2")
     assert len(table.columns["t"]) == 51
     assert table.notes == ('1 row left out: line 52, column yaw_rate: "x" is no number',)
 
 
 def test_many_bad_rows_refuse_the_file() -> None:
     with pytest.raises(LogError, match="4 of 54 rows"):
-        read(HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" * 4)
+        read(LOG_HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" * 4)
 
 
 def test_what_is_no_measurement_counts_as_missing_and_is_told() -> None:
-    table = read(HEADER + b"1,1e300,inf,nan\n2,1,1,1\n")
+    table = read(LOG_HEADER + b"1,1e300,inf,nan\n2,1,1,1\n")
     assert np.isnan(table.columns["left"][0])
     assert np.isnan(table.columns["right"][0])
     assert len(table.notes) == 2
@@ -198,16 +221,143 @@ def test_what_cannot_be_read_is_told_with_what_to_do(data: bytes, words: str) ->
 
 
 def test_a_unit_that_is_not_known_is_told() -> None:
-    notes = read(HEADER.replace(b"left", b"left (m/s)") + b"1,2,3,4\n").notes
+    notes = read(LOG_HEADER.replace(b"left", b"left (m/s)") + b"1,2,3,4\n").notes
     assert "column left says (m/s)" in notes[0]
 
 
 @given(st.binary(max_size=300), st.integers(0, 100))
 def test_garbage_anywhere_is_refused_or_left_out(garbage: bytes, at: int) -> None:
-    good = HEADER + b"1,2,3,4\n" * 10
+    good = LOG_HEADER + b"1,2,3,4\n" * 10
     try:
         table = read(good[:at] + garbage + good[at:])
     except LogError:
         return
     assert set(table.columns) >= {"t"}
     assert len(table.runs) == len(table.columns["t"])
+
+
+@pytest.mark.parametrize(
+    ("cell", "name", "unit"),
+    [
+        ("t", "t", ""),
+        (" T [ms] ", "t", "ms"),
+        ("Yaw Rate (deg / s)", "yaw_rate", "deg/s"),
+        ("yaw-rate", "yaw_rate", ""),
+        ("left(rpm", "left", "rpm"),
+        ("", "", ""),
+    ],
+)
+def test_a_unit_stands_in_brackets(cell: str, name: str, unit: str) -> None:
+    assert parted(cell) == (name, unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "times"),
+    [
+        ("t", "", 1.0),
+        ("t", "ns", 1e-9),
+        ("x", "cm", 0.01),
+        ("yaw", "deg", math.pi / 180),
+        ("yaw_rate", "degrees/sec", math.pi / 180),
+        ("left", "rpm", math.tau / 60),
+        ("left", "rad/s", 1.0),
+        ("left", "m/s", None),
+        ("t", "rad", None),
+    ],
+)
+def test_a_unit_is_worth_so_much(name: str, unit: str, times: float | None) -> None:
+    assert factor(name, unit) == (None if times is None else pytest.approx(times))
+
+
+def table(count: int = 200) -> dict[str, Floats]:
+    turned = np.arange(count) % 10.0
+    return {
+        "t": np.arange(count) / 10,
+        "left": turned.copy(),
+        "right": turned.copy(),
+        "yaw_rate": np.full(count, 0.1),
+    }
+
+
+def test_a_spike_counts_as_missing_and_a_fast_drive_does_not() -> None:
+    columns = table()
+    columns["left"][70], columns["yaw_rate"][70] = 900.0, -40.0
+    notes = list(bounded(columns))
+    assert np.flatnonzero(np.isnan(columns["left"])).tolist() == [70]
+    assert np.flatnonzero(np.isnan(columns["yaw_rate"])).tolist() == [70]
+    assert not np.isnan(columns["right"]).any()
+    assert notes == [
+        "1 cell of left left out as impossible, like 900",
+        "1 cell of yaw_rate left out as impossible, like -40",
+    ]
+
+
+def test_a_spike_is_found_between_rows_of_other_sensors() -> None:
+    columns = table()
+    columns["yaw_rate"][1::2] = np.nan
+    columns["yaw_rate"][100] = 40.0
+    assert list(bounded(columns)) == ["1 cell of yaw_rate left out as impossible, like 40"]
+
+
+def mostly_standing(rng: np.random.Generator) -> dict[str, Floats]:
+    """Return half an hour at 100 Hz in which the robot turns for 20 s."""
+    t = np.arange(180_000) / 100
+    rate = np.where((t > 900) & (t < 920), 1.0, 0.0) + 0.03 + rng.normal(0, 0.003, len(t))
+    wheels = np.where((t > 900) & (t < 920), 4.8, 0.0)
+    return {"t": t, "left": -wheels, "right": wheels, "yaw_rate": rate}
+
+
+@pytest.mark.parametrize("order", ["as recorded", "shuffled", "beside another drive"])
+def test_the_turns_of_who_mostly_stands_are_no_spikes(order: str) -> None:
+    rng = np.random.default_rng(1)
+    columns = mostly_standing(rng)
+    if order == "shuffled":
+        mixed = rng.permutation(len(columns["t"]))
+        columns = {name: values[mixed] for name, values in columns.items()}
+    elif order == "beside another drive":
+        other = columns | {"yaw_rate": rng.normal(0.03, 0.003, len(columns["t"]))}
+        columns = {name: np.concatenate([columns[name], other[name]]) for name in columns}
+    assert list(bounded(columns)) == []
+
+
+def test_what_is_beyond_all_bounds_is_none_however_long() -> None:
+    columns = table()
+    columns["left"][50:60], columns["t"][3] = np.inf, 1e21
+    assert len(list(bounded(columns))) == 2
+    assert np.isnan(columns["left"][50:60]).all()
+
+
+STAMP = Header(Time(1_700_000_000, 5_250_000))
+WHEELS = JointState(STAMP, velocity=[1.25, -2.5, -2.0, 1.0])
+GYRO = Imu(
+    Header(), Quaternion(), [0.0] * 9, Vector3(z=-0.125), [0.0] * 9, Vector3(), [0.0] * 9
+)  # fmt: skip
+PLACE = PoseStamped(
+    STAMP, Pose(Vector3(1.5, -2.25), Quaternion(z=math.sin(0.5), w=math.cos(0.5)))
+)  # fmt: skip
+
+
+def test_each_message_is_a_row_with_its_own_time() -> None:
+    arrived_ns = 1_700_000_001_500_000_000
+    rows = [row(message, arrived_ns) for message in (WHEELS, GYRO, PLACE)]
+    table = read("\n".join([HEADER, *rows]).encode())
+    nan = math.nan
+    expected = {
+        "t": [1_700_000_000.00525, 1_700_000_001.5, 1_700_000_000.00525],
+        "fr": [1.25, nan, nan], "fl": [-2.5, nan, nan],
+        "rl": [-2.0, nan, nan], "rr": [1.0, nan, nan],
+        "yaw_rate": [nan, -0.125, nan],
+        "x": [nan, nan, 1.5], "y": [nan, nan, -2.25], "yaw": [nan, nan, 1.0],
+    }  # fmt: skip
+    for name, values in expected.items():
+        assert table.columns[name] == pytest.approx(np.array(values), abs=1e-5, nan_ok=True)
+
+
+def test_the_keys_are_of_the_table() -> None:
+    assert all(by_key(key) is not None for key in KEYS)
+
+
+@pytest.mark.parametrize("message", [JointState(), ServiceReply(True, "")])
+def test_what_tells_nothing_of_wheels_or_turns_is_no_row(message: Message) -> None:
+    with pytest.raises(ValueError, match="no part of a log"):
+        row(message, 0)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from msgspec import Struct
 from rich.console import RenderableType
 
-from acsard.calibration.multipliers import SEPARATION
+from acsard.calibration.fit import SEPARATION
 from acsard.calibration.solve import Calibration
 from acsard.config.settings import DriveConfig
 from acsard.config.writing import excerpt

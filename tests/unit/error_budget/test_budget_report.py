@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.error_budget.budget import Basis, Budget, Cause, Share
-from acsard.error_budget.text import advice, parts
+from acsard.error_budget.budget_report import advice, parts
 from acsard.terminal.output import SENTENCES, plain
 
 DRIVEN = Budget(

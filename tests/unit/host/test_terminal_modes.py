@@ -15,7 +15,7 @@ import pytest
 
 from acsard.config.settings import LogConfig
 from acsard.host.logs import Log
-from acsard.host.terminal import coloured, one_by_one
+from acsard.host.terminal_modes import coloured, one_by_one
 from acsard.values import Event
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.bus.links import unreached
+from acsard.bus.bus import unreached
 
 A, B = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:7450"
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from acsard.calibration.doubts import RefusedError
-from acsard.calibration.multipliers import Multipliers
-from acsard.calibration.tape import TAPE_M, Tape, Way, scaled
+from acsard.calibration.fit import Multipliers
+from acsard.calibration.tape_distance import TAPE_M, Tape, Way, scaled
 
 FOUND = Multipliers(np.array([1.6, 1.0, 1.0]), np.diag([0.02, 1e-3, 1e-3]) ** 2)
 NAMES = ("turns", "straight")

@@ -8,8 +8,8 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.calibration.doubts import RefusedError
-from acsard.calibration.multipliers import LEFT_RADIUS, RIGHT_RADIUS, SEPARATION, Multipliers
-from acsard.calibration.table import Floats
+from acsard.calibration.fit import LEFT_RADIUS, RIGHT_RADIUS, SEPARATION, Multipliers
+from acsard.calibration.log_table import Floats
 
 TAPE_M = 0.01
 """Standard deviation of a distance by tape, including where on the robot it was measured, m."""
