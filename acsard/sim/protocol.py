@@ -78,14 +78,16 @@ def latched(line: bytes) -> Command:
     return Command(values)
 
 
+def _plain(text: bytes) -> Command | None:
+    values = _values(text)
+    return None if values is None else Command(dict(enumerate(values)))
+
+
 # A steady robot gets the same speeds again and again.
 @lru_cache(256)
-def _plain(text: bytes) -> Command | None:
+def _values(text: bytes) -> tuple[float, ...] | None:
     match = _LINE.fullmatch(text)
-    if match is None:
-        return None
-    a, b, c, d = match.groups()
-    return Command({0: _value(a), 1: _value(b), 2: _value(c), 3: _value(d)})
+    return None if match is None else tuple(map(_value, match.groups()))
 
 
 def _value(word: bytes) -> float:
