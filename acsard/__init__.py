@@ -42,13 +42,13 @@ and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-impor
     record/        S  the black box: steps <-> MCAP, a ring of files, replay (its core is pure)
     runtime/       S  the control loop, the daemon, the latch file; figures of itself
     door/          S  `acsard door`: where TLS ends, a process of its own
-    client/        S  drive and follow a robot from Python: synchronous, asynchronous; driving is
-                      one drive, and what `state` says becomes of it
+    client/        S  drive and follow a robot from Python: synchronous, asynchronous; follower and
+                      commander hold the rules and the limits for all that follow and command
     report/        P  `acsard log report`: course (what a recording shows), account (words),
                       figures, page
     bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
-    foxglove/      S  `acsard foxglove`, outside too: hand (what of a viewer's messages goes),
-                      drives, relay (what comes), settings, services, bridge (goes round)
+    foxglove/      S  `acsard foxglove`, outside too: drives (what viewers send), relay (what
+                      comes), settings, services, bridge (goes round)
     web/           S  `acsard web`: the robot's page, a process of its own; app has the table of its
                       paths, which admission and openapi follow; a viewer per browser; guide has a
                       check or calibration done, by errands (the command's words)

@@ -168,26 +168,22 @@ def _record(
 
     from acsard.bus.subscription import encoded
     from acsard.calibration.log_table import HEADER, KEYS, row
+    from acsard.client.synchronous import decoder
     from acsard.host import clock
-    from acsard.messages.encodings import Decoder
-    from acsard.messages.schema import MESSAGES
-    from acsard.messages.topics import by_key
 
-    queues = []
     for key in keys:
-        topic = by_key(key)
-        if key not in KEYS or topic is None:
+        if key not in KEYS:
             raise ExitError(Exit.USAGE, f"{key} is no part of a log; --csv takes {', '.join(KEYS)}")
-        queues.append((robot.subscribe(key), Decoder(MESSAGES[topic.type])))
+    queues = [(robot.subscribe(key), decoder(key)) for key in keys]
     print(HEADER, flush=True)
     count, heard_s = 0, time.monotonic()
     try:
         while most is None or count < most:
             if timeout is not None and time.monotonic() - heard_s > timeout:
                 return int(Exit.FAILURE)
-            for queue, decoder in queues:
+            for queue, reader in queues:
                 while (sample := queue.try_recv()) is not None and count != most:
-                    print(row(decoder.decode(*encoded(sample)), clock.now().wall_ns))
+                    print(row(reader.decode(*encoded(sample)), clock.now().wall_ns))
                     count, heard_s = count + 1, time.monotonic()
                     heard()
             time.sleep(0.02)

@@ -117,15 +117,10 @@ def _await_line(robot: Client, lines: Subscription) -> None:
 def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None:
     """Pass all messages of the next `seconds` s to `feed`."""
     from acsard.bus.subscription import encoded
-    from acsard.messages.encodings import DecodeError, Decoder
-    from acsard.messages.schema import MESSAGES
-    from acsard.messages.topics import by_key
+    from acsard.client.synchronous import decoder
+    from acsard.messages.encodings import DecodeError
 
-    decoders = {}
-    for key in queues:
-        topic = by_key(key)
-        assert topic is not None
-        decoders[key] = Decoder(MESSAGES[topic.type])
+    decoders = {key: decoder(key) for key in queues}
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         time.sleep(LOOK_S)

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -346,6 +347,7 @@ def _no_key(name: str) -> UsageError:
     return UsageError(f"{name!r} is not a key; `acsard topics` lists them")
 
 
+@lru_cache(maxsize=64)
 def decoder(name: str) -> Decoder[Any]:
     """Return the decoder of a key's type.
 

@@ -9,6 +9,7 @@ from typing import Protocol
 import zenoh
 
 from acsard.bus.subscription import QUEUED, Subscription, encoded
+from acsard.client.commander import objection
 from acsard.client.follower import Follower
 from acsard.messages.encodings import DecodeError, Decoder
 from acsard.messages.schema import RobotState
@@ -70,6 +71,12 @@ class Watch(Follower):
         except DecodeError:
             self.unreadable += 1
             return None
+
+    def objection(self, source: str, sender: str, now: float) -> str:
+        """Return why commands have no effect, or "" if they have or no state has arrived yet."""
+        if self.silent(now):
+            return "no word from the daemon: is it running?"
+        return "" if self.state is None else objection(self.state, source, sender)
 
     def end(self) -> None:
         """Unsubscribe from `state`."""

@@ -17,7 +17,6 @@ import foxglove
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import objection
 from acsard.client.watch import Watch
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.facts import Facts, learn
@@ -163,13 +162,6 @@ class Bridge:
             with suppress(zenoh.ZError):  # the session is closed: the program is ending
                 self._watch.look(now)
 
-    def _objection(self, watch: Watch, robot: Client, now: float) -> str:
-        if watch.silent(now):
-            return f"no word from the daemon of {self._id}: is it running?"
-        if watch.state is None:
-            return ""
-        return objection(watch.state, robot.source, robot.sender)
-
     def _object(self, driving: dict[int, Client]) -> None:
         """Report to each viewer once why its commands do not drive. Withdraw the report later."""
         now_ns = clock.mono_ns()
@@ -178,7 +170,7 @@ class Bridge:
         for client, told in list(self._objections.items()):
             robot, why = driving.get(client), ""
             if robot is not None and self._watch is not None:
-                why = self._objection(self._watch, robot, now_ns / NS_PER_S)
+                why = self._watch.objection(robot.source, robot.sender, now_ns / NS_PER_S)
             if told.look(why, now_ns):
                 stays = f"drive {client}"
                 if told.told:

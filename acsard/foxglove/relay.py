@@ -16,11 +16,12 @@ import zenoh
 
 from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.client import Client
+from acsard.client.synchronous import decoder
 from acsard.foxglove.facts import Facts, key_of
 from acsard.foxglove.heard import Commanders
 from acsard.foxglove.news import News
-from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import MESSAGES, Events
+from acsard.messages.encodings import DecodeError
+from acsard.messages.schema import Events
 from acsard.messages.topics import by_key
 from acsard.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.ros.shapes import Log
@@ -55,7 +56,6 @@ class Relay:
         self._outs: dict[str, _Out] = {}
         self._followed: dict[str, Subscription] = {}
         self._commanders = Commanders(robot, wake)
-        self._decoders: dict[str, Decoder[msgspec.Struct]] = {}
         self._news = News()
         self.log_topic = ""
         self.unreadable = 0
@@ -146,16 +146,10 @@ class Relay:
         except zenoh.ZError:
             pass  # the session is closed: the program is ending
         found: list[msgspec.Struct] = []
+        reader = decoder(key)
         for sample in held:
             try:
-                found.append(self._message(key, sample))
+                found.append(reader.decode(*encoded(sample)))
             except DecodeError:
                 self.unreadable += 1
         return found
-
-    def _message(self, key: str, sample: zenoh.Sample) -> msgspec.Struct:
-        if key not in self._decoders:
-            topic = by_key(key)
-            assert topic is not None, key
-            self._decoders[key] = Decoder(MESSAGES[topic.type])
-        return self._decoders[key].decode(*encoded(sample))

@@ -156,12 +156,10 @@ class Robots:
             if follower.asks(now) and (asking is None or asking.done()):
                 asking = asyncio.create_task(self._ask_state())
             quiet = follower.silent(now)
-            if quiet and (follower.heard or not self.gone):
-                self.gone = (
-                    f"nothing is heard of the daemon at {self.endpoint}: does it run?"
-                    if not follower.unreadable
-                    else "the daemon's state cannot be read: is it of another version?"
-                )
+            if quiet and follower.unreadable:
+                self.gone = "the daemon's state cannot be read: is it of another version?"
+            elif quiet and (follower.heard or not self.gone):
+                self.gone = f"nothing is heard of the daemon at {self.endpoint}: does it run?"
             elif follower.heard and not quiet and self.gone:
                 self.gone = ""
                 self.ask_anew()

@@ -9,7 +9,7 @@ from typing import Any
 from msgspec.structs import replace
 
 from acsard.bus.subscription import QUEUED
-from acsard.client.follower import ASK_S
+from acsard.client.follower import ASK_S, SILENT_S
 from acsard.client.watch import Watch
 from acsard.messages.encodings import encode
 from acsard.messages.schema import RobotState, Time
@@ -92,6 +92,20 @@ def test_a_flood_does_not_hold_the_caller() -> None:
     robot.queue.extend([UNREADABLE] * (QUEUED + 7))
     watch.look(0.0)
     assert len(robot.queue) == 7
+
+
+def test_commands_have_no_effect_on_a_daemon_that_is_silent_or_objects() -> None:
+    robot = Robot()
+    watch = Watch(robot, 0.0)
+    assert watch.objection("app", STATE.sender, 0.0) == ""
+    robot.queue.append(sample_of(STATE))
+    watch.look(0.0)
+    assert watch.objection("app", STATE.sender, 0.0) == ""
+    assert "no word from the daemon" in watch.objection("app", STATE.sender, SILENT_S + 0.01)
+    stopped = replace(STATE, mode="stopped", reason="stopped by request")
+    robot.queue.append(sample_of(stopped))
+    watch.look(5.0)
+    assert watch.objection("app", STATE.sender, 5.0) == "stopped by request"
 
 
 def test_the_subscription_ends_with_the_watch() -> None:

@@ -1,0 +1,132 @@
+"""The page tells that its robot is silent, by its published states and by its answers."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.bus.address import Address
+from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
+from acsard.messages.encodings import encode
+from acsard.messages.schema import RobotState, Time
+from acsard.values import NS_PER_S
+from acsard.web import robots, streams
+from acsard.web.counts import Counts
+from acsard.web.robots import LOOK_S, About, Robots
+from acsard.web.streams import Stream
+from tests.unit.top.screens import STATE
+
+ABOUT = About("1", False, 1.0, 4.0, 10.0, "")
+
+
+def sample_of(state: RobotState) -> Any:
+    payload = SimpleNamespace(to_bytes=lambda: encode(state, "json"))
+    return SimpleNamespace(encoding="application/json", payload=payload)
+
+
+UNREADABLE = SimpleNamespace(
+    encoding="application/json", payload=SimpleNamespace(to_bytes=lambda: b"{}")
+)
+
+
+class World:
+    """A page's robot whose time passes as fast as the page looks."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        self.answers: Callable[[], Any] = lambda: None
+        self.asked = 0
+        clock = SimpleNamespace(mono_ns=lambda: round(self.now * NS_PER_S))
+        monkeypatch.setattr(robots, "clock", clock)
+        monkeypatch.setattr(streams, "clock", clock)
+        monkeypatch.setattr(robots, "LOOK_S", 0.0)
+
+        async def at_once(call: Callable[[], Any], timeout: float | None) -> Any:
+            return call()
+
+        monkeypatch.setattr(robots, "in_thread", at_once)
+        never: Any = None
+        self.robots = Robots(Address("tcp/x:1", "acsar", ""), never, ABOUT, Counts())
+        client: Any = SimpleNamespace(ask=self._ask)
+        self.robots.client = client
+
+    def _ask(self, name: str, take: Callable[[Any], object]) -> None:
+        assert name == "state"
+        self.asked += 1
+        if (answer := self.answers()) is not None:
+            take(answer)
+
+    def state(self) -> Any:
+        return sample_of(replace(STATE, stamp=Time.from_ns(round(self.now * NS_PER_S))))
+
+    def told(self, seconds: float, publishes: Callable[[float], Any]) -> list[tuple[float, str]]:
+        """Return each change of `gone` in this time, with when it was told.
+
+        `publishes` returns the sample that the robot publishes at a time, or None.
+        """
+        found: list[tuple[float, str]] = []
+        stream = Stream()
+
+        async def story() -> None:
+            watching = asyncio.create_task(self.robots._watch(stream))
+            began, before = self.now, self.robots.gone
+            while self.now - began < seconds:
+                if (sample := publishes(self.now - began)) is not None:
+                    stream.take(sample)
+                for _ in range(5):  # each task of the page has its turn
+                    await asyncio.sleep(0)
+                if self.robots.gone != before:
+                    before = self.robots.gone
+                    found.append((self.now - began, before))
+                self.now += LOOK_S
+            assert not watching.done()
+            watching.cancel()
+
+        asyncio.run(story())
+        return found
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    return World(monkeypatch)
+
+
+def test_a_robot_that_falls_silent_is_told_within_its_time(world: World) -> None:
+    found = world.told(10.0, lambda t: world.state() if t < 5.0 else None)
+    (_, here), (at, gone) = found
+    assert here == ""
+    assert "nothing is heard of the daemon at tcp/x:1" in gone
+    assert 4.9 + SILENT_S - LOOK_S <= at <= 5.0 + SILENT_S + 2 * LOOK_S
+
+
+def test_a_robot_that_publishes_once_in_ten_seconds_is_queried_and_is_not_gone(
+    world: World,
+) -> None:
+    world.answers = world.state
+    found = world.told(30.0, lambda t: world.state() if round(t * 10) % 100 == 0 else None)
+    assert [gone for _, gone in found] == [""]
+    assert world.asked > 30.0 / (2 * ASK_S + 2 * LOOK_S)
+
+
+def test_a_storage_that_answers_for_a_daemon_that_died_does_not_hide_it(world: World) -> None:
+    last = world.state()
+    world.answers = lambda: last
+    found = world.told(10.0, lambda t: last if t == 0.0 else None)
+    assert [bool(gone) for _, gone in found] == [False, True]
+
+
+def test_a_daemon_of_another_version_is_told_as_that(world: World) -> None:
+    ((at, gone),) = world.told(10.0, lambda t: UNREADABLE)
+    assert "another version" in gone
+    assert at <= FIRST_S + 2 * LOOK_S
+
+
+def test_a_robot_that_comes_back_is_here_at_once(world: World) -> None:
+    found = world.told(10.0, lambda t: None if 2.0 < t < 6.0 else world.state())
+    assert [bool(gone) for _, gone in found] == [False, True, False]
+    assert found[-1][0] <= 6.0 + 2 * LOOK_S
