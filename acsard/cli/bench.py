@@ -72,8 +72,7 @@ def main(args: argparse.Namespace) -> int:
 
     import msgspec
 
-    from acsard.bench.measure import bench_config, measure
-    from acsard.bench.results_table import table
+    from acsard.bench.measure import bench_config, measure, table
     from acsard.serial.device import require
 
     port = "" if args.port in (None, "sim") else args.port
