@@ -152,7 +152,11 @@ def encoding_of(encoding: str, schema_name: str) -> str:
 
 
 def wish(encoding: str, payload: bytes) -> Wish:
-    """Return the twist and the stamp of a message. Raises `DecodeError`."""
+    """Return the twist and the stamp of a message.
+
+    It is decoded as the daemon decodes commands: accepted or refused as a whole. Raises
+    `DecodeError` with the reason.
+    """
     found = _receiver.command(Arrival("cmd/app", True, payload, encoding, 0, None, ""))
     return Wish(found.twist, found.stamp_ns)
 

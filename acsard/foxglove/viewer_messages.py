@@ -45,7 +45,12 @@ def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str,
 
 
 class Reader:
-    """Converts commands to messages of `cmd_vel_in/<source>`, by the robot's configuration."""
+    """Converts commands to messages of `cmd_vel_in/<source>`, by the robot's configuration.
+
+    Commands come from any key of a source and in any encoding, and are decoded exactly as the
+    daemon decodes them. A command that the daemon refuses is not shown; it appears in the daemon's
+    counters. `acsard log export` writes the same messages.
+    """
 
     def __init__(self, config: Config) -> None:
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
