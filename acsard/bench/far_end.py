@@ -22,7 +22,7 @@ from acsard.config.parsing import from_builtins
 from acsard.config.settings import Config
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
-from acsard.serial.sim_pty import PtyEnd
+from acsard.serial.simulated_board import PtyEnd
 from acsard.sim.fake_mcu import FakeMcu
 
 PRIORITY = 80

@@ -187,8 +187,8 @@ def main_renew(args: argparse.Namespace) -> int:
 def main_router(args: argparse.Namespace) -> int:
     """Print the configuration of a fleet's router."""
     from acsard.bus.address import require_id
+    from acsard.door.fleet_router import router_file
     from acsard.host.service_installation import source
-    from acsard.lan.router_file import router_file
 
     for robot in args.robots:
         require_id(robot)

@@ -83,7 +83,7 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from acsard.host import clock
-    from acsard.serial.sim_pty import SimPty
+    from acsard.serial.simulated_board import SimPty
 
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

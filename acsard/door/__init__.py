@@ -1,1 +1,1 @@
-"""The TLS gateway (`acsard door`): a process that terminates connections from the network."""
+"""The processes that are open to the network: the TLS gateway and the router of a fleet."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
+from acsard.host.processes import called
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d", "acsard-web.service.d")
 """Directories that are removed with the last file in them."""
@@ -155,8 +156,3 @@ def _unreadable(path: Path, error: OSError) -> MendableError:
     if isinstance(error, PermissionError):
         return NotPermittedError(f"no permission to read {path}; run it by sudo")
     return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; look what it is")
-
-
-def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
-    """Run a command to its end; raise `OSError` or `subprocess.TimeoutExpired`."""
-    return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

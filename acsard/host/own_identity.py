@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from acsard.host.installation_steps import called
+from acsard.host.processes import called
 from acsard.messages.signature import MAX_NAME
 
 SECRET_BYTES = 16

@@ -1,4 +1,4 @@
-"""Finds the processes that have a device open, and ends a child process with its parent.
+"""Finds the processes that have a device open, runs a command, and ends a child with its parent.
 
 Procfs shows the open files, and no file is opened. Only files below a /dev directory are examined:
 a file on a network disk that hangs would block this process.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -181,6 +182,11 @@ PR_SET_PDEATHSIG = 1
 def end_with_parent(number: signal.Signals) -> None:
     """Ask the kernel for this signal when the thread that started this process ends.
 
-    The child process calls it.
+    The child process calls it. It then ends with its parent even if the parent crashes.
     """
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+
+
+def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; raise `OSError` or `subprocess.TimeoutExpired`."""
+    return subprocess.run(words, capture_output=True, text=True, timeout=within_s, check=False)

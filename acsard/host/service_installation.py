@@ -17,7 +17,8 @@ from pathlib import Path
 
 import acsard
 from acsard.host.errors import Exit, ExitError
-from acsard.host.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write, called
+from acsard.host.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
+from acsard.host.processes import called
 
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`."""

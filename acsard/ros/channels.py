@@ -70,6 +70,10 @@ acsard/msg/RobotState: \
     string refused, string gyro, string track, string doubt, string recording, \
     string certificate, acsard/msg/Counter[] counters
 """
+"""Message definitions. Each type has one line: its name, a colon, and its fields as `type name`,
+separated by commas. `[]` marks a sequence and `[n]` an array. Types without a ROS message are in
+the package `acsard` (`shapes.py`).
+"""
 
 
 def _parsed(text: str) -> dict[str, tuple[Field, ...]]:

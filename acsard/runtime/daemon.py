@@ -35,9 +35,9 @@ from acsard.ros.transports import left_out
 from acsard.runtime.control_loop import ControlLoop
 from acsard.runtime.doorkeeper import DOOR, PAGE, Kind, keep_door
 from acsard.runtime.latch_file import LatchFile
-from acsard.runtime.simulated import Simulated
 from acsard.runtime.wakeup import Next, Ticker, Wakeup
 from acsard.serial.port import SerialPort
+from acsard.serial.simulated_board import Simulated
 from acsard.values import NS_PER_S, Event, Latches
 
 EXIT_RAMP_S = 0.6

@@ -31,7 +31,7 @@ ENDS = [math.pow(10.0, index / PER_DECADE) for index in range(LAST)]
 
 
 class Histogram:
-    """Measurements of one quantity, counted in buckets."""
+    """Percentiles of an endless stream in fixed memory, by logarithmic buckets."""
 
     def __init__(self) -> None:
         self._buckets = [0] * (LAST + 1)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from acsard.door.fleet_router import router_file
 from acsard.lan.authority import Authority
-from acsard.lan.router_file import router_file
 from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import words
 

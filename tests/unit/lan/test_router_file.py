@@ -15,7 +15,6 @@ import zenoh
 
 from acsard.bus.access import least_role
 from acsard.host.errors import UsageError
-from acsard.lan.router_file import router_file
 from acsard.messages.json_schema import SCHEMAS
 from acsard.messages.topics import PUBLISHED, TOPICS, json_key, source_keys, whoami_key
 from acsard.values import ROLES, Role

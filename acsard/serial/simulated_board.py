@@ -1,7 +1,9 @@
-"""A serial line as a pty, and the simulated board behind one, so that the real serial code runs.
+"""The simulated board in real time behind a pty, so that the real serial code runs.
 
-The simulated board runs in real time. A pty carries any baud rate. Here a host that sets another
-rate than the board's gets garbage, and so does the board, as on a real wire.
+A pty carries any baud rate. Here a host that sets another rate than the board's gets garbage, and
+so does the board, as on a real wire. `PtyEnd` is the board's end of any serial line that is a pty.
+Beside the daemon, `Simulated` also publishes the board's true state on the bus; the control loop
+reads the device like any other and knows nothing about the rest.
 """
 
 from __future__ import annotations
@@ -15,12 +17,18 @@ import tty
 from types import TracebackType
 from typing import get_args
 
-from acsard.config.settings import Baud
+from acsard.config.settings import Baud, Config
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
+from acsard.incoming.bus_interface import Bus
+from acsard.messages.schema import Message
+from acsard.messages.topics import IMU
 from acsard.serial.device import unlock
 from acsard.sim.fake_mcu import FakeMcu
 from acsard.sim.garble import garbled
+from acsard.sim.told import true_pose, turn_rate
+from acsard.sim.watched import Sight, WatchedMcu
+from acsard.values import NS_PER_S
 
 
 class PtyEnd:
@@ -127,3 +135,60 @@ class SimPty:
         due_ns = self.mcu.next_ns()
         if due_ns is not None:
             self._timer.set(due_ns)
+
+
+POSE = "sim/pose"
+
+
+class Simulated:
+    """The simulator.
+
+    Entering it creates the device at `path`; `tell` sets the bus to publish on.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))
+        self._frame, self._noise = config.odometry.base_frame, config.sim.gyro_noise
+        self._gyro = config.odometry.gyro
+        self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
+        self._bus: Bus | None = None
+        self._last: tuple[Sight, int] | None = None
+
+    @property
+    def path(self) -> str:
+        """The path of the serial device."""
+        return self._pty.path
+
+    def tell(self, bus: Bus) -> None:
+        """Publish on this bus from now on."""
+        self._bus = bus
+
+    def current(self, key: str) -> Message | None:
+        """Return the present value of a key that the simulator publishes, else None."""
+        return true_pose(*self._last) if key == POSE and self._last is not None else None
+
+    def __enter__(self) -> Simulated:
+        self._pty.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._pty.__exit__(kind, error, trace)
+
+    def _see(self, sight: Sight) -> None:
+        now, bus = clock.now(), self._bus
+        wall_ns = now.wall_ns - (now.mono_ns - sight.at_ns)
+        self._last = sight, wall_ns
+        if bus is None:
+            return
+        if POSE in bus.wanted:
+            bus.publish(POSE, true_pose(sight, wall_ns))
+        # The daemon receives its own sample from the bus, like one of a gyro on a real robot.
+        if self._gyro:
+            measured_ns = wall_ns - self._delay_ns
+            bus.publish(IMU, turn_rate(sight, self._frame, self._noise, measured_ns))
+        bus.flush()

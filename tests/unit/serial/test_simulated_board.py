@@ -11,7 +11,7 @@ import tty
 from collections.abc import Callable
 
 from acsard.config.settings import Config, SimConfig
-from acsard.runtime.simulated import Simulated
+from acsard.serial.simulated_board import Simulated
 from acsard.sim.faults import USB_PACKET
 
 LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\n"
