@@ -14,9 +14,11 @@ from typing import Any
 import pytest
 import zenoh
 
+from acsard.bus.access import least_role
 from acsard.door.fleet_router import Router, router_file
 from acsard.host.errors import InUseError, RouterFileError, UsageError
-from acsard.messages.topics import source_keys
+from acsard.messages.json_schema import SCHEMAS
+from acsard.messages.topics import PUBLISHED, TOPICS, json_key, source_keys, whoami_key
 from acsard.values import ROLES, Role
 
 ROUTER_FILE = Path(__file__).resolve().parents[3] / "deploy" / "zenoh" / "router.json5"
@@ -123,6 +125,19 @@ def made(robots: Sequence[str], people: Mapping[Role, Sequence[str]] | None = No
 
 def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
     assert made(["robot1"]) == read(TEMPLATE)
+
+
+@pytest.mark.parametrize(
+    ("rule", "role"),
+    [("see-robot1", "viewer"), ("operate-robot1", "operator"), ("keep-robot1", "maintainer")],
+)
+def test_each_role_may_ask_for_what_the_bus_of_a_robot_lets_it(rule: str, role: Role) -> None:
+    (keys,) = [one["key_exprs"] for one in read(TEMPLATE)["rules"] if one["id"] == rule]
+    told = [topic.key for topic in PUBLISHED]
+    asked = [topic.key for topic in TOPICS if topic.direction in ("query", "service")]
+    asked = [key for key in asked if "<" not in key] + [f"schema/{name}" for name in SCHEMAS]
+    may = {key for key in [*told, *map(json_key, told), *asked, "alive"] if least_role(key) == role}
+    assert {key.removeprefix("acsard/robot1/") for key in keys} == may | {whoami_key(role)}
 
 
 def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
