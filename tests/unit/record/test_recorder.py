@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from acsard.config.settings import Config, RecordConfig
 from acsard.incoming.commands import Arrival
 from acsard.mcu.gate import Offered
-from acsard.record import around, disk
+from acsard.record import disk, room
 from acsard.record import recorder as module
 from acsard.record.closing import closing, how_it_ends
 from acsard.record.directory import KEPT, Ring, listed
@@ -195,7 +195,7 @@ def test_the_minute_before_and_after_what_happened_is_kept(
 ) -> None:
     minute = 6  # one tenth of a minute in s, to save time
     monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
-    monkeypatch.setattr(around, "AROUND_NS", minute * 10**9)
+    monkeypatch.setattr(room, "AROUND_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.bus.wanted = set()
 
@@ -427,7 +427,7 @@ def test_a_clock_that_is_set_costs_no_recording(
     It gets the time only while it drives.
     """
     monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
-    monkeypatch.setattr(around, "AROUND_NS", 0)
+    monkeypatch.setattr(room, "AROUND_NS", 0)
     seen = set[str]()
 
     def there() -> set[str]:
