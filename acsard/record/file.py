@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import errno
 import os
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -131,15 +130,20 @@ class Writing:
         self.path, self._mode = path, mode
         self._gist = Gist(about)
         self._indexes: list[McapRecord] = []
-        self._counts: Counter[int] = Counter()
-        self._first_ns, self._last_ns = 1 << 63, 0
-        self._chunks = 0
-        """Number of complete chunks."""
+        self._totals = Statistics(
+            attachment_count=1,
+            channel_count=len(CHANNELS),
+            channel_message_counts=dict.fromkeys(NUMBERS.values(), 0),
+            chunk_count=0,
+            message_count=0,
+            message_start_time=0,
+            message_end_time=0,
+            metadata_count=2,
+            schema_count=1,
+        )
         self._chunk: Growing | None = None
         self._chunk_at: int | None = None
         """Offset of the chunk's head in the file; None if nothing of it is written yet."""
-        self._waits = False
-        """True if the chunk has messages that are not in the file yet."""
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -192,10 +196,12 @@ class Writing:
             self.end_chunk()
         self._chunk = self._chunk or Growing()
         self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
-        self._counts[NUMBERS[topic]] += 1
-        self._first_ns = min(self._first_ns, wall_ns)
-        self._last_ns = max(self._last_ns, wall_ns)
-        self._waits = True
+        totals = self._totals
+        first_ns = totals.message_start_time if totals.message_count else wall_ns
+        totals.message_start_time = min(first_ns, wall_ns)
+        totals.message_end_time = max(totals.message_end_time, wall_ns)
+        totals.message_count += 1
+        totals.channel_message_counts[NUMBERS[topic]] += 1
 
     def event(self, told: Told) -> None:
         """Add an event, and take it for the summary."""
@@ -205,7 +211,7 @@ class Writing:
 
     def flush(self) -> None:
         """Write the messages added so far, so that each can be read, and sync them to the disk."""
-        if self._chunk is not None and self._waits:
+        if self._chunk is not None and self._chunk.waits:
             self._put(self._chunk.take())
         self._sync()
         # The disk accepts the data, but nobody can find a file without a name.
@@ -218,7 +224,6 @@ class Writing:
             self._chunk_at = self._file.tell()
             self._file.write(GROWING)
         self._file.write(data)
-        self._waits = False
 
     def _sync(self) -> None:
         self._file.flush()
@@ -236,7 +241,7 @@ class Writing:
         self._file.write(head)
         self._file.seek(end)
         self._chunk = self._chunk_at = None
-        self._chunks += 1
+        self._totals.chunk_count += 1
 
     def finish(self, cut: str = "", why: str = "") -> None:
         """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
@@ -244,26 +249,13 @@ class Writing:
         self._add_metadata(END, fields(self._gist.closing(cut, why)))
         self._write(DataEnd(0))
         summary_at = self._file.tell()
-        for record in (*_definitions(), self._statistics(), *self._indexes):
+        for record in (*_definitions(), self._totals, *self._indexes):
             self._write(record)
         # A checksum of 0 says that there is none.
         self._write(Footer(summary_at, 0, 0))
         self._file.write(MAGIC)
         self._sync()
         self._file.close()
-
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=1,
-            channel_count=len(CHANNELS),
-            channel_message_counts=dict(self._counts),
-            chunk_count=self._chunks,
-            message_count=self._counts.total(),
-            message_start_time=self._first_ns if self._counts else 0,
-            message_end_time=self._last_ns,
-            metadata_count=2,
-            schema_count=1,
-        )
 
     def close(self) -> None:
         """Close the file without writing an end."""

@@ -108,7 +108,7 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
     puts = [(chunk.end, end)]
     if not chunk.complete:
-        puts = [(chunk.end, LAST_BLOCK + end), (chunk.begin, chunk.head())]
+        puts = [(chunk.end, LAST_BLOCK + end), (chunk.begin, chunk.head(before))]
     with part.open("r+b", buffering=0) as stream:
         try:
             for at, data in puts:

@@ -11,6 +11,11 @@ part when it is made:
     another part             made without a call of its code, then given attributes; none of them
                              hides an attribute of its class
 
+A list of allowed classes in `Unpickler.find_class` is not enough. With the list of `state`, nested
+tuples as keys, keys of one hash and copies of one dict ran past 3 s of processor time, a few bytes
+asked for more than 2 GB, and an attack changed the class of the robot for the whole process. The
+commands that read a recording are such processes, and not bounded children.
+
 A part that has been referred to cannot grow any more. Therefore, no part contains itself, and the
 depth and the size are exact.
 """

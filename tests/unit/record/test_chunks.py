@@ -24,6 +24,7 @@ from acsard.record.chunks import (
     content,
     places,
 )
+from acsard.record.walk import MAGIC, walk
 
 DICE = random.Random(1)
 
@@ -73,7 +74,7 @@ def test_a_cut_anywhere_costs_the_second_that_it_is_in(torn: bytes) -> None:
 def test_the_formats_own_reader_reads_a_complete_chunk_and_one_that_was_cut_and_ended() -> None:
     cut = content(GROWS[: ENDS[6] + 9], 0)
     assert cut is not None
-    ended = cut.head() + GROWS[len(GROWING) : cut.end] + LAST_BLOCK
+    ended = cut.head(GROWS) + GROWS[len(GROWING) : cut.end] + LAST_BLOCK
     for data, messages in ((COMPLETE, ALL), (ended, ALL[:21])):
         got = content(data, 0)
         assert got is not None
@@ -120,3 +121,27 @@ def test_a_few_bytes_that_ask_for_gigabytes_get_nothing(inside: bytes) -> None:
     assert got is not None
     assert (got.messages, got.complete) == ([], False)
     assert time.process_time() - began < 0.5
+
+
+def test_a_chunk_of_very_many_blocks_takes_a_time_in_proportion() -> None:
+    chunk, data, message = Growing(), GROWING, Message(1, 5, b"")
+    parts = []
+    for _ in range(20_000):
+        chunk.add(message)
+        parts.append(chunk.take())
+    data += b"".join(parts)
+    began = time.process_time()
+    got = content(data, 0)
+    assert got is not None
+    assert got.messages == [message] * 20_000
+    assert time.process_time() - began < 2.0
+
+
+def test_many_chunks_that_ask_for_megabytes_take_a_time_in_proportion() -> None:
+    """Each claims a message of 4 MB that does not end, so each must be decompressed."""
+    inside = struct.pack("<BQ", 5, MOST_IN_MESSAGE - 100) + bytes(MOST_IN_MESSAGE - 200)
+    packed = zstandard.ZstdCompressor(compression_params=PARAMETERS).compress(inside)
+    data = MAGIC + (GROWING + packed[:-20]) * 1000
+    began = time.process_time()
+    assert [found.messages for found in walk(data)] == [[]]
+    assert time.process_time() - began < 3.0
