@@ -377,6 +377,9 @@ def _events(
             )
     for at in add("settings", 20):
         call(at, "set", settings=_settings(dice, config), via="native")
+    if not config["control"].get("auto_activate", True):
+        # Without this a robot that waits for its first `activate` would stand until the end.
+        call(round(dice.uniform(0.5, 5.0), 3), "activate", named=False)
     return events
 
 

@@ -320,6 +320,9 @@ class Witness:
             self.softest = dict(self.limits)
             return
         self.counts["moving lines"] += 1
+        if at_ns - made_ns > self.period_ns + MARGIN_NS:
+            text = f"{line!r} was made at {made_ns / NS:.3f} s"
+            raise BrokenError("no line leaves later than it was made", at_ns, text)
         if at_ns - fed_ns > self.quiet_ns + 2 * self.period_ns + MARGIN_NS:
             raise BrokenError(
                 "a silent board gets zeros", at_ns, f"last heard {fed_ns / NS:.3f} s: {line!r}"

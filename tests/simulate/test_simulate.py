@@ -134,6 +134,10 @@ def witnessed() -> Witness:
             "a silent board gets zeros",
         ),
         (lambda w: w.line(NS, b"ap00.02,bp00.02\r\n", NS, NS), "every line is whole"),
+        (
+            lambda w: w.line(2 * NS, b"ap00.02,bp00.02,cp00.02,dp00.02\r\n", 2 * NS, NS),
+            "no line leaves later than it was made",
+        ),
     ],
 )
 def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], promise: str) -> None:
