@@ -1,7 +1,8 @@
 """acsard: the hardware interface daemon of a four-wheel differential-drive robot.
 
-One process, one asyncio event loop: a serial microcontroller below, a Zenoh bus above, a control
-step every 10 ms between. Who comes from the network comes through another process, the door.
+One process with one asyncio event loop drives the robot. Below it is a microcontroller on a serial
+line, above it a Zenoh bus, and a control step runs between them every 10 ms. TLS connections from
+a network end in another process, the gateway.
 
       one task, every 10 ms (earlier when a fresh command or feedback is in hand)
 
@@ -9,60 +10,56 @@ step every 10 ms between. Who comes from the network comes through another proce
                              +-> robot.step(inputs) ----+
  bus -> decode -> commands --+         (pure)           +-> line -> guard -> serial
 
-Inside `Robot.step`, top to bottom: fold the feedback into odometry, choose one command, gate by
-mode, limit, invert the kinematics, report. Nothing else decides anything.
+`Robot.step` does, in this order: fold the feedback into odometry, choose one command, gate it by
+mode, limit it, invert the kinematics, report. No other function decides anything.
 
-Where to look: one room per concern, in the order they may import each other (P: pure, no clock
-and no I/O; S: shell). `pyproject.toml` has the order as a contract, `lint-imports` checks it.
+The packages follow, each with the packages that it may import below it. `pyproject.toml` states
+this order as contracts, and `lint-imports` checks them.
 
-    values.py      P  the nouns, SI: Instant, Twist, Pose, WheelSpeeds, Command, Inputs, Outputs
-    thinning.py    P  curves, bands and paths in bounded memory: a day in a minute's room
-    formatting.py  P  safe text, signed figures, durations, counts and lists, for every message
-    config/        P  acsard.toml -> one frozen Config, or errors that name the key and the mend
-    mcu/           P  the serial line: codec, the check, link (is the MCU there?), the port
-    drive/         P  kinematics, odometry, sanity (can this feedback be true?), arbiter (who is
-                      followed?), neutral (who may drive?), freshness (what came too late), words
-                      (all that in sentences), limits, modes (the table), tally (the log)
-    messages/      P  the published structs, topics (**the** key table), encodings, report,
-                      json_schema (of what goes out and comes in)
-    ros/           P  the two ROS trees: names and hashes, tokens, attachments, parameters
-    incoming/      P  what comes in over the bus: sample -> command, query -> reply or request
-    robot.py       P  the order; guard.py: the last look at every outgoing line
-    terminal/      S  what every tool prints with, by the library rich: tables (P), output
-    sim/           P  the vehicle, the fake microcontroller, its faults
-    checkup/       P  what `acsard mcu check` does: one module a question to the board
-    error_budget/  P  what `acsard odom` does: drive_log (what the bus told), steps, budget (each
-                      cause's share), text
-    calibration/   P  what `acsard calibrate` does: table and runs (a log), heading and places (what
-                      it shows), fit, solve (the order), report; calibration/guided/ is the
-                      drive without a log: the ways, the legs, what a person reads off
-    host/          S  the machine: clock, timers, threads, files, systemd, journal, logs, errors
-    serial/        S  owns the serial port
-    bus/           S  owns the Zenoh sessions: inbox, outlets, replies, access rules, certificates
-    record/        S  the black box: steps <-> MCAP, a ring of files, replay (its core is pure)
-    runtime/       S  the control loop, the daemon, the latch file; figures of itself
-    door/          S  `acsard door`: where TLS ends, a process of its own
-    client/        S  drive and follow a robot from Python: synchronous, asynchronous; follower and
-                      commander hold the rules and the limits for all that follow and command
-    report/        P  `acsard log report`: course (what a recording shows), account (words),
-                      figures, page
-    bench/ top/    S  `acsard bench` and `acsard top`: they stand outside and look
-    foxglove/      S  `acsard foxglove`, outside too: drives (what viewers send), relay (what
-                      comes), settings, services, bridge (goes round)
-    web/           S  `acsard web`: the robot's page, a process of its own; app has the table of its
-                      paths, which admission and openapi follow; a viewer per browser; guide has a
-                      check or calibration done, by errands (the command's words)
-    doctor/ lan/   S  `acsard doctor`, one module a subject; certificates for other machines
-    asking/        S  how a verb asks who stands beside the robot: at a terminal, by a program
-    cli/           S  one verb per file
+    cli/             one file per verb: its options, one call into another package, its output
+    asking/          how a verb asks the person beside the robot: at a terminal or by a program
+    bench/           `acsard bench`: measures a daemon from outside
+    doctor/          `acsard doctor`: what is wrong with this installation
+    foxglove/        `acsard foxglove`: a live server for Foxglove
+    lan/             certificates for other machines
+    report/          `acsard log report`: what a recording shows, as a page
+    top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
+    web/             `acsard web`: the robot's page, in a process of its own
+    client/          follow and drive a robot from Python, synchronous or with asyncio; the
+                     follower and the commander hold the rules and time limits of all tools
+    daemon/          the process: control loop, latch file, ways down
+    daemon/gateway/  `acsard door`: the process in which TLS ends
+    daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
+    daemon/serial/   the serial port
+    recording/       the black box: steps to MCAP and back, a ring of files, replay
+    host/            the machine: clock, timers, threads, files, systemd, logs, errors
+    checkup/         `acsard mcu check`: one module for each question to the board
+    error_budget/    `acsard odom`: what each cause contributes to the odometry's error
+    calibration/     `acsard calibrate`: from a log, or by a drive of its own
+    terminal/        tables and output of all tools, by the library rich
+    core/            the robot as a pure function: no clock, no I/O, no thread
 
-Three invariants, each tested:
+Inside `core/`, in the same order:
 
-1. Only the rooms marked S do I/O; only host/clock.py reads a clock for the daemon.
-2. No wheel speed grows unless a fresh command, a live link and mode driving agree in the same
-   step; otherwise it only falls, and without a link the command is zero at once. The guard checks
+    core/simulator/  the vehicle, the simulated microcontroller and its faults
+    core/robot.py    the order of a step; core/guard.py checks each outgoing line
+    core/incoming/   what comes in over the bus: a sample becomes a command, a query a reply
+    core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
+    core/messages/   the published structs, the table of keys, encodings, reports, schemas
+    core/motion/     kinematics, odometry, arbiter, freshness, neutral, limits, modes
+    core/link/       the serial line: codec, checksum, negotiation, sample times, link state
+    core/config/     acsard.toml becomes one frozen Config, or errors that name key and mend
+    core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs
+    core/formatting.py  safe text, figures, durations and counts for every message
+    core/thinning.py    curves and paths of any length in a bounded number of points
+
+Three invariants hold, and each is tested:
+
+1. Nothing in `core/` does I/O, and in the daemon only `host/clock.py` reads a clock.
+2. No wheel speed grows unless a fresh command, a live link and mode `driving` agree in the same
+   step. Otherwise it only falls, and without a link the command is zero at once. The guard checks
    exactly this, and that each ramp ends in time, with code of its own.
-3. No line is held back to be sent later: one that cannot go now is superseded by the next.
+3. No line is held back to be sent later. If it cannot go now, the next line supersedes it.
 """
 
 __version__ = "0.1.0"

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
 from tests.scenarios.world import World
 from tests.system.browser import Page

@@ -21,8 +21,8 @@ import pytest
 import zenoh
 from ruamel.yaml import YAML
 
-from acsard.config.settings import Config, RosConfig
-from acsard.ros.transports import ros_names
+from acsard.core.config.settings import Config, RosConfig
+from acsard.core.ros.transports import ros_names
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()

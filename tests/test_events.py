@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import get_args
 
-from acsard.values import EventName, Verb
+from acsard.core.values import EventName, Verb
 
 ROOT = Path(__file__).parents[1]
 NAMES = get_args(EventName)

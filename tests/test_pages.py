@@ -23,7 +23,7 @@ import pytest
 import zenoh
 
 from acsard import cli
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from acsard.host.extras import Extra
 from tests.each import each
 from tests.pages import (
@@ -276,7 +276,7 @@ def files_with(pattern: str, *rooms: str) -> set[str]:
 
 def test_the_recipe_for_a_verb_names_every_file_that_lists_the_verbs() -> None:
     listed = files_with("reset_odometry", "acsard", "deploy")
-    assert {"values.py", "deploy/ros2/README.md"} <= listed
+    assert {"core/values.py", "deploy/ros2/README.md"} <= listed
     assert listed <= recipe("## Add a verb", "A verb of the command line")
 
 
@@ -290,13 +290,13 @@ READS_KEYS = {"error_budget/daemon_messages.py", "web/page/main.js"}
 @each(
     ("part", "pattern", "some", "beyond"),
     [
-        ("key", LISTS_KEYS, "messages/report.py", READS_KEYS),
-        ("key", r"\bInterfaces\b", "incoming/queries.py", set()),
-        ("simulated fault", "stuck_encoder", "config/named_faults.py", set()),
-        ("setting", "angular_jerk", "config/motion_rules.py", {"drive/limits.py"}),
-        ("ROS topic", "cmd_vel_teleop", "ros/transports.py", set()),
-        ("ROS topic", "sensor_msgs/(msg/)?JointState", "ros/channels.py", set()),
-        ("firmware dialect", "trailing_comma", "mcu/codec.py", set()),
+        ("key", LISTS_KEYS, "core/messages/report.py", READS_KEYS),
+        ("key", r"\bInterfaces\b", "core/incoming/queries.py", set()),
+        ("simulated fault", "stuck_encoder", "core/config/named_faults.py", set()),
+        ("setting", "angular_jerk", "core/config/motion_rules.py", {"core/motion/limits.py"}),
+        ("ROS topic", "cmd_vel_teleop", "core/ros/transports.py", set()),
+        ("ROS topic", "sensor_msgs/(msg/)?JointState", "core/ros/channels.py", set()),
+        ("firmware dialect", "trailing_comma", "core/link/codec.py", set()),
     ],
 )
 def test_a_recipe_names_every_file_that_knows_one_like_it(
@@ -310,7 +310,7 @@ def test_a_recipe_names_every_file_that_knows_one_like_it(
 
 def test_the_recipe_for_a_transport_names_every_file_that_knows_one_by_name() -> None:
     knowing = files_with('"(rmw|bridge)"', "acsard")
-    assert {"ros/transports.py", "bus/bus.py"} <= knowing
+    assert {"core/ros/transports.py", "daemon/bus/bus.py"} <= knowing
     assert knowing <= recipe("A third transport", "##")
 
 

@@ -11,7 +11,7 @@ from argparse import _SubParsersAction
 from pathlib import Path
 
 from acsard.cli import parser
-from acsard.messages.topics import TOPICS
+from acsard.core.messages.topics import TOPICS
 
 README = Path(__file__).parent.parent / "README.md"
 TABLE = re.compile(r"(<!-- keys: acsard topics -->\n).*?(<!-- end of keys -->)", re.S)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.record.file import Recording
-from acsard.record.replayed import differs, live
+from acsard.recording.file import Recording
+from acsard.recording.replayed import differs, live
 
 RECORDINGS = sorted((Path(__file__).parent / "recordings").glob("*.mcap"))
 

@@ -18,12 +18,12 @@ import msgspec
 from msgspec.structs import replace
 
 from acsard.bench.matching import Seen, staircase
-from acsard.config.parsing import from_builtins
-from acsard.config.settings import Config
+from acsard.core.config.parsing import from_builtins
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.daemon.serial.simulated_board import PtyEnd
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
-from acsard.serial.simulated_board import PtyEnd
-from acsard.sim.fake_mcu import FakeMcu
 
 PRIORITY = 80
 """Real-time priority: a microcontroller does not wait for its host."""

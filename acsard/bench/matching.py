@@ -12,10 +12,10 @@ from collections.abc import Iterable, Sequence
 
 from msgspec import Struct
 
-from acsard.config.settings import Config
-from acsard.drive.kinematics import Kinematics
-from acsard.mcu.codec import Codec
-from acsard.values import Instant
+from acsard.core.config.settings import Config
+from acsard.core.link.codec import Codec
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import Instant
 
 STEPS = 1000
 """Number of different speeds. Lines that are further apart are distinguished by their time."""

@@ -22,8 +22,8 @@ from acsard.bench.matching import (
 )
 from acsard.bench.results_table import Result, this_machine
 from acsard.bench.rig import Rig, resident_mb
-from acsard.config.parsing import effective
-from acsard.config.settings import (
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import (
     BusConfig,
     CommandsConfig,
     Config,
@@ -36,9 +36,9 @@ from acsard.config.settings import (
     SimConfig,
     Source,
 )
-from acsard.config.writing import document
+from acsard.core.config.writing import document
+from acsard.core.messages.schema import RobotState
 from acsard.host.errors import Exit, ExitError
-from acsard.messages.schema import RobotState
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:

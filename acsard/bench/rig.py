@@ -28,20 +28,20 @@ import zenoh
 
 from acsard.bench.far_end import Part
 from acsard.bench.matching import Record, Sample, Seen, Sent
-from acsard.bus.outlets import direct
-from acsard.bus.subscription import encoded
-from acsard.bus.zenoh_sessions import client_session
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
-from acsard.drive.kinematics import Kinematics
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.link.codec import Codec
+from acsard.core.messages.encodings import Decoder, encode, encoding_name
+from acsard.core.messages.schema import Odometry, RobotState, Twist, Vector3
+from acsard.core.messages.topics import full_key
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
+from acsard.daemon.bus.outlets import direct
+from acsard.daemon.bus.subscription import encoded
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from acsard.host.errors import Exit, ExitError, NoAnswerError, UnreachableError
 from acsard.host.processes import end_with_parent
-from acsard.mcu.codec import Codec
-from acsard.messages.encodings import Decoder, encode, encoding_name
-from acsard.messages.schema import Odometry, RobotState, Twist, Vector3
-from acsard.messages.topics import full_key
-from acsard.values import NS_PER_S, Instant, WheelSpeeds
 
 END_S = 5.0
 """Time limit for the end of a process, s. It usually takes 0.2 s."""

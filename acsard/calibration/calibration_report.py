@@ -9,9 +9,9 @@ from rich.console import RenderableType
 
 from acsard.calibration.fit import SEPARATION
 from acsard.calibration.solve import Calibration
-from acsard.config.settings import DriveConfig
-from acsard.config.writing import excerpt
-from acsard.formatting import many
+from acsard.core.config.settings import DriveConfig
+from acsard.core.config.writing import excerpt
+from acsard.core.formatting import many
 from acsard.terminal.tables import table
 
 NAMES = (

@@ -13,7 +13,7 @@ import numpy as np
 from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base
 from acsard.calibration.log_table import Floats
 from acsard.calibration.search import Begin
-from acsard.values import AcsardError
+from acsard.core.values import AcsardError
 
 UNLIKE = 0.5
 """Fraction of a sensor's motion that the wheels may leave unexplained."""

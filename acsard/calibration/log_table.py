@@ -20,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.config.nearest import nearest
-from acsard.formatting import many, printable
-from acsard.messages.schema import Imu, JointState, Message, PoseStamped
-from acsard.values import NS_PER_S, AcsardError
+from acsard.core.config.nearest import nearest
+from acsard.core.formatting import many, printable
+from acsard.core.messages.schema import Imu, JointState, Message, PoseStamped
+from acsard.core.values import NS_PER_S, AcsardError
 
 TIME = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 TIME |= {"\N{MICRO SIGN}s": 1e-6, "\N{GREEK SMALL LETTER MU}s": 1e-6}

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.log_table import FOUR, TWO, Floats, LogError, Table
-from acsard.formatting import many
+from acsard.core.formatting import many
 
 Complexes = npt.NDArray[np.complex128]
 Rows = npt.NDArray[np.int64]

@@ -38,8 +38,8 @@ from acsard.calibration.prepared import (
 )
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.tape_distance import Follow, Tape, Way, scaled
-from acsard.config.settings import DriveConfig
-from acsard.values import AcsardError
+from acsard.core.config.settings import DriveConfig
+from acsard.core.values import AcsardError
 
 LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
 """Block lengths that are tried, s: with a heading sensor, and without.

@@ -18,15 +18,15 @@ from acsard.checkup.findings import StoppedError, WireLostError, motor_name, mot
 from acsard.checkup.lateness import Lateness
 from acsard.checkup.motion import ZERO, Reply
 from acsard.checkup.restarts import RestartedError, Restarts
-from acsard.config.motion_rules import LONGEST_REPLY_S
-from acsard.config.settings import McuConfig, WheelMap
-from acsard.config.wire_time import line_bytes, wire_ns
-from acsard.mcu.check import ASK_SAMPLE, SEQUENCES, seal, unseal
-from acsard.mcu.codec import LETTERS, Codec, FrameError, Motors
-from acsard.mcu.contract import WATCHDOG_S
-from acsard.mcu.hearing import Heard
-from acsard.mcu.lines import LineReader
-from acsard.values import NS_PER_S, WheelSpeeds
+from acsard.core.config.motion_rules import LONGEST_REPLY_S
+from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.config.wire_time import line_bytes, wire_ns
+from acsard.core.link.check import ASK_SAMPLE, SEQUENCES, seal, unseal
+from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
+from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.link.hearing import Heard
+from acsard.core.link.lines import LineReader
+from acsard.core.values import NS_PER_S, WheelSpeeds
 
 
 class Wire(Protocol):

@@ -13,10 +13,10 @@ from rich.text import Text
 
 from acsard.checkup import lateness
 from acsard.checkup.findings import REST, Finding
-from acsard.config.contradictions import contradictions
-from acsard.config.parsing import effective, from_builtins
-from acsard.config.settings import Config
-from acsard.config.writing import excerpt
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.parsing import effective, from_builtins
+from acsard.core.config.settings import Config
+from acsard.core.config.writing import excerpt
 from acsard.terminal.tables import table
 
 Changes = dict[str, object]

@@ -8,8 +8,8 @@ from acsard.checkup import outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.motion import GLANCE_S, SPEED, ZERO, moving
-from acsard.mcu.check import seal
-from acsard.mcu.codec import LETTERS
+from acsard.core.link.check import seal
+from acsard.core.link.codec import LETTERS
 
 REPEATS = 3
 """Number of times each damaged line is sent. A motor needs a moment to show that it obeyed."""

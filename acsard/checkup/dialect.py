@@ -15,10 +15,10 @@ from acsard.checkup import lateness, outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, CUT_S, GLANCE_S, ZERO, Reply
-from acsard.config.settings import Baud
-from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.mcu.check import seal
-from acsard.mcu.session import IDENTITY
+from acsard.core.config.settings import Baud
+from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.core.link.check import seal
+from acsard.core.link.session import IDENTITY
 
 OTHER_S = 0.6
 """Time for which each other baud rate is tried, s."""

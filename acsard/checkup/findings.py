@@ -7,9 +7,9 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.config.settings import McuConfig
-from acsard.mcu.codec import LETTERS
-from acsard.values import WHEELS, AcsardError
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.codec import LETTERS
+from acsard.core.values import WHEELS, AcsardError
 
 Verdict = Literal["PASS", "WARN", "FAIL", "SKIPPED"]
 

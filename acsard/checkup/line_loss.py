@@ -17,10 +17,10 @@ from acsard.checkup import lateness, motion, outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, Reply
-from acsard.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.formatting import printable_bytes
-from acsard.mcu.hearing import SHOWN
-from acsard.mcu.session import IDENTITY
+from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.core.formatting import printable_bytes
+from acsard.core.link.hearing import SHOWN
+from acsard.core.link.session import IDENTITY
 
 MOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""

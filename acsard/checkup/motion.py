@@ -14,9 +14,9 @@ from statistics import fmean
 
 from msgspec import Struct
 
-from acsard.config.wire_time import FIELD
-from acsard.mcu.check import Reading
-from acsard.mcu.codec import Motors
+from acsard.core.config.wire_time import FIELD
+from acsard.core.link.check import Reading
+from acsard.core.link.codec import Motors
 
 # Bounds within which a measured time agrees with the contract's `WATCHDOG_S`.
 WATCHDOG_LEAST_S = 0.1  # a pause of this host that is longer may already have stopped the motors

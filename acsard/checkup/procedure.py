@@ -24,9 +24,9 @@ from acsard.checkup.motion import BOOT_S, GLANCE_S
 from acsard.checkup.outcomes import Unsure
 from acsard.checkup.restarts import Restart, RestartedError
 from acsard.checkup.wheels import Channel, encoder_finding, wheel_map
-from acsard.config.motion_rules import longest_reply
-from acsard.config.settings import Config
-from acsard.formatting import many
+from acsard.core.config.motion_rules import longest_reply
+from acsard.core.config.settings import Config
+from acsard.core.formatting import many
 
 LIFTED = "lifted"
 

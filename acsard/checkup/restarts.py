@@ -16,10 +16,10 @@ from msgspec import Struct
 from acsard.checkup import outcomes
 from acsard.checkup.findings import Finding, motor_names
 from acsard.checkup.motion import BOOT_S, GLANCE_S, ZERO, Reply
-from acsard.config.settings import McuConfig
-from acsard.mcu.codec import Motors
-from acsard.mcu.session import IDENTITY
-from acsard.values import AcsardError
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.codec import Motors
+from acsard.core.link.session import IDENTITY
+from acsard.core.values import AcsardError
 
 ASKED_S = 1.0
 """Time after the question within which an identification is its answer, s."""

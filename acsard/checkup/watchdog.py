@@ -23,8 +23,8 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import Reply
 from acsard.checkup.wheels import run_up
-from acsard.config.wire_time import FIELD
-from acsard.mcu.codec import LETTERS, Motors
+from acsard.core.config.wire_time import FIELD
+from acsard.core.link.codec import LETTERS, Motors
 
 FED = 0.75
 """Fraction of the travel at full speed from which on damaged lines feed the watchdog.

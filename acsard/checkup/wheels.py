@@ -16,9 +16,9 @@ from acsard.checkup import motion, outcomes
 from acsard.checkup.board import Board, Operator
 from acsard.checkup.findings import Finding, motor_name, wheel_of, words
 from acsard.checkup.motion import GLANCE_S, PROBE_MOVES, SPEED, ZERO, moving
-from acsard.config.settings import McuConfig
-from acsard.mcu.codec import LETTERS, Motors
-from acsard.values import WHEELS
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.codec import LETTERS, Motors
+from acsard.core.values import WHEELS
 
 TOLERANCE = 0.25
 """Largest relative error of an encoder's speed that still belongs to the motor."""

@@ -19,10 +19,10 @@ from typing import NoReturn
 
 from acsard import __version__
 from acsard.cli.exits import code_of
-from acsard.config.nearest import nearest
-from acsard.formatting import lines
+from acsard.core.config.nearest import nearest
+from acsard.core.formatting import lines
+from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
-from acsard.values import AcsardError
 
 VERBS = (
     "run",

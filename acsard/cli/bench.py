@@ -74,7 +74,7 @@ def main(args: argparse.Namespace) -> int:
 
     from acsard.bench.measure import bench_config, measure
     from acsard.bench.results_table import parts
-    from acsard.serial.device import require
+    from acsard.daemon.serial.device import require
     from acsard.terminal.output import show
 
     port = "" if args.port in (None, "sim") else args.port

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonAttendant
     from acsard.calibration.solve import Calibration
     from acsard.calibration.tape_distance import Tape
-    from acsard.config.settings import DriveConfig
+    from acsard.core.config.settings import DriveConfig
 
 DESCRIPTION = """\
 Find the wheels' radii and the effective track, each with its standard deviation, and tell what they
@@ -152,7 +152,7 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
     from acsard.calibration.log_table import AS_CSV, LogError, noted, read
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
-    from acsard.record.walk import MAGIC
+    from acsard.recording.walk import MAGIC
 
     if log.is_dir():
         raise LogError(f"it is a directory (a bag of ROS, perhaps): {AS_CSV}")
@@ -182,8 +182,8 @@ def _measured(log: Path) -> bytes:
     """
     from acsard.calibration.log_table import AS_CSV, LogError
     from acsard.host.errors import RecordingError
-    from acsard.record.export import measured
-    from acsard.record.file import Recording
+    from acsard.recording.export import measured
+    from acsard.recording.file import Recording
 
     try:
         recording = Recording(log)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
     from acsard.client.legs import Robot
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
 
 DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
 
@@ -69,13 +69,13 @@ def guided(
     A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
     `RefusedError`.
     """
-    from acsard.bus.address import address_of
     from acsard.calibration.guided.legs import GuideError, setup
     from acsard.calibration.guided.ways import KINDS
     from acsard.cli.common import require_one
     from acsard.client import connect
     from acsard.client.legs import SOURCE, Robot
-    from acsard.messages.topics import full_key
+    from acsard.core.messages.topics import full_key
+    from acsard.daemon.bus.address import address_of
 
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
@@ -142,7 +142,7 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
     import msgspec
 
     from acsard.calibration.guided.legs import GuideError
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
 
     config = msgspec.convert(client.get("config"), Config)
     if write and (trouble := differing(config, mine, where)):
@@ -199,7 +199,7 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
     """Return a separate session for positions that the daemon does not publish, or None."""
     if not args.positions_at:
         return None
-    from acsard.bus.zenoh_sessions import client_session
+    from acsard.daemon.bus.zenoh_sessions import client_session
 
     session = client_session(args.positions_at, tls)
     stack.callback(session.close)

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import MANY, add_bus, robots_address
-from acsard.formatting import json_line, lines, printable
+from acsard.core.formatting import json_line, lines, printable
+from acsard.core.messages.topics import SERVICES
 from acsard.host.errors import Exit
-from acsard.messages.topics import SERVICES
 
 if TYPE_CHECKING:
     from acsard.client import Client
@@ -51,8 +51,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Call the service and print its answer."""
     from acsard.client import connect
+    from acsard.core.messages.encodings import encode
     from acsard.host.errors import UsageError
-    from acsard.messages.encodings import encode
 
     wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
     if len(args.values) != len(wanted):
@@ -88,12 +88,12 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    from acsard.bus import robot_discovery
-    from acsard.bus.robot_discovery import ALL, present, seen
     from acsard.cli.echo import of_robot
-    from acsard.messages.encodings import encode
-    from acsard.messages.schema import ServiceReply
-    from acsard.values import AcsardError
+    from acsard.core.messages.encodings import encode
+    from acsard.core.messages.schema import ServiceReply
+    from acsard.core.values import AcsardError
+    from acsard.daemon.bus import robot_discovery
+    from acsard.daemon.bus.robot_discovery import ALL, present, seen
 
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
     robot_discovery.stop(robot.session, ids, robot.caller)

@@ -25,9 +25,9 @@ def main(args: argparse.Namespace) -> int:
     """Check the configuration and print it."""
     import msgspec
 
-    from acsard.config.contradictions import warnings
-    from acsard.config.parsing import effective
-    from acsard.config.writing import document
+    from acsard.core.config.contradictions import warnings
+    from acsard.core.config.parsing import effective
+    from acsard.core.config.writing import document
 
     where, config = load(args.config)
     plain = effective(config)

@@ -8,14 +8,14 @@ import sys
 
 from msgspec.structs import replace
 
-from acsard.bus.address import Address, address_of
-from acsard.config import parsing as configuration
-from acsard.config.parsing import ConfigError
-from acsard.config.settings import RECORD, Config
-from acsard.formatting import many, printable
+from acsard.core.config import parsing as configuration
+from acsard.core.config.parsing import ConfigError
+from acsard.core.config.settings import RECORD, Config
+from acsard.core.formatting import many, printable
+from acsard.core.messages.topics import key_hint, row_of, unknown
+from acsard.daemon.bus.address import Address, address_of
 from acsard.host.config_file import find
 from acsard.host.errors import Exit, ExitError, UsageError
-from acsard.messages.topics import key_hint, row_of, unknown
 
 Overrides = dict[str, dict[str, object]]
 
@@ -113,7 +113,7 @@ def robot_address(args: argparse.Namespace) -> Address:
 
 def require_one(args: argparse.Namespace) -> None:
     """Raise `UsageError` if `--id` names several robots."""
-    from acsard.bus.robot_discovery import named
+    from acsard.daemon.bus.robot_discovery import named
 
     if named(args.id or ""):
         raise UsageError(
@@ -127,7 +127,7 @@ def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
 
     The ids are `("*",)` for all robots and `()` for a single robot.
     """
-    from acsard.bus.robot_discovery import named
+    from acsard.daemon.bus.robot_discovery import named
 
     many = named(args.id or "")
     _, config = load(args.config)

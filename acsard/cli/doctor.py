@@ -32,7 +32,7 @@ def main(args: argparse.Namespace) -> int:
     import msgspec
     from rich.text import Text
 
-    from acsard.bus.address import address_of
+    from acsard.daemon.bus.address import address_of
     from acsard.doctor.examination import examine
     from acsard.terminal.output import show_whole
 

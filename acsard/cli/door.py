@@ -31,9 +31,9 @@ def main(args: argparse.Namespace) -> int:
     """Run the gateway until a signal ends it or until it must be restarted."""
     import os
 
-    from acsard.bus.zenoh_sessions import log_from_environment
-    from acsard.door.supervision import Watched
-    from acsard.door.tls_gateway import Door
+    from acsard.daemon.bus.zenoh_sessions import log_from_environment
+    from acsard.daemon.gateway.supervision import Watched
+    from acsard.daemon.gateway.tls_gateway import Door
     from acsard.host.logs import Log
     from acsard.host.systemd import Systemd
 

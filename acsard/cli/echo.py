@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from acsard import formatting
 from acsard.cli.common import (
     MANY,
     add_bus,
@@ -16,13 +15,14 @@ from acsard.cli.common import (
     robots_address,
     warn_of_unknown,
 )
+from acsard.core import formatting
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     import zenoh
 
     from acsard.client import Client
-    from acsard.messages.encodings import Decoder
+    from acsard.core.messages.encodings import Decoder
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -60,9 +60,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, a count or a timeout ends it."""
-    from acsard.bus.robot_discovery import follow
     from acsard.cli.waiting import explained, lost_by, nothing, waits_for
     from acsard.client import connect
+    from acsard.daemon.bus.robot_discovery import follow
 
     where, many = robots_address(args)
     endpoint, robot_id, tls = where
@@ -110,8 +110,8 @@ def _print(
         of_many: whether each line names its robot.
         heard: called for each message.
     """
-    from acsard.bus.robot_discovery import robot_of
-    from acsard.bus.subscription import encoded
+    from acsard.daemon.bus.robot_discovery import robot_of
+    from acsard.daemon.bus.subscription import encoded
 
     try:
         for number, sample in enumerate(samples, 1):
@@ -127,10 +127,10 @@ def _print(
 
 def _shortened(key: str) -> Decoder[Any]:
     """Return the decoder of a key that has a short form. Raises `ExitError` for any other key."""
-    from acsard.messages.encodings import Decoder
-    from acsard.messages.schema import MESSAGES
-    from acsard.messages.short import SHORT
-    from acsard.messages.topics import TOPICS, by_key
+    from acsard.core.messages.encodings import Decoder
+    from acsard.core.messages.schema import MESSAGES
+    from acsard.core.messages.short import SHORT
+    from acsard.core.messages.topics import TOPICS, by_key
 
     kinds = {kind.__name__: kind for kind in SHORT}
     topic = by_key(key)
@@ -142,8 +142,8 @@ def _shortened(key: str) -> Decoder[Any]:
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
     """Return a message as a printable line. A message that cannot be decoded is printed as JSON."""
-    from acsard.messages.encodings import DecodeError
-    from acsard.messages.short import short
+    from acsard.core.messages.encodings import DecodeError
+    from acsard.core.messages.short import short
 
     if decoder is not None:
         try:
@@ -166,9 +166,9 @@ def _record(
     """Print rows of all keys until Ctrl-C, until `most` rows, or after `timeout` s of silence."""
     import time
 
-    from acsard.bus.subscription import encoded
     from acsard.calibration.log_table import HEADER, KEYS, row
     from acsard.client.synchronous import decoder
+    from acsard.daemon.bus.subscription import encoded
     from acsard.host import clock
 
     for key in keys:
@@ -194,7 +194,7 @@ def _record(
 
 def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
     """Print which robots are present now, because a silent robot looks like a missing one."""
-    from acsard.bus.robot_discovery import ALL, present
+    from acsard.daemon.bus.robot_discovery import ALL, present
     from acsard.host.errors import NoAnswerError
 
     try:
@@ -222,7 +222,7 @@ def json_line(encoding: str, payload: bytes) -> str:
     """
     import msgspec
 
-    from acsard.messages.encodings import DecodeError, detect
+    from acsard.core.messages.encodings import DecodeError, detect
 
     try:
         form = detect(encoding, payload)

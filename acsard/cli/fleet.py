@@ -43,8 +43,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Show the robots until the operator leaves, or print one table."""
-    from acsard.bus.robot_discovery import ALL
     from acsard.client import connect
+    from acsard.daemon.bus.robot_discovery import ALL
     from acsard.terminal.output import has_screen
     from acsard.top import terminal
     from acsard.top.fleet import Fleet

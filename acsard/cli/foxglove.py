@@ -7,7 +7,7 @@ import signal
 import sys
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.formatting import lines
+from acsard.core.formatting import lines
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 

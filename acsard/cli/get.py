@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 
-from acsard import formatting
 from acsard.cli.common import MANY, add_bus, require_asked, robots_address
-from acsard.formatting import printable
+from acsard.core import formatting
+from acsard.core.formatting import printable
+from acsard.core.values import AcsardError
 from acsard.host.errors import Exit
-from acsard.values import AcsardError
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -29,9 +29,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Query the key and print its answer, or one answer per robot."""
 
-    from acsard.bus.robot_discovery import present
     from acsard.cli.echo import json_line, of_robot
     from acsard.client import connect
+    from acsard.daemon.bus.robot_discovery import present
 
     require_asked(args.key)
     (endpoint, robot_id, tls), many = robots_address(args)

@@ -8,14 +8,14 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from acsard.bus.tls import CA, CERTIFICATE, KEY
 from acsard.cli.common import add_config, load
-from acsard.config.settings import Config
-from acsard.config.validation import write
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import write
+from acsard.core.values import ROLES
+from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.host.errors import UsageError
 from acsard.host.service_installation import TLS
 from acsard.lan import identities
-from acsard.values import ROLES
 
 MOST_DAYS = 3650
 
@@ -186,8 +186,8 @@ def main_renew(args: argparse.Namespace) -> int:
 
 def main_router(args: argparse.Namespace) -> int:
     """Print the configuration of a fleet's router."""
-    from acsard.bus.address import require_id
-    from acsard.door.fleet_router import router_file
+    from acsard.daemon.bus.address import require_id
+    from acsard.daemon.gateway.fleet_router import router_file
     from acsard.host.service_installation import source
 
     for robot in args.robots:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 from acsard.cli import log_export, log_report, log_span
 from acsard.cli.common import load
 from acsard.cli.log_progress import telling
-from acsard.formatting import json_line, many, printable
+from acsard.core.formatting import json_line, many, printable
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.record.closing import Closing
-    from acsard.record.file import Recording
-    from acsard.record.story import Told
+    from acsard.recording.closing import Closing
+    from acsard.recording.file import Recording
+    from acsard.recording.story import Told
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
@@ -80,8 +80,8 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 def list_all(args: argparse.Namespace) -> int:
     """Print a line for each recording."""
     from acsard.host.errors import RecordingError
-    from acsard.record.closing import closing
-    from acsard.record.file import Recording
+    from acsard.recording.closing import closing
+    from acsard.recording.file import Recording
     from acsard.terminal.output import show
     from acsard.terminal.tables import table
 
@@ -101,7 +101,7 @@ def list_all(args: argparse.Namespace) -> int:
 
 
 def _row(path: Path, last: Closing, note: str = "") -> tuple[str, ...]:
-    from acsard.record.closing import how_it_ends
+    from acsard.recording.closing import how_it_ends
 
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
@@ -112,7 +112,7 @@ def _row(path: Path, last: Closing, note: str = "") -> tuple[str, ...]:
 def _row_of_all(recording: Recording) -> tuple[str, ...]:
     """Return the row of a recording without an end. The whole recording must be read for it."""
     from acsard.host.errors import RecordingError
-    from acsard.record.file import Gist, event_of
+    from acsard.recording.file import Gist, event_of
 
     gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
@@ -136,7 +136,7 @@ def _state(recording: Recording) -> str:
 
 def _ending(recording: Recording) -> str:
     """Return why the recording ended other than by a normal end of the daemon, or ""."""
-    from acsard.record.closing import how_it_ends
+    from acsard.recording.closing import how_it_ends
 
     if not recording.ended:
         return "no end: cut, or being written"
@@ -145,8 +145,8 @@ def _ending(recording: Recording) -> str:
 
 def show_one(args: argparse.Namespace) -> int:
     """Print the timeline of a recording."""
-    from acsard.record.replayed import steps
-    from acsard.record.story import Story, Told
+    from acsard.recording.replayed import steps
+    from acsard.recording.story import Story, Told
 
     recording = _recording(args)
     begin, end = log_span.span(args, recording)
@@ -182,7 +182,7 @@ def replay_one(args: argparse.Namespace) -> int:
 
     Returns 1 if they differ; with --config a difference is expected and it returns 0.
     """
-    from acsard.record.replayed import (
+    from acsard.recording.replayed import (
         because,
         compared,
         config_of,
@@ -213,8 +213,8 @@ def replay_one(args: argparse.Namespace) -> int:
 
 def recover_one(args: argparse.Namespace) -> int:
     """Rewrite an unfinished or damaged recording as a finished file."""
-    from acsard.record.beside import beside
-    from acsard.record.file import rewrite
+    from acsard.recording.beside import beside
+    from acsard.recording.file import rewrite
 
     recording, new = _recording(args), Path(args.new)
     try:
@@ -247,7 +247,7 @@ def report_one(args: argparse.Namespace) -> int:
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
-    from acsard.record.directory import listed
+    from acsard.recording.directory import listed
 
     where = Path(args.directory or load(None)[1].record.directory or SERVICE)
     try:
@@ -266,7 +266,7 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
 
 
 def _recording(args: argparse.Namespace) -> Recording:
-    from acsard.record.file import Recording
+    from acsard.recording.file import Recording
 
     name = args.file
     if name is not None and not re.fullmatch(r"\d{1,9}", name):
@@ -281,7 +281,7 @@ def _recording(args: argparse.Namespace) -> Recording:
 
 
 def _sentence(one: Told) -> str:
-    from acsard.ros.shapes import how_often
+    from acsard.core.ros.shapes import how_often
 
     by = f" (by {one.by})" if one.by else ""
     times = how_often(one.text, one.count)

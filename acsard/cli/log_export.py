@@ -12,8 +12,8 @@ from acsard.cli.log_progress import telling
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.record.export import Kind
-    from acsard.record.file import Recording
+    from acsard.recording.export import Kind
+    from acsard.recording.file import Recording
 
 DESCRIPTION = """\
 Write what the robot said then as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag play`:
@@ -46,7 +46,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
 
 def export_one(recording: Recording, args: argparse.Namespace) -> str:
     """Write the file, print a summary, and return why it ends early, or "" if it is complete."""
-    from acsard.record.export import Span, export
+    from acsard.recording.export import Span, export
 
     kind: Kind = args.kind
     new = Path(args.new) if args.new else _name(recording.path, kind)
@@ -69,6 +69,6 @@ def _name(path: Path, kind: Kind) -> Path:
 
     The directory of the recordings belongs to the service.
     """
-    from acsard.record.export import SUFFIX
+    from acsard.recording.export import SUFFIX
 
     return Path(path.name.partition(".")[0] + SUFFIX[kind])

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from acsard.record.file import Recording
+    from acsard.recording.file import Recording
 
 
 @contextmanager
@@ -17,7 +17,7 @@ def telling(recording: Recording) -> Iterator[Callable[[int], None]]:
 
     The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
     """
-    from acsard.record.closing import closing
+    from acsard.recording.closing import closing
 
     if not sys.stderr.isatty():
         yield lambda wall_ns: None

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from acsard.cli import log_span
 from acsard.cli.log_progress import telling
+from acsard.core.values import NS_PER_S
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
-from acsard.values import NS_PER_S
 
 if TYPE_CHECKING:
-    from acsard.record.file import Recording
+    from acsard.recording.file import Recording
 
 DESCRIPTION = """\
 Draw what happened as one HTML file that needs no network. Needs the library plotly; without it, it
@@ -66,7 +66,7 @@ def report_one(
     recording: Recording, args: argparse.Namespace, plotly: str, words: Words
 ) -> list[str]:
     """Write the report, print a summary, and return notes about the recording."""
-    from acsard.record.beside import beside
+    from acsard.recording.beside import beside
 
     if args.held:
         return _held(recording, args, plotly, words)
@@ -90,7 +90,7 @@ def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Wo
     The progress in percent goes to standard error.
     """
     from acsard.host.processes import end_with_parent
-    from acsard.record.closing import closing
+    from acsard.recording.closing import closing
 
     end_with_parent(signal.SIGKILL)
     last, began = closing(recording.path), recording.about.wall_ns / 1e9
@@ -120,7 +120,7 @@ def _drawn(
 
     `tell` is called with the wall-clock time reached, in ns.
     """
-    from acsard.record.replayed import EVERY, Onlooker, verdict
+    from acsard.recording.replayed import EVERY, Onlooker, verdict
     from acsard.report.account import Origin, notes
     from acsard.report.course import Course
     from acsard.report.page import page

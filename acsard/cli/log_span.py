@@ -14,10 +14,10 @@ import time
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-from acsard.values import NS_PER_S, Instant
+from acsard.core.values import NS_PER_S, Instant
 
 if TYPE_CHECKING:
-    from acsard.record.file import Recording
+    from acsard.recording.file import Recording
 
 SET_NS = 5 * NS_PER_S
 """Difference between wall clock and monotonic clock that counts as a clock step, ns."""
@@ -113,7 +113,7 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 def _instants(data: bytes) -> list[Instant]:
     """Return the time of each step in a message."""
-    from acsard.record.rows import BatchError, decode
+    from acsard.recording.rows import BatchError, decode
 
     try:
         return [step.inputs.now for step in decode(data)]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from acsard.asking.json_lines import JsonPerson
     from acsard.checkup.board import Wire
     from acsard.checkup.findings import Finding
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
 
 DESCRIPTION = """\
 Find out on your own robot, wheels lifted, what its microcontroller speaks and whether it keeps
@@ -135,10 +135,10 @@ def _checked(
 def _wire(config: Config) -> Wire:
     """Return the port, or the simulator in virtual time, with which no check has to wait."""
     if config.mcu.port == SIMULATOR:
-        from acsard.sim.fake_mcu import FakeMcu
-        from acsard.sim.virtual_wire import VirtualWire
+        from acsard.core.simulator.fake_mcu import FakeMcu
+        from acsard.core.simulator.virtual_wire import VirtualWire
 
         return VirtualWire(FakeMcu(config))
-    from acsard.serial.blocking import BlockingPort
+    from acsard.daemon.serial.blocking import BlockingPort
 
     return BlockingPort(config.mcu.port)

@@ -15,7 +15,7 @@ from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
     from acsard.client import Client, Subscription
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
     from acsard.error_budget.budget import Budget
     from acsard.error_budget.daemon_messages import Feed
 
@@ -86,7 +86,7 @@ def _config(robot: Client, path: str | None) -> Config:
     """
     import msgspec
 
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
     from acsard.host.errors import NoAnswerError, NotPermittedError
 
     try:
@@ -116,9 +116,9 @@ def _await_line(robot: Client, lines: Subscription) -> None:
 
 def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None:
     """Pass all messages of the next `seconds` s to `feed`."""
-    from acsard.bus.subscription import encoded
     from acsard.client.synchronous import decoder
-    from acsard.messages.encodings import DecodeError
+    from acsard.core.messages.encodings import DecodeError
+    from acsard.daemon.bus.subscription import encoded
 
     decoders = {key: decoder(key) for key in queues}
     end = time.monotonic() + seconds

@@ -32,10 +32,10 @@ def main(args: argparse.Namespace) -> int:
     """Supervise a router until a signal, or be the supervised router (`--held`)."""
     import os
 
-    from acsard.bus.zenoh_sessions import log_from_environment
-    from acsard.config.settings import LogConfig
-    from acsard.door.fleet_router import Router
-    from acsard.door.supervision import Watched
+    from acsard.core.config.settings import LogConfig
+    from acsard.daemon.bus.zenoh_sessions import log_from_environment
+    from acsard.daemon.gateway.fleet_router import Router
+    from acsard.daemon.gateway.supervision import Watched
     from acsard.host.logs import Log
     from acsard.host.systemd import Systemd
 
@@ -54,7 +54,7 @@ async def _kept(file: str, log: Log) -> int:
     """Run one router process after the other, until a signal or an exit code that is final."""
     import signal
 
-    from acsard.runtime.doorkeeper import ROUTER, keep_door
+    from acsard.daemon.doorkeeper import ROUTER, keep_door
 
     keeper = asyncio.ensure_future(keep_door(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

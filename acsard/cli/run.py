@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard.cli.common import Overrides, add_config, load, recorded
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 
 _BANNER = """\
 acsard {version}, robot {robot}
@@ -88,10 +88,10 @@ def main(args: argparse.Namespace) -> int:
     import faulthandler
 
     from acsard import __version__
-    from acsard.config.contradictions import warnings
+    from acsard.core.config.contradictions import warnings
+    from acsard.core.values import Event
+    from acsard.daemon import daemon
     from acsard.host.logs import Log, Writer
-    from acsard.runtime import daemon
-    from acsard.values import Event
 
     where, config = load(args.config, overrides(args))
     config = recorded(config)
@@ -140,7 +140,7 @@ def page(config: Config, where: str) -> list[str] | None:
     there = find_spec("aiohttp") and find_spec("segno")
     if not (config.web.page and looked_at and there):
         return None
-    from acsard.bus.zenoh_sessions import reachable
+    from acsard.daemon.bus.zenoh_sessions import reachable
 
     words = ["web", "--id", config.robot.id]
     if Path(where).is_file():
@@ -162,7 +162,7 @@ def _bus(config: Config) -> str:
 
 def reach(args: argparse.Namespace) -> str:
     """Return the options that other tools need to find this daemon, as text for the banner."""
-    from acsard.bus.zenoh_sessions import reachable
+    from acsard.daemon.bus.zenoh_sessions import reachable
 
     listens = args.listen and reachable(args.listen)
     given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
@@ -189,7 +189,7 @@ def banner(
         served: whether the page is served.
     """
     from acsard import __version__
-    from acsard.values import ROOT
+    from acsard.core.values import ROOT
 
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:

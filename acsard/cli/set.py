@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_bus, robot_address
-from acsard.formatting import json_line, lines
+from acsard.core.formatting import json_line, lines
 from acsard.host.config_file import writable
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 
 if TYPE_CHECKING:
-    from acsard.values import Plain
+    from acsard.core.values import Plain
 
 DESCRIPTION = """\
 Change settings of the robot that runs, all or none: limits, timeouts, covariances, publishing
@@ -52,10 +52,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Set the settings, or list them if none is given."""
     from acsard.client import connect
-    from acsard.config.lowered import stays
+    from acsard.core.config.lowered import stays
+    from acsard.core.messages.encodings import encode
     from acsard.host.config_file import change, require_changeable
     from acsard.host.errors import MendableError
-    from acsard.messages.encodings import encode
 
     settings = pairs(args.settings)
     file = _file(args.config, settings) if args.write else None
@@ -126,9 +126,9 @@ def _tell(config: object, as_json: bool) -> None:
     """Print the settings that can be changed, with their present values."""
     import msgspec
 
-    from acsard.config.live import flat, live
-    from acsard.config.validation import show
-    from acsard.ros.parameters import described
+    from acsard.core.config.live import flat, live
+    from acsard.core.config.validation import show
+    from acsard.core.ros.parameters import described
 
     now = {key: value for key, value in flat(config) if live(key)}
     if as_json:

@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 from acsard.cli.common import add_config, load
-from acsard.config.named_faults import FAULTS, RESET, NamedFault, forms, named
-from acsard.config.settings import Config
+from acsard.core.config.named_faults import FAULTS, RESET, NamedFault, forms, named
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.host.errors import Exit, ExitError
-from acsard.sim.fake_mcu import FakeMcu
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -82,8 +82,8 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
     import signal
     from contextlib import ExitStack
 
+    from acsard.daemon.serial.simulated_board import SimPty
     from acsard.host import clock
-    from acsard.serial.simulated_board import SimPty
 
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

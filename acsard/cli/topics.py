@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from acsard.cli.common import add_config, load
 
 if TYPE_CHECKING:
-    from acsard.config.settings import Config
-    from acsard.messages.schema import Topics
+    from acsard.core.config.settings import Config
+    from acsard.core.messages.schema import Topics
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -27,8 +27,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the table."""
-    from acsard.incoming.queries import topic_table
-    from acsard.messages.encodings import encode
+    from acsard.core.incoming.queries import topic_table
+    from acsard.core.messages.encodings import encode
     from acsard.terminal.output import show
     from acsard.terminal.tables import table
 
@@ -44,11 +44,11 @@ def main(args: argparse.Namespace) -> int:
 
 def ros_table(config: Config) -> Topics:
     """Return the ROS topics and services, each with the native key that it stands for."""
-    from acsard.messages.schema import TopicInfo, Topics
-    from acsard.messages.topics import by_key
-    from acsard.ros.names import full_name
-    from acsard.ros.parameters import SETTING
-    from acsard.ros.transports import left_out, ros_names
+    from acsard.core.messages.schema import TopicInfo, Topics
+    from acsard.core.messages.topics import by_key
+    from acsard.core.ros.names import full_name
+    from acsard.core.ros.parameters import SETTING
+    from acsard.core.ros.transports import left_out, ros_names
 
     ros = config.ros
     rows = []

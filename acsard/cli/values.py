@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import get_args, get_type_hints
 
-from acsard.config.live import flat, live
-from acsard.config.named_faults import ARGUMENTS, FAULTS
-from acsard.config.parsing import effective
-from acsard.config.settings import Config, LogConfig
-from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
+from acsard.core.config.live import flat, live
+from acsard.core.config.named_faults import ARGUMENTS, FAULTS
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config, LogConfig
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
 
 NUMBERS = "acsard log 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
 """Shell command that lists the recordings by number. The shell offers local files as well."""

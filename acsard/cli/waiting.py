@@ -9,11 +9,11 @@ from threading import Event, Thread
 from typing import TYPE_CHECKING
 
 from acsard.client.follower import FIRST_S
-from acsard.formatting import printable
+from acsard.core.formatting import printable
 
 if TYPE_CHECKING:
-    from acsard.bus.address import Address
     from acsard.client import Client
+    from acsard.daemon.bus.address import Address
 
 
 def nothing() -> str:
@@ -63,8 +63,8 @@ def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
     """Return a function that explains why nothing has arrived on a key."""
 
     def look() -> str:
-        from acsard.bus.quiet import why
-        from acsard.bus.robot_discovery import around
+        from acsard.daemon.bus.quiet import why
+        from acsard.daemon.bus.robot_discovery import around
 
         seen = around(robot.session, where.robot_id, where.endpoint)
         if seen is None:
@@ -85,7 +85,7 @@ def lost_by(robot: Client, where: Address) -> Callable[[], str]:
     def look() -> str:
         import zenoh
 
-        from acsard.bus.quiet import Around, why
+        from acsard.daemon.bus.quiet import Around, why
 
         try:
             if robot.session.info.links():
@@ -103,8 +103,8 @@ def of_link(where: Address) -> str:
 
     A certificate may have expired while the tool followed the robot.
     """
-    from acsard.bus.tls import trouble
-    from acsard.config.settings import TLS
+    from acsard.core.config.settings import TLS
+    from acsard.daemon.bus.tls import trouble
 
     secured = where.tls and where.endpoint.startswith(TLS)
     return trouble(where.endpoint, where.tls) if secured else ""

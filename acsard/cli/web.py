@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import Overrides, add_bus, load, recorded
-from acsard.formatting import lasting
+from acsard.core.formatting import lasting
+from acsard.core.values import ROLES
 from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
-from acsard.values import ROLES
 
 if TYPE_CHECKING:
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
     from acsard.web.listen import Listen
     from acsard.web.tokens import Vault
 
@@ -91,8 +91,8 @@ def main(args: argparse.Namespace) -> int:
 def _serve(args: argparse.Namespace, config: Config) -> int:
     import asyncio
 
-    from acsard.bus.address import address_of
-    from acsard.bus.zenoh_sessions import log_from_environment
+    from acsard.daemon.bus.address import address_of
+    from acsard.daemon.bus.zenoh_sessions import log_from_environment
     from acsard.host.logs import Log
     from acsard.web import server, tokens
     from acsard.web.listen import opened_by
@@ -165,7 +165,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:
     """Return the tokens of the robot that the options name."""
-    from acsard.bus.address import address_of
+    from acsard.daemon.bus.address import address_of
     from acsard.web.tokens import Vault, place
 
     return Vault(place(), address_of(config, args.connect, args.id, args.tls).robot_id)

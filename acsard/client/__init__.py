@@ -7,8 +7,8 @@
         print(robot.pose())
 
 `connect` is for scripts and `connect_async` for asyncio programs. Both offer the same methods and
-typed messages (`acsard.messages.schema`). Commands are signed, numbered and stamped, and each drive
-begins with zeros. The daemon's rules about stale commands and about zeros before motion are
+typed messages (`acsard.core.messages.schema`). Commands are signed, numbered and stamped, and each
+drive begins with zeros. The daemon's rules about stale commands and about zeros before motion are
 therefore satisfied without further code. A drive that the robot does not follow raises an error. A
 drive that returns has ended with the robot at rest.
 
@@ -36,11 +36,13 @@ to do:
     DecodeError                         a payload is not a message of acsard
 """
 
-from acsard.bus.identity import Identity
-from acsard.bus.subscription import Subscription
 from acsard.client.asynchronous import AsyncClient
 from acsard.client.connecting import connect, connect_async
 from acsard.client.synchronous import Client
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.values import AcsardError, Pose
+from acsard.daemon.bus.identity import Identity
+from acsard.daemon.bus.subscription import Subscription
 from acsard.host.errors import (
     CertificateError,
     NoAnswerError,
@@ -50,8 +52,6 @@ from acsard.host.errors import (
     UnreachableError,
     UsageError,
 )
-from acsard.messages.encodings import DecodeError
-from acsard.values import AcsardError, Pose
 
 __all__ = (
     "AcsardError",

@@ -8,14 +8,14 @@ from contextlib import aclosing, closing
 from functools import partial
 from typing import Any
 
-from acsard.bus.identity import Identity
-from acsard.bus.subscription import encoded
 from acsard.client.driving import UnheardError, drive
 from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, decoder
+from acsard.core.messages import schema
+from acsard.core.values import Plain, Pose
+from acsard.daemon.bus.identity import Identity
+from acsard.daemon.bus.subscription import encoded
 from acsard.host.errors import NoAnswerError
 from acsard.host.threads import in_thread
-from acsard.messages import schema
-from acsard.values import Plain, Pose
 
 
 class AsyncClient:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.messages.schema import RobotState
-from acsard.messages.signature import Signature
-from acsard.values import NS_PER_S, REST, Twist
+from acsard.core.messages.schema import RobotState
+from acsard.core.messages.signature import Signature
+from acsard.core.values import NS_PER_S, REST, Twist
 
 SEND_PERIOD_S = 0.05
 """Pause between two commands, s: 20 Hz, so five commands within the default timeout."""

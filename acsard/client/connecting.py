@@ -7,10 +7,10 @@ from contextlib import asynccontextmanager, contextmanager
 
 import zenoh
 
-from acsard.bus.address import address_by_environment
-from acsard.bus.zenoh_sessions import client_session
 from acsard.client.asynchronous import AsyncClient
 from acsard.client.synchronous import Client
+from acsard.daemon.bus.address import address_by_environment
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.threads import in_thread
 
 

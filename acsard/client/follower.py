@@ -10,7 +10,7 @@ only if it is newer than the state before it.
 
 from __future__ import annotations
 
-from acsard.messages.schema import RobotState
+from acsard.core.messages.schema import RobotState
 
 ASK_S = 0.3
 """Time without a state, s, after which it is queried. The robot may publish it seldom."""

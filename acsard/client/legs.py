@@ -11,17 +11,17 @@ from typing import Any, Protocol
 
 import zenoh
 
-from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.calibration.guided.legs import GuideError, Leg
 from acsard.calibration.runs import Run
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S
 from acsard.client.riding import Recorder, Riding
 from acsard.client.synchronous import Client
-from acsard.config.settings import Config
-from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
-from acsard.messages.topics import by_key
+from acsard.core.config.settings import Config
+from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
+from acsard.core.messages.topics import by_key
+from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 
 SOURCE = "app"
 

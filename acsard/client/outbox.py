@@ -12,8 +12,8 @@ from threading import Condition, Thread
 from typing import Never
 
 from acsard.client.commander import Commander, Wish
+from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.values import NS_PER_S
 
 Put = Callable[[Wish], object]
 """Sends one command on the bus; it may block."""

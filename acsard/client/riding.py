@@ -23,9 +23,9 @@ from acsard.calibration.log_table import Floats, Table
 from acsard.calibration.runs import Run, runs
 from acsard.client.commander import NEVER, OPENED_S, OPENING_S
 from acsard.client.follower import QUIET_S
-from acsard.config.settings import DriveConfig
-from acsard.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState, Time
-from acsard.values import NS_PER_S, REST, Twist
+from acsard.core.config.settings import DriveConfig
+from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState, Time
+from acsard.core.values import NS_PER_S, REST, Twist
 
 STREAMS = {"wheels": ("left", "right"), "gyro": ("yaw_rate",), "places": ("x", "y")}
 

@@ -14,13 +14,27 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.bus.identity import Identity, identity
-from acsard.bus.quiet import why as why_quiet
-from acsard.bus.robot_discovery import around
-from acsard.bus.subscription import Subscription, encoded, queue_on
-from acsard.bus.tls import shown_at
 from acsard.client.commander import SPACING_S, Sender
 from acsard.client.driving import UnheardError, drive
+from acsard.core.incoming.queries import BUSY
+from acsard.core.messages import schema
+from acsard.core.messages.encodings import Decoder, encode, encoding_name
+from acsard.core.messages.signature import Signature, public_name
+from acsard.core.messages.topics import (
+    VERBS,
+    by_key,
+    command_key,
+    full_key,
+    key_hint,
+    service_key,
+    unknown,
+)
+from acsard.core.values import Plain, Pose
+from acsard.daemon.bus.identity import Identity, identity
+from acsard.daemon.bus.quiet import why as why_quiet
+from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
+from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -31,20 +45,6 @@ from acsard.host.errors import (
     UsageError,
 )
 from acsard.host.own_identity import new_secret, own_name, sender_id
-from acsard.incoming.queries import BUSY
-from acsard.messages import schema
-from acsard.messages.encodings import Decoder, encode, encoding_name
-from acsard.messages.signature import Signature, public_name
-from acsard.messages.topics import (
-    VERBS,
-    by_key,
-    command_key,
-    full_key,
-    key_hint,
-    service_key,
-    unknown,
-)
-from acsard.values import Plain, Pose
 
 AGAIN_S = 0.03
 """Pause before the next try, s, if the daemon reports too many queries."""

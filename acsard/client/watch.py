@@ -8,11 +8,11 @@ from typing import Protocol
 
 import zenoh
 
-from acsard.bus.subscription import QUEUED, Subscription, encoded
 from acsard.client.commander import objection
 from acsard.client.follower import Follower
-from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import RobotState
+from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.schema import RobotState
+from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
 
 STATE = "state"
 

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from acsard.bus.address import Address
-from acsard.bus.zenoh_sessions import reachable
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
+from acsard.core.formatting import many
+from acsard.core.link.whose_silence import BUSY, is_ours
+from acsard.core.messages.diagnostics import NO_ROUTER
+from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.motion.gyro import WORDS
+from acsard.core.values import NS_PER_S, AcsardError
+from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.zenoh_sessions import reachable
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, answers, asked
-from acsard.drive.gyro import WORDS
-from acsard.formatting import many
 from acsard.host.errors import NoAnswerError
-from acsard.mcu.whose_silence import BUSY, is_ours
-from acsard.messages.diagnostics import NO_ROUTER
-from acsard.messages.schema import DiagnosticStatus
-from acsard.values import NS_PER_S, AcsardError
 
 LOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""

@@ -16,11 +16,13 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from acsard.bus.address import Address, address_of
-from acsard.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
-from acsard.config.contradictions import warnings
-from acsard.config.parsing import ConfigError, parse
-from acsard.config.settings import Config
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.settings import Config
+from acsard.core.messages.expiry import expiry
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.address import Address, address_of
+from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
 from acsard.doctor.daemon_findings import daemon, door, found, routers
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, compared
@@ -30,8 +32,6 @@ from acsard.host.errors import MendableError
 from acsard.host.extras import install
 from acsard.host.processes import holders, running
 from acsard.host.serial_ports import BOARDS, serial_devices
-from acsard.messages.expiry import expiry
-from acsard.values import NS_PER_S
 
 
 def certificates(tls: str) -> Iterator[Finding]:

@@ -10,19 +10,19 @@ import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.bus.address import Address
-from acsard.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.client import Client, connect
-from acsard.config.live import flat, live
-from acsard.config.parsing import effective, from_builtins
-from acsard.config.settings import SIMULATOR, Config
-from acsard.config.validation import write
+from acsard.core.config.live import flat, live
+from acsard.core.config.parsing import effective, from_builtins
+from acsard.core.config.settings import SIMULATOR, Config
+from acsard.core.config.validation import write
+from acsard.core.formatting import listed
+from acsard.core.messages.schema import DiagnosticStatus, Info, RobotState
+from acsard.core.values import AcsardError
+from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
 from acsard.doctor.finding import Finding, Level
-from acsard.formatting import listed
 from acsard.host import clock
 from acsard.host.processes import name_of
-from acsard.messages.schema import DiagnosticStatus, Info, RobotState
-from acsard.values import AcsardError
 
 WATCHED_S = 1.0
 """Time over which lines are counted, s: about a hundred lines."""

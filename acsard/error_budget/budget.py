@@ -1,11 +1,11 @@
 """The error budget of a drive: how much each cause contributes to the present odometry error.
 
-Each cause is propagated alone through the odometry's own error model (`drive/uncertainty.py`). The
-recorded drive is repeated until 100 m are driven, which gives the position error, and until 360 deg
-are turned to one side, which gives the heading error. The size of a cause in each step is measured
-if the feedback lines show it. This holds for time, quantisation, gaps, wheels that contradict each
-other, and the gyro noise that odometry assumes. All other sizes come from the declarations in
-`[odometry]`.
+Each cause is propagated alone through the odometry's own error model
+(`core/motion/uncertainty.py`). The recorded drive is repeated until 100 m are driven, which gives
+the position error, and until 360 deg are turned to one side, which gives the heading error. The
+size of a cause in each step is measured if the feedback lines show it. This holds for time,
+quantisation, gaps, wheels that contradict each other, and the gyro noise that odometry assumes. All
+other sizes come from the declarations in `[odometry]`.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, OdometryConfig
-from acsard.drive.kinematics import Kinematics
-from acsard.drive.noise import columns
-from acsard.drive.path import Path
-from acsard.drive.twist_uncertainty import DECIMAL, TwistUncertainty
-from acsard.drive.uncertainty import GYRO_SCALE, PoseUncertainty
+from acsard.core.config.settings import Config, OdometryConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.noise import columns
+from acsard.core.motion.path import Path
+from acsard.core.motion.twist_uncertainty import DECIMAL, TwistUncertainty
+from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
+from acsard.core.values import REST
 from acsard.error_budget.drive_log import Line, Motion, motion
 from acsard.error_budget.step_errors import Driving, Step, mirrored, rounding
-from acsard.values import REST
 
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 

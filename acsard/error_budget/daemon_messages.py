@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
-from acsard.config.settings import Config
-from acsard.error_budget.budget import Heard
-from acsard.error_budget.drive_log import Line
-from acsard.messages.schema import (
+from acsard.core.config.settings import Config
+from acsard.core.messages.schema import (
     DiagnosticArray,
     JointState,
     Message,
@@ -16,7 +14,9 @@ from acsard.messages.schema import (
     RobotState,
     TwistStamped,
 )
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
+from acsard.error_budget.budget import Heard
+from acsard.error_budget.drive_log import Line
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Keys to subscribe to."""

@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.drive.gap_variance import Gaps
-from acsard.drive.kinematics import Kinematics
-from acsard.drive.uncertainty import GYRO_SCALE
-from acsard.values import Twist, WheelSpeeds
+from acsard.core.motion.gap_variance import Gaps
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.uncertainty import GYRO_SCALE
+from acsard.core.values import Twist, WheelSpeeds
 
 Floats = npt.NDArray[np.float64]
 Counts = npt.NDArray[np.int64]

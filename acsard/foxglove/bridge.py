@@ -18,6 +18,9 @@ import zenoh
 
 from acsard.client import Client
 from acsard.client.watch import Watch
+from acsard.core.messages.topics import full_key
+from acsard.core.ros.names import full_name
+from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.facts import Facts, learn
 from acsard.foxglove.notices import Notices
@@ -27,9 +30,6 @@ from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, sta
 from acsard.foxglove.services import CALLED, STOPS, services
 from acsard.foxglove.settings import Settings
 from acsard.host import clock
-from acsard.messages.topics import full_key
-from acsard.ros.names import full_name
-from acsard.values import NS_PER_S, AcsardError
 
 GATHER_S = 0.015
 """Time to gather messages before a round. A screen shows 60 frames a second, and gathering for less

@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from acsard.config.settings import Config, RosConfig
-from acsard.drive.kinematics import Kinematics
-from acsard.incoming.commands import Arrival, Receiver, Via
-from acsard.messages.schema import Time, TwistStamped
-from acsard.messages.topics import source_keys
-from acsard.ros.shapes import asked
-from acsard.ros.transports import endpoints
+from acsard.core.config.settings import Config, RosConfig
+from acsard.core.incoming.commands import Arrival, Receiver, Via
+from acsard.core.messages.schema import Time, TwistStamped
+from acsard.core.messages.topics import source_keys
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.ros.shapes import asked
+from acsard.core.ros.transports import endpoints
 
 
 class Way(Struct, frozen=True):

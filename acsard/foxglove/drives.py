@@ -15,11 +15,11 @@ import zenoh
 from acsard.client import Client
 from acsard.client.commander import Commander, Wish
 from acsard.client.outbox import Outbox
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.values import NS_PER_S
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.twists import encoding_of, wish
 from acsard.host import clock
-from acsard.messages.encodings import DecodeError
-from acsard.values import NS_PER_S
 
 CHANNELS = 64
 """Maximum number of channels on which one viewer may publish."""

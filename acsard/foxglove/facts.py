@@ -6,12 +6,12 @@ import msgspec
 from msgspec import Struct
 
 from acsard.client import Client
-from acsard.config.parsing import from_builtins
-from acsard.config.settings import Config
+from acsard.core.config.parsing import from_builtins
+from acsard.core.config.settings import Config
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.ros.channels import CMD_VEL_IN, SOURCE, Channel, said
+from acsard.core.ros.transports import left_out
 from acsard.host.errors import ReplyError
-from acsard.messages.encodings import DecodeError
-from acsard.ros.channels import CMD_VEL_IN, SOURCE, Channel, said
-from acsard.ros.transports import left_out
 
 DEAF = (
     "what the sources command (/cmd_vel_in/…) is told to nobody who comes by TLS: see it with "

@@ -8,14 +8,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 import zenoh
 
 from acsard.client import Client
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import TwistStamped
+from acsard.core.ros.channels import CMD_VEL_IN
 from acsard.foxglove.commanders import Reader, Way, ways
 from acsard.foxglove.facts import Facts
 from acsard.host import clock
-from acsard.incoming.commands import MAX_COMMAND_BYTES, Arrival
-from acsard.messages.encodings import DecodeError
-from acsard.messages.schema import TwistStamped
-from acsard.ros.channels import CMD_VEL_IN
 
 MOST = 100
 """Maximum number of waiting commands per source, about one second of the highest accepted rate; the

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from acsard.messages.schema import Events, Happening
-from acsard.ros.shapes import Log, log
+from acsard.core.messages.schema import Events, Happening
+from acsard.core.ros.shapes import Log, log
 
 
 class News:

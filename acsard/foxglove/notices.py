@@ -10,10 +10,10 @@ from foxglove import StatusLevel
 from foxglove.websocket import WebSocketServer
 from msgspec import Struct
 
+from acsard.core.messages.schema import Time
+from acsard.core.ros.shapes import LEVELS, Log
+from acsard.core.values import NS_PER_S, Level
 from acsard.host import clock
-from acsard.messages.schema import Time
-from acsard.ros.shapes import LEVELS, Log
-from acsard.values import NS_PER_S, Level
 
 STATUS: dict[Level, StatusLevel] = {
     "info": StatusLevel.Info,

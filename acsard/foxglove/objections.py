@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from acsard.client.commander import GRACE_S
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
 
 
 class Objections:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from acsard.config.live import flat, live
+from acsard.core.config.live import flat, live
 
 
 def values(config: object) -> dict[str, Any]:

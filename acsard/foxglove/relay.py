@@ -14,17 +14,17 @@ import foxglove
 import msgspec
 import zenoh
 
-from acsard.bus.subscription import Subscription, encoded, queue_on
 from acsard.client import Client
 from acsard.client.synchronous import decoder
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import Events
+from acsard.core.messages.topics import by_key
+from acsard.core.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
+from acsard.core.ros.shapes import Log
+from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.foxglove.facts import Facts, key_of
 from acsard.foxglove.heard import Commanders
 from acsard.foxglove.news import News
-from acsard.messages.encodings import DecodeError
-from acsard.messages.schema import Events
-from acsard.messages.topics import by_key
-from acsard.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
-from acsard.ros.shapes import Log
 
 MOST = 100
 """Maximum number of messages of a topic per round; a second's worth at 100 Hz."""

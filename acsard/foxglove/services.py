@@ -9,13 +9,13 @@ import foxglove
 import msgspec
 
 from acsard.client import Client
-from acsard.config.settings import RosConfig
-from acsard.messages.encodings import DecodeError, Decoder, encode
-from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.schema import ServiceReply, SetPose
-from acsard.messages.topics import SERVICES
-from acsard.ros.names import full_name
-from acsard.values import AcsardError
+from acsard.core.config.settings import RosConfig
+from acsard.core.messages.encodings import DecodeError, Decoder, encode
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.schema import ServiceReply, SetPose
+from acsard.core.messages.topics import SERVICES
+from acsard.core.ros.names import full_name
+from acsard.core.values import AcsardError
 
 CALLED = tuple(verb for verb in SERVICES if verb != "set")
 """Services that are offered; `set` is left out because viewers set parameters instead."""

@@ -7,10 +7,10 @@ from threading import Lock
 from typing import Any
 
 from acsard.client import Client
+from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove import parameters
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
-from acsard.values import NS_PER_S, AcsardError
 
 OLD_NS = NS_PER_S
 """Age at which the settings are read again for a viewer that asks."""

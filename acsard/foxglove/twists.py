@@ -7,10 +7,10 @@ reason.
 from __future__ import annotations
 
 from acsard.client.commander import Wish
-from acsard.config.settings import DriveConfig, JointsConfig
-from acsard.drive.kinematics import Kinematics
-from acsard.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
-from acsard.messages.encodings import DecodeError, encoding_name
+from acsard.core.config.settings import DriveConfig, JointsConfig
+from acsard.core.incoming.commands import STAMPED_TWISTS, TWISTS, Arrival, Receiver
+from acsard.core.messages.encodings import DecodeError, encoding_name
+from acsard.core.motion.kinematics import Kinematics
 
 _receiver = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 """Decoder for twists only. They depend on neither joints nor wheels, so the defaults are

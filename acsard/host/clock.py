@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from acsard.values import Instant
+from acsard.core.values import Instant
 
 mono_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_MONOTONIC_RAW)
 """Read the monotonic clock, ns. A dozen reads a period are too many for a Python wrapper."""

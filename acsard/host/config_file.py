@@ -6,9 +6,9 @@ import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from acsard.config.editing import edited
-from acsard.config.parsing import ConfigError, parse
-from acsard.config.settings import Config
+from acsard.core.config.editing import edited
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.settings import Config
 from acsard.host.atomic_file import replace
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install

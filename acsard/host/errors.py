@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from acsard.values import AcsardError
+from acsard.core.values import AcsardError
 
 
 class MendableError(AcsardError):

@@ -19,10 +19,10 @@ import threading
 from collections.abc import Mapping, MutableMapping
 from typing import Any, Literal, TextIO
 
-from acsard.config.settings import LogConfig
-from acsard.formatting import printable
+from acsard.core.config.settings import LogConfig
+from acsard.core.formatting import printable
+from acsard.core.values import Event, EventName
 from acsard.host.terminal_modes import coloured
-from acsard.values import Event, EventName
 
 # structlog imports rich to draw tracebacks, and the log has none. The daemon's modules take 39 MB
 # without rich and 44 MB with it, so rich is hidden while structlog is imported.
@@ -88,7 +88,7 @@ Form = Literal["console", "json", "logfmt", "journal"]
 
 QUEUED_LINES = 1000
 """Largest number of queued lines: more than the daemon logs in a minute with all faults at once
-(`drive/tally.py`).
+(`core/motion/tally.py`).
 """
 
 MAX_VALUE = 500

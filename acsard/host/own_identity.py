@@ -11,8 +11,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from acsard.core.messages.signature import MAX_NAME
 from acsard.host.processes import called
-from acsard.messages.signature import MAX_NAME
 
 SECRET_BYTES = 16
 """Size of the random secret: 128 bits, which no program can guess."""

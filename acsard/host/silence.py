@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
 
 MOMENT_NS = NS_PER_S // 2
 """Longest time that counts between two judgements, ns. A longer gap means that the machine or a

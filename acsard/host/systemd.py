@@ -10,7 +10,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Mapping
 
-from acsard.values import NS_PER_S, Outputs
+from acsard.core.values import NS_PER_S, Outputs
 
 FEEDS_PER_WATCHDOG = 4
 """Number of times that the watchdog is fed within its timeout. No separate timer feeds it,

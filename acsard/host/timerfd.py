@@ -12,8 +12,8 @@ import os
 import sys
 from typing import Final
 
+from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.values import NS_PER_S
 
 CLOCK_MONOTONIC: Final = 1
 _FLAGS: Final = os.O_NONBLOCK | os.O_CLOEXEC

@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from acsard.bus.tls import CA, CERTIFICATE, KEY
+from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.lan.identities import CA_KEY
 
 SLACK = timedelta(hours=1)

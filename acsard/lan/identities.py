@@ -15,12 +15,12 @@ from getpass import getpass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.bus.tls import CA
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
+from acsard.core.values import ROLES
+from acsard.daemon.bus.tls import CA
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
 from acsard.host.own_identity import own_addresses
-from acsard.values import ROLES
 
 if TYPE_CHECKING:
     from acsard.lan.authority import Authority

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 from msgspec import Struct
 
-from acsard.config.live import flat
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
-from acsard.config.validation import show
-from acsard.formatting import lasting, listed, many
+from acsard.core.config.live import flat
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import show
+from acsard.core.formatting import lasting, listed, many
 from acsard.report.course import Course, Mark
 
 Clock = Callable[[float, bool], str]

@@ -6,12 +6,12 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from acsard.config.settings import Source
-from acsard.drive.words import REFUSED, waiting
-from acsard.record.steps import Step
-from acsard.robot import Robot
-from acsard.thinning import Band
-from acsard.values import NS_PER_S, Command, Outputs, Twist
+from acsard.core.config.settings import Source
+from acsard.core.motion.words import REFUSED, waiting
+from acsard.core.robot import Robot
+from acsard.core.thinning import Band
+from acsard.core.values import NS_PER_S, Command, Outputs, Twist
+from acsard.recording.steps import Step
 
 DOES = ("refused", "waits", "sends", "drives")
 """States of a source that is not silent, in the order in which they win when short spans are

@@ -13,14 +13,14 @@ from collections.abc import Mapping
 
 from msgspec import Struct
 
-from acsard.config.settings import Config
-from acsard.mcu.contract import WATCHDOG_S
-from acsard.record.steps import MICRO, Step
-from acsard.record.story import Story, Told
+from acsard.core.config.settings import Config
+from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.robot import Robot
+from acsard.core.thinning import Band, Curve, Place, Point, Track
+from acsard.core.values import NS_PER_S, Outputs, Twist
+from acsard.recording.steps import MICRO, Step
+from acsard.recording.story import Story, Told
 from acsard.report.commanders import LOOK_S, MOST_TEXT, Commanders
-from acsard.robot import Robot
-from acsard.thinning import Band, Curve, Place, Point, Track
-from acsard.values import NS_PER_S, Outputs, Twist
 
 GOOD = "lines"
 """Name of the counter of lines that were parsed."""

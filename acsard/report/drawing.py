@@ -16,9 +16,9 @@ from collections.abc import Iterable
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from acsard.formatting import printable
+from acsard.core.formatting import printable
+from acsard.core.thinning import Place
 from acsard.report.course import Course, Mark, Marks
-from acsard.thinning import Place
 
 WISHED, LIMITED, MEASURED = "#e08600", "#2f7ed8", "#159a6b"
 

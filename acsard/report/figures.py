@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
+from acsard.core.thinning import Point, Span
+from acsard.core.values import WHEELS
 from acsard.report.commanders import OTHERS
 from acsard.report.course import Course, Mark
 from acsard.report.drawing import (
@@ -27,8 +29,6 @@ from acsard.report.drawing import (
     path,
     sentence,
 )
-from acsard.thinning import Point, Span
-from acsard.values import WHEELS
 
 ROW_PX, ROOM_PX = 54, 68
 """Height of a row of bands, and additional height for the time axis."""

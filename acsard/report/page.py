@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import msgspec
 
-from acsard.formatting import lasting, printable
+from acsard.core.formatting import lasting, printable
 from acsard.report.account import Clock, Origin, differences, notes, reasons, rows, summary
 from acsard.report.course import Course
 from acsard.report.drawing import Figure

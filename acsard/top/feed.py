@@ -8,9 +8,9 @@ from collections import deque
 from acsard.client import Client
 from acsard.client.follower import restarted
 from acsard.client.watch import Watch
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import Info, RobotState
 from acsard.host.errors import MendableError, ReplyError
-from acsard.messages.encodings import DecodeError
-from acsard.messages.schema import Info, RobotState
 from acsard.top.seen import Seen
 
 SPAN_S = 1.0

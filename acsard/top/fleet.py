@@ -10,13 +10,13 @@ from threading import Lock
 
 import zenoh
 
-from acsard.bus.robot_discovery import ALL, follow, nobody, robot_of, seen
-from acsard.bus.subscription import QUEUED, encoded
 from acsard.client import Client
 from acsard.client.follower import FLEET_ASK_S, Follower
-from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import Info, RobotState
-from acsard.messages.topics import full_key
+from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.schema import Info, RobotState
+from acsard.core.messages.topics import full_key
+from acsard.daemon.bus.robot_discovery import ALL, follow, nobody, robot_of, seen
+from acsard.daemon.bus.subscription import QUEUED, encoded
 from acsard.top.roster import Row
 
 MOST = 1000

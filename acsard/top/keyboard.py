@@ -11,8 +11,8 @@ import time
 from acsard.client import Client
 from acsard.client.commander import GRACE_S, ZEROS, Commander, Wish, objection
 from acsard.client.watch import Watch
+from acsard.core.values import NS_PER_S, REST, Twist
 from acsard.top.teleop import Teleop
-from acsard.values import NS_PER_S, REST, Twist
 
 HOLD_S = 0.6
 """Time that one key press drives, s.

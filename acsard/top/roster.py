@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from acsard.formatting import printable, rough, signed
-from acsard.messages.schema import RobotState
+from acsard.core.formatting import printable, rough, signed
+from acsard.core.messages.schema import RobotState
 from acsard.top.teleop import reason
 
 HEADS = ("ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY")

@@ -10,13 +10,13 @@ from collections.abc import Callable, Sequence
 
 from rich.text import Text
 
-from acsard.drive.gyro import WORDS
-from acsard.formatting import rough, signed
-from acsard.messages.schema import Info, RobotState, SourceState, Spread
-from acsard.runtime.latencies import NAMES
+from acsard.core.formatting import rough, signed
+from acsard.core.messages.schema import Info, RobotState, SourceState, Spread
+from acsard.core.motion.gyro import WORDS
+from acsard.core.values import NS_PER_S
+from acsard.daemon.latencies import NAMES
 from acsard.top.seen import Seen
 from acsard.top.text import bar, clean, count, rate, row, rule
-from acsard.values import NS_PER_S
 
 WIDEST = 116
 """Maximum width in cells; longer lines are harder to read."""

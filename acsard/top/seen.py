@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec import Struct
 
-from acsard.messages.schema import Info, RobotState
+from acsard.core.messages.schema import Info, RobotState
 
 MODES = {
     "driving": "bold white on green",

@@ -13,9 +13,9 @@ from textwrap import wrap
 from rich.cells import cell_len
 from rich.text import Text
 
-from acsard.formatting import rough, signed
-from acsard.messages.schema import RobotState
-from acsard.runtime.latencies import NAMES
+from acsard.core.formatting import rough, signed
+from acsard.core.messages.schema import RobotState
+from acsard.daemon.latencies import NAMES
 from acsard.top.sections import (
     certificate,
     drives,

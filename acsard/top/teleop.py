@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from msgspec import Struct
 
-from acsard.formatting import printable
-from acsard.messages.schema import RobotState
-from acsard.messages.short import place, speeds
+from acsard.core.formatting import printable
+from acsard.core.messages.schema import RobotState
+from acsard.core.messages.short import place, speeds
 from acsard.top.seen import MODES
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from acsard.core.values import AcsardError
 from acsard.terminal.output import plain
 from acsard.top.feed import Feed
 from acsard.top.fleet import Fleet
@@ -18,7 +19,6 @@ from acsard.top.keys import keys
 from acsard.top.roster import table
 from acsard.top.teleop import Teleop, lines
 from acsard.top.view import screen
-from acsard.values import AcsardError
 
 ONCE_S = 0.5
 """Time over which `--once` averages rates; a person waits for it."""

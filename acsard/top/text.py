@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from rich.cells import cell_len
 from rich.text import Text
 
-from acsard.formatting import printable
+from acsard.core.formatting import printable
 
 MOST = 256
 """Maximum number of characters of a text; a screen shows fewer."""

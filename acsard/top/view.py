@@ -13,8 +13,8 @@ from msgspec.structs import replace
 from rich.console import Group
 from rich.text import Text
 
-from acsard.formatting import lasting, rough
-from acsard.messages.schema import RobotState
+from acsard.core.formatting import lasting, rough
+from acsard.core.messages.schema import RobotState
 from acsard.top import sections as beside
 from acsard.top import stacked
 from acsard.top.sections import WIDEST

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 from aiohttp import web
 
-from acsard.values import AcsardError
+from acsard.core.values import AcsardError
 from acsard.web.files import File
 from acsard.web.routes import JSON, Problem
 from acsard.web.who import Reason

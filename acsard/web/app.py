@@ -19,11 +19,11 @@ from aiohttp import web
 from msgspec import Meta, Struct
 
 from acsard import __version__
-from acsard.bus.access import least_role
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.values import Role
+from acsard.daemon.bus.access import least_role
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
-from acsard.messages.encodings import DecodeError
-from acsard.values import Role
 from acsard.web import metrics, openapi
 from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip

@@ -9,15 +9,15 @@ import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
-from acsard.bus import robot_discovery
-from acsard.bus.access import SERVICE_ROLES
-from acsard.bus.address import require_id
 from acsard.client import Client
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.schema import ServiceReply
+from acsard.core.messages.topics import SERVICES
+from acsard.daemon.bus import robot_discovery
+from acsard.daemon.bus.access import SERVICE_ROLES
+from acsard.daemon.bus.address import require_id
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.threads import in_thread
-from acsard.messages.encodings import DecodeError
-from acsard.messages.schema import ServiceReply
-from acsard.messages.topics import SERVICES
 from acsard.web.robots import Robots
 from acsard.web.who import RefusedError, Who
 

@@ -12,7 +12,7 @@ from functools import partial
 from acsard.client import Client
 from acsard.client.commander import Commander, Sender, Wish
 from acsard.client.outbox import Outbox
-from acsard.messages.schema import Twist, Vector3
+from acsard.core.messages.schema import Twist, Vector3
 from acsard.web.counts import Counts
 
 SOURCE = "teleop"

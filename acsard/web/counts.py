@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 
-from acsard.values import Event
+from acsard.core.values import Event
 from acsard.web.who import Reason
 
 NAMED = 5

@@ -8,16 +8,16 @@ from typing import Any
 
 import zenoh
 
-from acsard.bus.robot_discovery import ALL, robot_of
-from acsard.bus.subscription import encoded
 from acsard.client import Client
 from acsard.client.follower import FLEET_ASK_S
+from acsard.core.messages.encodings import DecodeError, Decoder
+from acsard.core.messages.schema import Info, RobotState
+from acsard.core.messages.topics import full_key
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.robot_discovery import ALL, robot_of
+from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.threads import in_thread
-from acsard.messages.encodings import DecodeError, Decoder
-from acsard.messages.schema import Info, RobotState
-from acsard.messages.topics import full_key
-from acsard.values import NS_PER_S
 from acsard.web.robots import Robots
 from acsard.web.streams import DECLARE_S, UNREADY
 from acsard.web.told import Row

@@ -13,8 +13,8 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 import msgspec
 from msgspec import Meta, Struct
 
-from acsard.messages.signature import MOST
-from acsard.values import AcsardError, Role
+from acsard.core.messages.signature import MOST
+from acsard.core.values import AcsardError, Role
 
 MAX_BYTES = 65536
 """Maximum size of one message; a command has about a hundred bytes."""

@@ -19,11 +19,11 @@ import msgspec
 from msgspec import Struct
 
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
+from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.errors import WORDS, Exit
 from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
-from acsard.values import NS_PER_S
 from acsard.web.calls import Ending
 from acsard.web.errands import Reach, words
 from acsard.web.frames import Begin, FrameError, Press, Reply

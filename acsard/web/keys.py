@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from acsard.bus.address import require_id
+from acsard.daemon.bus.address import require_id
 from acsard.host.errors import UsageError
 from acsard.web.frames import Subscribe, Unsubscribe
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares

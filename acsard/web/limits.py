@@ -10,7 +10,7 @@ from collections import Counter, defaultdict
 from collections.abc import Hashable
 from typing import NamedTuple
 
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
 
 OVERRUNS = 600
 """Number of messages beyond the rate limit that ends a connection."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, get_args
 
-from acsard.drive.modes import Mode
-from acsard.mcu.link_state import State
-from acsard.messages.schema import RobotState
+from acsard.core.link.link_state import State
+from acsard.core.messages.schema import RobotState
+from acsard.core.motion.modes import Mode
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 

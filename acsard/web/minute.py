@@ -12,8 +12,8 @@ from collections.abc import Sequence
 
 from msgspec import Struct
 
-from acsard.messages.schema import RobotState, Twist
-from acsard.values import NS_PER_S, WHEELS
+from acsard.core.messages.schema import RobotState, Twist
+from acsard.core.values import NS_PER_S, WHEELS
 
 LASTS_NS = 60 * NS_PER_S
 

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta, Struct
 
-from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.topics import IMU, PUBLISHED
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import IMU, PUBLISHED
 from acsard.web import lines, told
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route

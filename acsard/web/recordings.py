@@ -9,11 +9,11 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
+from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.host.threads import in_thread
-from acsard.record.closing import closing, how_it_ends
-from acsard.record.directory import PART, STAMP, listed
-from acsard.values import NS_PER_S
+from acsard.recording.closing import closing, how_it_ends
+from acsard.recording.directory import PART, STAMP, listed
 from acsard.web.answers import READ_S, TroubleError
 from acsard.web.robots import Robots
 from acsard.web.who import RefusedError, is_loopback

@@ -27,9 +27,9 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.threads import in_thread
-from acsard.values import NS_PER_S
 
 # -P runs the installed package, not files in the current directory.
 COMMAND = (sys.executable, "-P", "-m", "acsard", "log", "report", "--held")

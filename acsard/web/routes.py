@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 from msgspec import Struct
 
-from acsard.bus.access import SERVICE_ROLES, least_role
-from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.topics import TOPICS, VERBS, Topic
-from acsard.values import Role, Verb
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import TOPICS, VERBS, Topic
+from acsard.core.values import Role, Verb
+from acsard.daemon.bus.access import SERVICE_ROLES, least_role
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
 """Takes the page and the request, and returns the response."""

@@ -16,11 +16,11 @@ from typing import Any
 from aiohttp import web
 from msgspec import Struct
 
-from acsard.bus.address import Address
-from acsard.bus.tls import CERTIFICATE, KEY, names_in
-from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
+from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.logs import Log
 from acsard.host.processes import end_with_parent
 from acsard.web.app import Page

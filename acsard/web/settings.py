@@ -7,8 +7,8 @@ from typing import Any
 
 from msgspec import UNSET, Struct, UnsetType, inspect
 
-from acsard.config.live import WHEN, flat, live
-from acsard.ros.parameters import kind_of
+from acsard.core.config.live import WHEN, flat, live
+from acsard.core.ros.parameters import kind_of
 
 
 class Setting(Struct, frozen=True, omit_defaults=True):

@@ -15,13 +15,13 @@ from typing import Any
 import msgspec
 import zenoh
 
-from acsard.bus.subscription import encoded, on
 from acsard.client import Client
+from acsard.core.messages.encodings import DecodeError, detect
+from acsard.core.messages.topics import PUBLISHED
+from acsard.daemon.bus.subscription import encoded, on
 from acsard.host import clock
 from acsard.host.errors import UsageError
 from acsard.host.threads import in_thread
-from acsard.messages.encodings import DecodeError, detect
-from acsard.messages.topics import PUBLISHED
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 
 Take = Callable[[zenoh.Sample], None]

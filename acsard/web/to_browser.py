@@ -15,8 +15,8 @@ import aiohttp
 import msgspec
 from aiohttp import web
 
+from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.values import NS_PER_S
 from acsard.web.counts import Counts
 from acsard.web.streams import Stream
 from acsard.web.told import Refused

@@ -19,8 +19,8 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from acsard.core.values import Role
 from acsard.host.errors import NotPermittedError, UsageError
-from acsard.values import Role
 from acsard.web.who import Who
 
 FILE, MODE = "tokens.json", 0o600

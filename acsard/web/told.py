@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import msgspec
 from msgspec import Struct
 
-from acsard.values import Role
+from acsard.core.values import Role
 from acsard.web.minute import Plotted
 
 Point = tuple[float, float]

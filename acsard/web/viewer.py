@@ -15,10 +15,10 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client.commander import Commander, Sender, Wish
+from acsard.core.messages.signature import public_name
+from acsard.core.values import Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
-from acsard.messages.signature import public_name
-from acsard.values import Twist
 from acsard.web import told
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand

@@ -17,8 +17,8 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.bus.access import MAY
-from acsard.values import ROLES, AcsardError, Role
+from acsard.core.values import ROLES, AcsardError, Role
+from acsard.daemon.bus.access import MAY
 
 Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",

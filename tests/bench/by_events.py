@@ -26,16 +26,16 @@ import serial
 import serial_asyncio
 import zenoh
 
-from acsard.bus.outlets import direct
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.outlets import direct
+from acsard.daemon.daemon import SWITCH_INTERVAL_S
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
-from acsard.runtime.daemon import SWITCH_INTERVAL_S
-from acsard.values import NS_PER_S
 from tests.bench.polled import Robot, session_of
 
 
 class Sender:
-    """A thread that publishes the messages left for it, as `acsard/bus/outlets.py` does."""
+    """A thread that publishes the messages left for it, as `acsard/daemon/bus/outlets.py` does."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self._publisher = publisher

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from acsard.bench.matching import Record, command_waits, feedback_fates, staircase
 from acsard.bench.measure import bench_config, free_endpoint, write
 from acsard.bench.rig import ACSARD, Rig
-from acsard.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
+from acsard.core.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
 
 POLLED = (sys.executable, "-m", "tests.bench.polled")
 """The original driver's method."""

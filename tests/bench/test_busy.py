@@ -22,7 +22,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.bench.matching import staircase
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from tests.bench.rigs import all_cores_busy, config, delays_us, rig, schedule, share, waits_us
 from tests.system.strangers import FLOOD, words
 

@@ -13,9 +13,9 @@ from time import perf_counter_ns
 
 import pytest
 
-from acsard.messages.cdr import Cdr
-from acsard.messages.schema import Message, Odometry
-from tests.unit.messages.test_cdr import (
+from acsard.core.messages.cdr import Cdr
+from acsard.core.messages.schema import Message, Odometry
+from tests.unit.core.messages.test_cdr import (
     ROS_NAMES,
     STORE,
     built,

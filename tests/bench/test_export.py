@@ -15,15 +15,15 @@ from typing import NamedTuple
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
-from acsard.config.writing import document
-from acsard.guard import Guard
-from acsard.record.file import About, Writing
-from acsard.record.rows import encode
-from acsard.record.steps import Taken
-from acsard.robot import Robot
-from acsard.values import Inputs, Instant, Outputs, Recording
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.writing import document
+from acsard.core.guard import Guard
+from acsard.core.robot import Robot
+from acsard.core.values import Inputs, Instant, Outputs, Recording
+from acsard.recording.file import About, Writing
+from acsard.recording.rows import encode
+from acsard.recording.steps import Taken
 from tests.scenarios.world import START, World
 from tests.system.harness import ROOT, finish
 

@@ -18,14 +18,14 @@ from time import thread_time_ns
 
 import pytest
 
-from acsard.config.settings import Config, DriveConfig, OdometryConfig, SimConfig, WheelMap
-from acsard.drive.kinematics import Kinematics
-from acsard.drive.path import arc
-from acsard.mcu.codec import Codec
-from acsard.mcu.lines import LineReader
-from acsard.messages.encodings import encode
-from acsard.runtime.pacing import NO_PERIOD, Period
-from acsard.values import Instant, Outputs, Pose, PoseCovariance, Received
+from acsard.core.config.settings import Config, DriveConfig, OdometryConfig, SimConfig, WheelMap
+from acsard.core.link.codec import Codec
+from acsard.core.link.lines import LineReader
+from acsard.core.messages.encodings import encode
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.path import arc
+from acsard.core.values import Instant, Outputs, Pose, PoseCovariance, Received
+from acsard.daemon.pacing import NO_PERIOD, Period
 from tests.scenarios.world import World
 
 pytestmark = [pytest.mark.bench, pytest.mark.timeout(300)]

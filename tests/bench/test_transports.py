@@ -21,19 +21,19 @@ from statistics import median
 import pytest
 
 from acsard.bench.rig import Rig, processor_ns
-from acsard.bus import outlets
-from acsard.bus.access import access_control
-from acsard.bus.bus import ZenohBus
-from acsard.bus.outlets import direct
-from acsard.bus.zenoh_sessions import client_session
-from acsard.config.settings import SIMULATOR, Config
+from acsard.core.config.settings import SIMULATOR, Config
+from acsard.core.messages import encodings
+from acsard.core.messages.schema import Message
+from acsard.core.messages.topics import full_key, offered, published
+from acsard.core.ros.transports import left_out
+from acsard.daemon.bus import outlets
+from acsard.daemon.bus.access import access_control
+from acsard.daemon.bus.bus import ZenohBus
+from acsard.daemon.bus.outlets import direct
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
-from acsard.messages import encodings
-from acsard.messages.schema import Message
-from acsard.messages.topics import full_key, offered, published
-from acsard.ros.transports import left_out
 from tests.bench.rigs import config, in_turns, rig, sibling
-from tests.unit.messages.test_cdr import odometry
+from tests.unit.core.messages.test_cdr import odometry
 
 FEEDBACK = ("odom", "tf", "wheel_states")
 ON_THE_BRIDGE = ("odom", "tf", "joint_states")

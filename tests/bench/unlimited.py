@@ -15,8 +15,8 @@ import asyncio
 from msgspec.structs import replace
 
 from acsard.cli.common import load
+from acsard.daemon import daemon
 from acsard.host.logs import Log
-from acsard.runtime import daemon
 
 BAUD_RATE = 4_000_000
 """The highest speed to which a terminal can be set: 33 bytes in 0.08 ms."""

@@ -16,10 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.config.settings import WheelMap
-from acsard.mcu.codec import Codec, FrameError
-from acsard.mcu.lines import LineReader
-from acsard.values import WheelSpeeds
+from acsard.core.config.settings import WheelMap
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.lines import LineReader
+from acsard.core.values import WheelSpeeds
 from tests.firmware.board import checked, read_identity, read_reply, speeds_line
 from tests.vectors.lines import ACCEPTED, REFUSED, SEED_LINE, ZERO
 

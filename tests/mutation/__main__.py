@@ -37,24 +37,24 @@ from tests.mutation.trials import ENDLESS, NONE, OTHER, OWN, Trials
 
 ROOT = Path(__file__).parents[2]
 CORE = (
-    "acsard/drive",
-    "acsard/guard.py",
-    "acsard/mcu/check.py",
-    "acsard/mcu/encoders.py",
-    "acsard/mcu/codec.py",
-    "acsard/mcu/negotiation.py",
-    "acsard/mcu/promptest.py",
-    "acsard/robot.py",
-    "acsard/runtime/kept_latches.py",
+    "acsard/core/motion",
+    "acsard/core/guard.py",
+    "acsard/core/link/check.py",
+    "acsard/core/link/encoders.py",
+    "acsard/core/link/codec.py",
+    "acsard/core/link/negotiation.py",
+    "acsard/core/link/promptest.py",
+    "acsard/core/robot.py",
+    "acsard/daemon/kept_latches.py",
 )
 SAFETY = (
-    "acsard/guard.py",
-    "acsard/drive/neutral.py",
-    "acsard/drive/freshness.py",
-    "acsard/drive/lifecycle.py",
-    "acsard/drive/modes.py",
-    "acsard/drive/sanity.py",
-    "acsard/runtime/kept_latches.py",
+    "acsard/core/guard.py",
+    "acsard/core/motion/neutral.py",
+    "acsard/core/motion/freshness.py",
+    "acsard/core/motion/lifecycle.py",
+    "acsard/core/motion/modes.py",
+    "acsard/core/motion/sanity.py",
+    "acsard/daemon/kept_latches.py",
 )
 ENOUGH, ENOUGH_OF_ALL = 0.95, 0.98
 """Share of the mutants that tests must notice: of a sample, and of every mutant of some modules."""

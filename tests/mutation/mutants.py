@@ -15,7 +15,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from acsard.drive.modes import Mode
+from acsard.core.motion.modes import Mode
 
 COMPARE: dict[type, tuple[type, ...]] = {
     ast.Lt: (ast.LtE, ast.GtE),

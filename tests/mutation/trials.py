@@ -31,8 +31,17 @@ from hypothesis import Phase, settings
 from tests.mutation.equivalent import EQUIVALENT
 from tests.mutation.mutants import Mutant, traced
 
-TESTS = ["tests/unit/drive", "tests/unit/mcu", "tests/unit/runtime", "tests/unit/test_guard.py"]
-TESTS += ["tests/unit/test_robot.py", "tests/unit/test_robot_machine.py", "tests/scenarios"]
+TESTS = [
+    "tests/unit/core/motion",
+    "tests/unit/core/link",
+    "tests/unit/daemon",
+    "tests/unit/core/test_guard.py",
+]
+TESTS += [
+    "tests/unit/core/test_robot.py",
+    "tests/unit/core/test_robot_machine.py",
+    "tests/scenarios",
+]
 PYTEST = [
     "-n",
     "0",

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
 

@@ -9,11 +9,11 @@ from typing import Literal
 
 import msgspec
 
-from acsard.incoming.commands import Arrival, Via
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
-from acsard.ros.attachments import Attachment
-from acsard.values import NS_PER_S, Outputs
+from acsard.core.incoming.commands import Arrival, Via
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
+from acsard.core.ros.attachments import Attachment
+from acsard.core.values import NS_PER_S, Outputs
 from tests.scenarios.world import World
 
 Way = Literal["client", "signed", "rmw", "header", "zenoh", "plain", "bridge"]

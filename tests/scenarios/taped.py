@@ -7,21 +7,21 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from acsard.config.named_faults import FAULTS
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
-from acsard.config.writing import document
-from acsard.guard import Guard
-from acsard.record.file import About, Writing
-from acsard.record.replay import Replay
-from acsard.record.rows import decode, encode
-from acsard.record.state import freeze, thaw
-from acsard.record.steps import Step, Taken
-from acsard.record.story import told
-from acsard.robot import Robot
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.faults import Fault
-from acsard.values import Inputs, Outputs, Recording
+from acsard.core.config.named_faults import FAULTS
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.writing import document
+from acsard.core.guard import Guard
+from acsard.core.robot import Robot
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.faults import Fault
+from acsard.core.values import Inputs, Outputs, Recording
+from acsard.recording.file import About, Writing
+from acsard.recording.replay import Replay
+from acsard.recording.rows import decode, encode
+from acsard.recording.state import freeze, thaw
+from acsard.recording.steps import Step, Taken
+from acsard.recording.story import told
 from tests.scenarios.world import START, World
 
 BATCH = 200

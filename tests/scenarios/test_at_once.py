@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.config.settings import CommandsConfig, Config, McuConfig, Source
-from acsard.incoming.queries import Query
-from acsard.runtime.pacing import IDLE_WAKES
-from acsard.values import Outputs
+from acsard.core.config.settings import CommandsConfig, Config, McuConfig, Source
+from acsard.core.incoming.queries import Query
+from acsard.core.values import Outputs
+from acsard.daemon.pacing import IDLE_WAKES
 from tests.scenarios.world import World
 
 MS = 1_000_000

@@ -12,7 +12,7 @@ import random
 
 import pytest
 
-from acsard.config.settings import Config, McuConfig, SimConfig
+from acsard.core.config.settings import Config, McuConfig, SimConfig
 from tests.scenarios.world import World
 
 COUNTS = 3200

@@ -8,7 +8,7 @@ from contextlib import nullcontext
 
 import pytest
 
-from acsard.config.settings import Config, SimConfig
+from acsard.core.config.settings import Config, SimConfig
 from tests.scenarios.world import World
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from acsard.config.settings import CommandsConfig, Config, Source
-from acsard.incoming.commands import Arrival, Via
-from acsard.incoming.queries import Query
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Header, Time, Twist, TwistStamped, Vector3
-from acsard.ros.attachments import Attachment
-from acsard.values import NS_PER_S
+from acsard.core.config.settings import CommandsConfig, Config, Source
+from acsard.core.incoming.commands import Arrival, Via
+from acsard.core.incoming.queries import Query
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
+from acsard.core.ros.attachments import Attachment
+from acsard.core.values import NS_PER_S
 from tests.scenarios.speakers import Speaker, Way
 from tests.scenarios.world import World
 

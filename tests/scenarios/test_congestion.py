@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from acsard.config.settings import CommandsConfig, Config, Source
-from acsard.drive.freshness import FORGIVE_NS, FORGIVE_RATE
-from acsard.values import NS_PER_S
+from acsard.core.config.settings import CommandsConfig, Config, Source
+from acsard.core.motion.freshness import FORGIVE_NS, FORGIVE_RATE
+from acsard.core.values import NS_PER_S
 from tests.scenarios.speakers import FOREIGN, STAMPED, Speaker, Way, moved, over
 from tests.scenarios.world import World
 

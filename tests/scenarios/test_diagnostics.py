@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.messages.diagnostics import OK, WARN
-from acsard.messages.schema import DiagnosticArray, DiagnosticStatus
+from acsard.core.messages.diagnostics import OK, WARN
+from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from tests.scenarios.speakers import Speaker
 from tests.scenarios.world import World
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from acsard.config.settings import (
+from acsard.core.config.settings import (
     CommandsConfig,
     Config,
     ControlConfig,
@@ -16,8 +16,8 @@ from acsard.config.settings import (
     McuConfig,
     WheelMap,
 )
-from acsard.messages.schema import JointState, TFMessage, TwistStamped
-from acsard.values import NS_PER_S
+from acsard.core.messages.schema import JointState, TFMessage, TwistStamped
+from acsard.core.values import NS_PER_S
 from tests.scenarios.world import World
 
 

@@ -21,8 +21,8 @@ from mcap_ros2.decoder import DecoderFactory
 from msgspec.structs import replace
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from acsard.config.settings import Config
-from acsard.messages.schema import (
+from acsard.core.config.settings import Config
+from acsard.core.messages.schema import (
     DiagnosticArray,
     Events,
     Header,
@@ -33,13 +33,13 @@ from acsard.messages.schema import (
     TwistStamped,
     Vector3,
 )
-from acsard.record.export import export
-from acsard.record.file import Recording
-from acsard.record.published import MEASURED, Publisher
-from acsard.record.replay import lived
-from acsard.record.replayed import Course
-from acsard.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG
-from acsard.ros.shapes import log, state
+from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG
+from acsard.core.ros.shapes import log, state
+from acsard.recording.export import export
+from acsard.recording.file import Recording
+from acsard.recording.published import MEASURED, Publisher
+from acsard.recording.replay import lived
+from acsard.recording.replayed import Course
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
 from tests.scenarios.world import World
 

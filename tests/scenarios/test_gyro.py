@@ -7,9 +7,9 @@ import random
 
 import pytest
 
-from acsard.config.settings import Config, OdometryConfig, SimConfig
-from acsard.messages.schema import DiagnosticArray
-from acsard.record.steps import BlackBox
+from acsard.core.config.settings import Config, OdometryConfig, SimConfig
+from acsard.core.messages.schema import DiagnosticArray
+from acsard.recording.steps import BlackBox
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import World
 

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import Outputs
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.values import Outputs
 from tests.scenarios.world import World
 
 GOLDEN = Path(__file__).parent.parent / "vectors" / "golden_hour.json"

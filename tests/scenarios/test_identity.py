@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
-from acsard.messages.encodings import encode
-from acsard.messages.topics import TOPICS
-from acsard.record.state import freeze
-from acsard.values import NS_PER_S
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.topics import TOPICS
+from acsard.core.values import NS_PER_S
+from acsard.recording.state import freeze
 from tests.scenarios.speakers import Speaker
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World

@@ -10,13 +10,13 @@ import random
 import msgspec
 import pytest
 
-from acsard.incoming.commands import Via
-from acsard.incoming.queries import Query
-from acsard.messages.cdr import Cdr
-from acsard.messages.schema import ServiceReply
-from acsard.messages.signature import public_name
-from acsard.ros.attachments import Attachment
-from acsard.values import NS_PER_S, Latches
+from acsard.core.incoming.commands import Via
+from acsard.core.incoming.queries import Query
+from acsard.core.messages.cdr import Cdr
+from acsard.core.messages.schema import ServiceReply
+from acsard.core.messages.signature import public_name
+from acsard.core.ros.attachments import Attachment
+from acsard.core.values import NS_PER_S, Latches
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 

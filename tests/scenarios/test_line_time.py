@@ -8,10 +8,10 @@ from contextlib import ExitStack, nullcontext
 
 import pytest
 
-from acsard.config.settings import Config, McuConfig, SimConfig
-from acsard.drive.path import Path
-from acsard.messages.schema import JointState, RobotState
-from acsard.values import Pose
+from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.messages.schema import JointState, RobotState
+from acsard.core.motion.path import Path
+from acsard.core.values import Pose
 from tests.scenarios.world import World
 
 FINE = SimConfig(encoder_counts=20_000)

@@ -7,9 +7,9 @@ from typing import TypeVar
 
 import pytest
 
-from acsard.config.named_faults import named
-from acsard.config.settings import Config, ControlConfig, McuConfig, SimConfig
-from acsard.messages.schema import (
+from acsard.core.config.named_faults import named
+from acsard.core.config.settings import Config, ControlConfig, McuConfig, SimConfig
+from acsard.core.messages.schema import (
     DiagnosticArray,
     JointState,
     Message,
@@ -18,8 +18,8 @@ from acsard.messages.schema import (
     Twist,
     Vector3,
 )
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S, Instant, Received
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.values import NS_PER_S, Instant, Received
 from tests.scenarios.world import World
 
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"

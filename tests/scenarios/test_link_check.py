@@ -15,7 +15,7 @@ from contextlib import nullcontext
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import (
+from acsard.core.config.settings import (
     Config,
     ControlConfig,
     FeedbackConfig,
@@ -24,15 +24,15 @@ from acsard.config.settings import (
     SimConfig,
     WheelMap,
 )
-from acsard.mcu.check import unseal
-from acsard.mcu.codec import Codec, FrameError
-from acsard.mcu.lines import LineReader
-from acsard.messages.schema import DiagnosticArray
-from acsard.sim import protocol
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S, Instant, Outputs, Received
+from acsard.core.link.check import unseal
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.lines import LineReader
+from acsard.core.messages.schema import DiagnosticArray
+from acsard.core.simulator import protocol
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.values import NS_PER_S, Instant, Outputs, Received
 from tests.scenarios.world import VirtualPort, World
-from tests.unit.mcu.test_damage import drive as replies_of_a_drive
+from tests.unit.core.link.test_damage import drive as replies_of_a_drive
 
 MS = 1_000_000
 ZERO = b"ap00.00,bp00.00,cp00.00,dp00.00"

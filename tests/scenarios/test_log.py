@@ -8,11 +8,11 @@ from typing import get_args
 import msgspec
 import pytest
 
-from acsard.incoming.commands import EXAMPLES, Arrival, Via
-from acsard.incoming.queries import Query
-from acsard.messages.signature import public_name
-from acsard.messages.topics import VERBS
-from acsard.values import NS_PER_S, Event, EventName
+from acsard.core.incoming.commands import EXAMPLES, Arrival, Via
+from acsard.core.incoming.queries import Query
+from acsard.core.messages.signature import public_name
+from acsard.core.messages.topics import VERBS
+from acsard.core.values import NS_PER_S, Event, EventName
 from tests.scenarios.world import World
 
 LINES_A_SECOND = 6

@@ -8,11 +8,11 @@ import random
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, FeedbackConfig, OdometryConfig, SimConfig
-from acsard.messages.schema import DiagnosticArray, DiagnosticStatus
-from acsard.sim.faults import Fault
-from acsard.sim.watched import WatchedMcu
-from acsard.values import NS_PER_S, WHEELS
+from acsard.core.config.settings import Config, FeedbackConfig, OdometryConfig, SimConfig
+from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
+from acsard.core.simulator.faults import Fault
+from acsard.core.simulator.watched import WatchedMcu
+from acsard.core.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
 
 

@@ -17,10 +17,10 @@ import msgspec
 import pytest
 
 from acsard.client.commander import Commander, Wish
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
-from acsard.values import NS_PER_S
-from acsard.values import Twist as BodyTwist
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
+from acsard.core.values import NS_PER_S
+from acsard.core.values import Twist as BodyTwist
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 

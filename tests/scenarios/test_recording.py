@@ -6,12 +6,12 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.named_faults import FAULTS
-from acsard.config.settings import Config
-from acsard.record.merge import adopt
-from acsard.record.replay import Replay
-from acsard.record.state import thaw
-from acsard.robot import Robot
+from acsard.core.config.named_faults import FAULTS
+from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
+from acsard.recording.merge import adopt
+from acsard.recording.replay import Replay
+from acsard.recording.state import thaw
 from tests.scenarios.taped import (
     WITH_ARGUMENTS,
     Tape,

@@ -15,17 +15,17 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, RecordConfig
-from acsard.incoming.commands import Arrival
-from acsard.messages.signature import public_name
-from acsard.record.directory import listed
-from acsard.record.file import Recording
-from acsard.record.recorder import Recorder
-from acsard.record.replayed import live
-from acsard.robot import Robot
-from acsard.runtime.control_loop import ControlLoop
-from acsard.runtime.kept_latches import LatchFileError, decode, encode, stopped, unreadable
-from acsard.values import NS_PER_S, Event, Inputs, Instant, Latch, Latches, Outputs
+from acsard.core.config.settings import Config, RecordConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.messages.signature import public_name
+from acsard.core.robot import Robot
+from acsard.core.values import NS_PER_S, Event, Inputs, Instant, Latch, Latches, Outputs
+from acsard.daemon.control_loop import ControlLoop
+from acsard.daemon.kept_latches import LatchFileError, decode, encode, stopped, unreadable
+from acsard.recording.directory import listed
+from acsard.recording.file import Recording
+from acsard.recording.recorder import Recorder
+from acsard.recording.replayed import live
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.test_diagnostics import row
 from tests.scenarios.world import SIGNED, START, World

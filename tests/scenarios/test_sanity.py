@@ -9,10 +9,10 @@ from itertools import product
 
 import pytest
 
-from acsard.config.contradictions import contradictions
-from acsard.config.settings import Config, LimitsConfig, McuConfig, SimConfig, WheelMap
-from acsard.sim.faults import Fault
-from acsard.values import NS_PER_S, WHEELS
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.settings import Config, LimitsConfig, McuConfig, SimConfig, WheelMap
+from acsard.core.simulator.faults import Fault
+from acsard.core.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
 
 

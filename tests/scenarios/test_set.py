@@ -7,14 +7,14 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from acsard.config.settings import Config, LimitsConfig
-from acsard.incoming.commands import Via
-from acsard.incoming.queries import Query
-from acsard.messages.cdr import Cdr
-from acsard.messages.schema import Odometry, ServiceReply
-from acsard.messages.signature import public_name
-from acsard.ros import parameters as rcl
-from acsard.values import NS_PER_S, Outputs, Plain
+from acsard.core.config.settings import Config, LimitsConfig
+from acsard.core.incoming.commands import Via
+from acsard.core.incoming.queries import Query
+from acsard.core.messages.cdr import Cdr
+from acsard.core.messages.schema import Odometry, ServiceReply
+from acsard.core.messages.signature import public_name
+from acsard.core.ros import parameters as rcl
+from acsard.core.values import NS_PER_S, Outputs, Plain
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.world import World
 

@@ -18,9 +18,9 @@ from collections import Counter, deque
 import msgspec
 import pytest
 
-from acsard.config.settings import CommandsConfig, Config, ControlConfig, McuConfig, Source
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.values import NS_PER_S, Outputs
+from acsard.core.config.settings import CommandsConfig, Config, ControlConfig, McuConfig, Source
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.values import NS_PER_S, Outputs
 from tests.scenarios.speakers import FOREIGN, SHARED, STAMPED, Speaker, Way, backlog, moved
 from tests.scenarios.world import World
 

@@ -11,25 +11,25 @@ from collections.abc import Callable
 
 import msgspec
 
-from acsard.config.settings import Config
-from acsard.incoming.bus_interface import NOTHING, BusInput
-from acsard.incoming.commands import Arrival
-from acsard.incoming.imu import OWN
-from acsard.incoming.queries import Query, Reply
-from acsard.mcu.codec import Codec
-from acsard.mcu.gate import Gate, Offered
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
-from acsard.messages.signature import Signature
-from acsard.messages.topics import PUBLISHED
-from acsard.record.steps import BlackBox
-from acsard.runtime.control_loop import ControlLoop
-from acsard.runtime.kept_latches import LatchKeeper
-from acsard.runtime.pacing import NO_PERIOD, Period
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.told import turn_rate
-from acsard.sim.watched import Sight, WatchedMcu
-from acsard.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
+from acsard.core.config.settings import Config
+from acsard.core.incoming.bus_interface import NOTHING, BusInput
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.imu import OWN
+from acsard.core.incoming.queries import Query, Reply
+from acsard.core.link.codec import Codec
+from acsard.core.link.gate import Gate, Offered
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
+from acsard.core.messages.signature import Signature
+from acsard.core.messages.topics import PUBLISHED
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.told import turn_rate
+from acsard.core.simulator.watched import Sight, WatchedMcu
+from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
+from acsard.daemon.control_loop import ControlLoop
+from acsard.daemon.kept_latches import LatchKeeper
+from acsard.daemon.pacing import NO_PERIOD, Period
+from acsard.recording.steps import BlackBox
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 

@@ -31,12 +31,20 @@ def fault(name: str, breaks: str, module: str, old: str, new: str, *more: Edit) 
     return Fault(name, breaks, (Edit(module, old, new), *more))
 
 
-GUARD, ARBITER, NEUTRAL = "guard.py", "drive/arbiter.py", "drive/neutral.py"
-FRESHNESS, LIMITS, LIFECYCLE = "drive/freshness.py", "drive/limits.py", "drive/lifecycle.py"
-MODES, ROBOT, SESSION = "drive/modes.py", "robot.py", "mcu/session.py"
-SANITY, ODOMETRY, PATH = "drive/sanity.py", "drive/odometry.py", "drive/path.py"
-LATCHES, VALUES, LOOP = "runtime/kept_latches.py", "values.py", "runtime/control_loop.py"
-COMMANDS, KINEMATICS, CODEC = "incoming/commands.py", "drive/kinematics.py", "mcu/codec.py"
+GUARD, ARBITER, NEUTRAL = "core/guard.py", "core/motion/arbiter.py", "core/motion/neutral.py"
+FRESHNESS, LIMITS, LIFECYCLE = (
+    "core/motion/freshness.py",
+    "core/motion/limits.py",
+    "core/motion/lifecycle.py",
+)
+MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
+SANITY, ODOMETRY, PATH = "core/motion/sanity.py", "core/motion/odometry.py", "core/motion/path.py"
+LATCHES, VALUES, LOOP = "daemon/kept_latches.py", "core/values.py", "daemon/control_loop.py"
+COMMANDS, KINEMATICS, CODEC = (
+    "core/incoming/commands.py",
+    "core/motion/kinematics.py",
+    "core/link/codec.py",
+)
 
 JUDGING = """
 
@@ -399,7 +407,7 @@ FAULTS = (
     fault(
         "gate late",
         "a line that was made before a stall leaves after it",
-        "mcu/gate.py",
+        "core/link/gate.py",
         "if now_ns - made_ns > self._period_ns and",
         "if False and",
     ),

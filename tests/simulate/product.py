@@ -16,11 +16,14 @@ from typing import Any
 import msgspec
 
 import acsard
-from acsard.config.parsing import ConfigError, parse
-from acsard.incoming.commands import Arrival
-from acsard.incoming.queries import Query
-from acsard.messages.encodings import encode as encode_message
-from acsard.runtime.kept_latches import (
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.queries import Query
+from acsard.core.messages.encodings import encode as encode_message
+from acsard.core.simulator.watched import WatchedMcu
+from acsard.core.values import Estimate as Measured
+from acsard.core.values import Event, Instant, Latches, Outputs, Received
+from acsard.daemon.kept_latches import (
     LatchFileError,
     at_start,
     decode,
@@ -29,9 +32,6 @@ from acsard.runtime.kept_latches import (
     unreadable,
     unwritable,
 )
-from acsard.sim.watched import WatchedMcu
-from acsard.values import Estimate as Measured
-from acsard.values import Event, Instant, Latches, Outputs, Received
 from tests.scenarios.world import START, World
 
 START_NS = START.mono_ns

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from acsard.values import REST, Command
+from acsard.core.values import REST, Command
 from tests.simulate.planted import CASE_MINUTES, FAULT_MINUTES, edited, read
 from tests.simulate.planted_cases import CASES
 from tests.simulate.planted_faults import FAULTS, FRESHNESS, Fault

@@ -15,8 +15,8 @@ from typing import Any
 
 import aiohttp
 
-from acsard.config.parsing import parse
-from acsard.values import Role
+from acsard.core.config.parsing import parse
+from acsard.core.values import Role
 from acsard.web.tokens import Vault
 from tests.system.harness import (
     PATIENCE_S,

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from acsard.door.fleet_router import router_file
+from acsard.daemon.gateway.fleet_router import router_file
 from acsard.lan.authority import Authority
 from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import words

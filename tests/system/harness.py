@@ -33,8 +33,8 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 import zenoh
 
-from acsard.incoming.queries import BUSY
-from acsard.messages.topics import command_key
+from acsard.core.incoming.queries import BUSY
+from acsard.core.messages.topics import command_key
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.bench.measure import bench_config, measure
-from acsard.config.settings import Config, ControlConfig
+from acsard.core.config.settings import Config, ControlConfig
 from acsard.host.errors import Exit, ExitError
 from tests.system.harness import (
     ZERO_LINE,

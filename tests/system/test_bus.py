@@ -17,7 +17,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from acsard.drive.lifecycle import LOOK_FIRST_S
+from acsard.core.motion.lifecycle import LOOK_FIRST_S
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,

@@ -18,16 +18,16 @@ import numpy as np
 import pytest
 import zenoh
 
-from acsard.bus.zenoh_sessions import client_session
 from acsard.calibration.guided.legs import Ask, GuideError
 from acsard.client import legs
 from acsard.client.legs import POSITIONS, Sensor
 from acsard.client.riding import HELD_UP, Recorder, Sample
-from acsard.config.parsing import parse
-from acsard.config.settings import JointsConfig
-from acsard.mcu.whose_silence import is_ours
-from acsard.messages.encodings import FORMATS, encode
-from acsard.messages.schema import Odometry, PoseStamped
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import JointsConfig
+from acsard.core.link.whose_silence import is_ours
+from acsard.core.messages.encodings import FORMATS, encode
+from acsard.core.messages.schema import Odometry, PoseStamped
+from acsard.daemon.bus.zenoh_sessions import client_session
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,

@@ -23,9 +23,9 @@ from typing import Any
 
 import pytest
 
-from acsard.bus.quiet import Around
-from acsard.bus.robot_discovery import around
 from acsard.client import connect
+from acsard.daemon.bus.quiet import Around
+from acsard.daemon.bus.robot_discovery import around
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,

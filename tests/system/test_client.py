@@ -17,8 +17,10 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from acsard.bus.subscription import Subscription
 from acsard.client import AsyncClient, Client, connect, connect_async, synchronous
+from acsard.core.incoming.queries import BUSY
+from acsard.core.messages import schema
+from acsard.daemon.bus.subscription import Subscription
 from acsard.host.errors import (
     NoAnswerError,
     NotDrivenError,
@@ -26,8 +28,6 @@ from acsard.host.errors import (
     UnreachableError,
     UsageError,
 )
-from acsard.incoming.queries import BUSY
-from acsard.messages import schema
 from tests.system.bystander import lost
 from tests.system.harness import (
     ROOT,

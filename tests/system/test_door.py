@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from acsard.door.watch import UNANSWERED
+from acsard.daemon.gateway.watch import UNANSWERED
 from tests.system.harness import (
     Bus,
     Daemon,

@@ -22,13 +22,13 @@ import zenoh.ext
 from msgspec.structs import astuple
 
 from acsard.client import connect
-from acsard.config.contradictions import warnings
-from acsard.config.parsing import parse
-from acsard.config.settings import Config
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
+from acsard.core.values import ROLES
 from acsard.host.errors import Exit
-from acsard.messages.json_schema import SCHEMAS
-from acsard.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, source_keys, whoami_key
-from acsard.values import ROLES
 from tests.system.browser import Page, hands, run
 from tests.system.fleet_router import (
     ITS_NAME,

@@ -20,10 +20,10 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from websockets.exceptions import InvalidStatus
 
-from acsard.config.settings import JointsConfig
-from acsard.messages.encodings import FORMATS, encode, encoding_name
-from acsard.messages.schema import Header, JointState, Twist, TwistStamped, Vector3
-from acsard.values import NS_PER_S
+from acsard.core.config.settings import JointsConfig
+from acsard.core.messages.encodings import FORMATS, encode, encoding_name
+from acsard.core.messages.schema import Header, JointState, Twist, TwistStamped, Vector3
+from acsard.core.values import NS_PER_S
 from tests.system.bystander import lost
 from tests.system.harness import (
     ZERO,

@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from acsard.client import Client, connect
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
 from tests.system.browser import Page, hands, run
 from tests.system.harness import Bus, Daemon, free_endpoint, twist, until
 from tests.system.identities import Certificates, free_tls_endpoint

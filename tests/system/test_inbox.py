@@ -6,7 +6,7 @@ from functools import partial
 
 import zenoh
 
-from acsard.bus.inbox import ARRIVALS, TICKETS, Inbox, Replies
+from acsard.daemon.bus.inbox import ARRIVALS, TICKETS, Inbox, Replies
 from tests.system.harness import Bus, client_config, free_endpoint, until
 
 

@@ -16,8 +16,8 @@ import pytest
 
 from acsard import __version__
 from acsard.client import connect
+from acsard.core.messages.signature import public_name
 from acsard.host.own_identity import own_name
-from acsard.messages.signature import public_name
 from tests.system.harness import Bus, Daemon, Peer, acsard, until
 
 

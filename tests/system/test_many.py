@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard.bus.robot_discovery import ALL, stop
 from acsard.cli import main
 from acsard.client import connecting
+from acsard.daemon.bus.robot_discovery import ALL, stop
 from tests.pages import blocks
 from tests.system.fleet_router import ROBOT_FILE, certified, router
 from tests.system.harness import (

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.config.parsing import parse
+from acsard.core.config.parsing import parse
 from tests.system.browser import Page
 from tests.system.bystander import lost
 from tests.system.chromium import CHROMIUM, DESKTOP, PHONE, SIDEWAYS, Browser, browsing

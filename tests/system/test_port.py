@@ -18,14 +18,14 @@ from contextlib import suppress
 import pytest
 import serial
 
-from acsard.config.settings import McuConfig
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.check import seal
+from acsard.core.link.session import McuSession
+from acsard.core.values import NS_PER_S, STILL, Event, Instant, Received
+from acsard.daemon.serial.device import open_raw
+from acsard.daemon.serial.port import HUNG, SerialPort
 from acsard.host import clock
 from acsard.host.clock import Asleep
-from acsard.mcu.check import seal
-from acsard.mcu.session import McuSession
-from acsard.serial.device import open_raw
-from acsard.serial.port import HUNG, SerialPort
-from acsard.values import NS_PER_S, STILL, Event, Instant, Received
 from tests.system.harness import until
 
 PERIOD_NS = 10_000_000
@@ -303,8 +303,8 @@ def test_a_device_that_opened_too_late_is_not_left_exclusive(
         fcntl.ioctl(slave, TIOCGEXCL, mark)
         return bool(mark[0])
 
-    monkeypatch.setattr("acsard.serial.port.OPEN_TIMEOUT_S", 0.01)
-    monkeypatch.setattr("acsard.serial.port.open_raw", open_late)
+    monkeypatch.setattr("acsard.daemon.serial.port.OPEN_TIMEOUT_S", 0.01)
+    monkeypatch.setattr("acsard.daemon.serial.port.open_raw", open_late)
     master, slave = os.openpty()
     try:
         path = os.ttyname(slave)

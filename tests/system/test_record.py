@@ -52,7 +52,7 @@ def replayed(where: Path, path: Path) -> int:
 def last_s(where: Path, path: Path) -> float:
     """Return the wall clock of the last step that can be read."""
     code = (
-        "import sys, pathlib; from acsard.record import replayed, file;"
+        "import sys, pathlib; from acsard.recording import replayed, file;"
         "recording = file.Recording(pathlib.Path(sys.argv[1]));"
         "print(max(step.inputs.now.wall_ns for step in replayed.steps(recording)))"
     )
@@ -90,7 +90,7 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
 
 
 BUG = """\
-from acsard.robot import Robot
+from acsard.core.robot import Robot
 whole = Robot.step
 def step(robot, inputs):
     if inputs.requests:

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from acsard.config.settings import RecordConfig
-from acsard.record.closing import closing
-from acsard.record.directory import Ring, Run
-from acsard.record.disk import HAPPENED
-from acsard.record.file import About, Recording, Writing
-from acsard.record.recovery import recover
+from acsard.core.config.settings import RecordConfig
+from acsard.recording.closing import closing
+from acsard.recording.directory import Ring, Run
+from acsard.recording.disk import HAPPENED
+from acsard.recording.file import About, Recording, Writing
+from acsard.recording.recovery import recover
 from acsard.web.recordings import rows
 from tests.system import bystander
 from tests.system.harness import Bus, Daemon, Periods, environment, until

@@ -43,7 +43,7 @@ CYCLE_S = 2.0
 
 CRASH = """\
 import os, signal
-from acsard.robot import Robot
+from acsard.core.robot import Robot
 whole, crashes = Robot.step, []
 signal.signal(signal.SIGUSR2, lambda *_: crashes.append(1))
 def step(robot, inputs):

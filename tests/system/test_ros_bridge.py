@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pytest
 
-from acsard.drive.lifecycle import LOOK_FIRST_S
+from acsard.core.motion.lifecycle import LOOK_FIRST_S
 from tests.system.harness import Bus, Daemon, Program, until
 from tests.system.ros_clients import (
     DDS,

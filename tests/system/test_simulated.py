@@ -12,10 +12,10 @@ import pytest
 
 from acsard.calibration.log_table import read
 from acsard.calibration.runs import runs
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Header, Imu, Quaternion, Vector3
-from acsard.ros.attachments import Attachment
-from acsard.ros.names import rmw_key
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Header, Imu, Quaternion, Vector3
+from acsard.core.ros.attachments import Attachment
+from acsard.core.ros.names import rmw_key
 from tests.system.harness import Bus, Daemon, Peer, acsard, finish, seconds, until
 
 SKIDDING: dict[str, dict[str, object]] = {"sim": {"track_multiplier": 1.6}}

@@ -13,7 +13,7 @@ from threading import Thread
 import pytest
 import zenoh
 
-from acsard.bus.zenoh_sessions import client_session
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
 from acsard.lan import authority as making
 from acsard.lan.authority import Authority

@@ -12,12 +12,12 @@ import aiohttp
 import pytest
 from aiohttp.test_utils import TestServer
 
-from acsard.bus.address import Address
-from acsard.bus.zenoh_sessions import client_session
 from acsard.client import Client
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
+from acsard.core.messages.signature import MOST
+from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
-from acsard.messages.signature import MOST
 from acsard.web.app import Page
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand

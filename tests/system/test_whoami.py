@@ -13,8 +13,8 @@ from threading import Thread, Timer
 import pytest
 
 from acsard.client import connect, connect_async
+from acsard.core.values import ROLES
 from acsard.host.errors import NoAnswerError, NotPermittedError
-from acsard.values import ROLES
 from tests.system.harness import (
     Bus,
     Daemon,

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import inspect
 from msgspec.structs import FieldInfo, fields
 
-from acsard.config.settings import Config, Source
+from acsard.core.config.settings import Config, Source
 
 Bounded = inspect.FloatType | inspect.IntType
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from math import pi
 
-from acsard.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig
 
 DEFAULT = DriveConfig()
 

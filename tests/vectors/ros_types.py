@@ -1,5 +1,5 @@
 """The ROS 2 message and service definitions (Jazzy) behind the types we speak, as facts: those that
-`acsard/ros/channels.py` does not have.
+`acsard/core/ros/channels.py` does not have.
 
 One line a type: its name, a colon, its fields as `type name` with commas between. A type without
 a package is a base type; `[]` is a sequence, `[<=n]` a bounded one, `[n]` an array. A service has

@@ -16,8 +16,8 @@ from msgspec import Struct
 
 from acsard.calibration.runs import Run
 from acsard.calibration.solve import Calibration
-from acsard.config.settings import Config, DriveConfig
-from acsard.values import AcsardError
+from acsard.core.config.settings import Config, DriveConfig
+from acsard.core.values import AcsardError
 
 T = TypeVar("T")
 

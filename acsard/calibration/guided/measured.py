@@ -23,7 +23,7 @@ from acsard.calibration.guided.readings import Found, Reading, found, joined, pr
 from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import blocks, wheels
 from acsard.calibration.solve import Calibration, Drives
-from acsard.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig
 
 BLOCK_S = 4.0
 

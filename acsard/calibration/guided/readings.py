@@ -26,7 +26,7 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import wheels
 from acsard.calibration.places import Grid, grid, path
 from acsard.calibration.runs import Run
-from acsard.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig
 
 What = Literal["turned", "angle", "distance", "ahead", "aside"]
 """Kind of a reading. `turned` is an angle that includes whole turns, and `angle` one that does not.

@@ -26,9 +26,9 @@ from acsard.bench.matching import (
     staircase,
     summary,
 )
-from acsard.config.settings import Config, McuConfig, WheelMap
-from acsard.mcu.codec import Codec
-from acsard.values import Instant, WheelSpeeds
+from acsard.core.config.settings import Config, McuConfig, WheelMap
+from acsard.core.link.codec import Codec
+from acsard.core.values import Instant, WheelSpeeds
 
 ONE, TWO = b"ap05.00,bp05.00,cp05.00,dp05.00", b"ap05.02,bp05.02,cp05.02,dp05.02"
 

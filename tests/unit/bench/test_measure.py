@@ -8,8 +8,8 @@ import pytest
 
 from acsard.bench.matching import staircase
 from acsard.bench.measure import bench_config, write
-from acsard.config.parsing import parse
-from acsard.config.settings import BusConfig, Config, ControlConfig, LimitsConfig, McuConfig
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import BusConfig, Config, ControlConfig, LimitsConfig, McuConfig
 
 
 @pytest.mark.parametrize("simulated", [True, False])

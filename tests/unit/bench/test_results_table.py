@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from acsard.bench.matching import Summary
 from acsard.bench.results_table import OWN, POINTS, Machine, Result, parts, this_machine
-from acsard.runtime.latencies import NAMES
+from acsard.daemon.latencies import NAMES
 from acsard.terminal.output import plain
 
 RESULT = Result(

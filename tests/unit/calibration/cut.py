@@ -13,7 +13,7 @@ from acsard.calibration.heading import of_gyro
 from acsard.calibration.log_table import read
 from acsard.calibration.prepared import Prepared
 from acsard.calibration.tape_distance import Tape
-from acsard.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.robots import GUIDED, Drive, Plan, Robot, drive
 
 BASE = Base(0.05, 0.30, 1.0, 1.0, 1.0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 
 from acsard.calibration.calibration_report import NAMES, keys, parts, report
-from acsard.config.parsing import parse
-from acsard.config.settings import DriveConfig
-from acsard.config.writing import excerpt
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import DriveConfig
+from acsard.core.config.writing import excerpt
 from acsard.terminal.output import SENTENCES, plain
 from tests.unit.calibration.cut import calibrated, usual
 

@@ -20,7 +20,7 @@ from acsard.calibration.log_table import (
     read,
     row,
 )
-from acsard.messages.schema import (
+from acsard.core.messages.schema import (
     Header,
     Imu,
     JointState,
@@ -32,7 +32,7 @@ from acsard.messages.schema import (
     Time,
     Vector3,
 )
-from acsard.messages.topics import by_key
+from acsard.core.messages.topics import by_key
 
 LOG_HEADER = b"t,left,right,yaw_rate\n"
 

@@ -15,10 +15,10 @@ import msgspec
 from acsard.checkup import checkup_report, procedure
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
-from acsard.config.named_faults import named
-from acsard.config.settings import Config
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.virtual_wire import VirtualWire
+from acsard.core.config.named_faults import named
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.virtual_wire import VirtualWire
 
 MS = 1_000_000
 

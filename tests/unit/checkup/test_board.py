@@ -7,10 +7,10 @@ import pytest
 from acsard.checkup.board import Board, Operator, Wire
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import MOTOR_S, PATIENCE_S, SPEED, ZERO
-from acsard.config.settings import Config, McuConfig, SimConfig
+from acsard.core.config.settings import Config, McuConfig, SimConfig
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import MendableError
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Nobody, Robot
 
 

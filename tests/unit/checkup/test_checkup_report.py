@@ -7,9 +7,9 @@ import pytest
 from acsard.checkup import checkup_report, lateness
 from acsard.checkup.checkup_report import report, row, summary
 from acsard.checkup.findings import REST, Finding
-from acsard.config.contradictions import contradictions
-from acsard.config.parsing import parse
-from acsard.config.settings import Config
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
 from acsard.terminal.output import plain
 from tests.unit.checkup.robots import configured
 

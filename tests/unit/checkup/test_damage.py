@@ -7,9 +7,9 @@ import re
 import pytest
 
 from acsard.checkup import damage, dialect
-from acsard.config.settings import WheelMap
-from acsard.mcu.codec import Codec, FrameError
-from acsard.sim import protocol
+from acsard.core.config.settings import WheelMap
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.simulator import protocol
 from tests.unit.checkup.robots import Robot
 
 

@@ -10,8 +10,8 @@ from acsard.checkup import dialect
 from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.outcomes import find
-from acsard.config.settings import Config, McuConfig
-from acsard.mcu.hearing import Look
+from acsard.core.config.settings import Config, McuConfig
+from acsard.core.link.hearing import Look
 from tests.unit.checkup.robots import Checked, Robot
 
 

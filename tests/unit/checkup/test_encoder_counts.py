@@ -10,8 +10,8 @@ from acsard.checkup import encoder_counts, line_loss
 from acsard.checkup.dialect import check, identity
 from acsard.checkup.motion import Reply
 from acsard.checkup.wheels import turn
-from acsard.config.settings import Config, SimConfig
-from acsard.mcu.check import Reading
+from acsard.core.config.settings import Config, SimConfig
+from acsard.core.link.check import Reading
 from tests.unit.checkup.robots import Robot
 
 

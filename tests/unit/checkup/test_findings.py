@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.checkup.findings import Finding, StoppedError, motor_name, wheel_of
-from acsard.config.settings import McuConfig, WheelMap
+from acsard.core.config.settings import McuConfig, WheelMap
 
 TURNED = McuConfig(wheels=WheelMap("-c", "+d", "-a", "+b"))
 

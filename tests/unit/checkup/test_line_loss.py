@@ -10,7 +10,7 @@ import pytest
 from acsard.checkup import dialect, encoder_counts, line_loss
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding, StoppedError
-from acsard.config.settings import Config, SimConfig
+from acsard.core.config.settings import Config, SimConfig
 from tests.unit.checkup.robots import Checked, Nobody, Robot, check, configured
 
 

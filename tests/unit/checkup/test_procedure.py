@@ -13,10 +13,10 @@ from acsard.checkup import procedure
 from acsard.checkup.board import FAREWELL
 from acsard.checkup.findings import REST, Finding, WireLostError
 from acsard.checkup.motion import SPEED
-from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
-from acsard.mcu.codec import Codec
-from acsard.sim import protocol
-from acsard.values import WHEELS
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.core.link.codec import Codec
+from acsard.core.simulator import protocol
+from acsard.core.values import WHEELS
 from tests.unit.checkup.robots import (
     MS,
     Busy,

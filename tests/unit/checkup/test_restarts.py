@@ -20,9 +20,9 @@ from acsard.checkup.restarts import (
     Restarts,
     finding,
 )
-from acsard.config.settings import Config
-from acsard.mcu.check import Reading
-from acsard.mcu.session import IDENTITY
+from acsard.core.config.settings import Config
+from acsard.core.link.check import Reading
+from acsard.core.link.session import IDENTITY
 from tests.unit.checkup.robots import MS, Checked, Robot, check
 
 NAME = IDENTITY + b"1 counts=3200"

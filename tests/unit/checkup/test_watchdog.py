@@ -9,8 +9,8 @@ from acsard.checkup.findings import StoppedError
 from acsard.checkup.motion import SPEED
 from acsard.checkup.watchdog import UNKNOWN, Between, run
 from acsard.checkup.wheels import turn
-from acsard.config.settings import Config, SimConfig
-from acsard.sim import protocol
+from acsard.core.config.settings import Config, SimConfig
+from acsard.core.simulator import protocol
 from tests.unit.checkup.robots import Robot
 
 ALL = (0, 1, 2, 3)

@@ -8,9 +8,9 @@ from msgspec import structs
 from acsard.checkup import dialect, wheels
 from acsard.checkup.motion import GLANCE_S, PATIENCE_S, SPEED
 from acsard.checkup.wheels import Channel, Kind, encoder_finding, wheel_map
-from acsard.config.settings import Config, McuConfig, SimConfig, WheelMap
-from acsard.mcu.codec import Motors
-from acsard.values import WHEELS
+from acsard.core.config.settings import Config, McuConfig, SimConfig, WheelMap
+from acsard.core.link.codec import Motors
+from acsard.core.values import WHEELS
 from tests.unit.checkup.robots import Robot
 
 MCU = McuConfig()

@@ -12,7 +12,7 @@ import pytest
 from mcap.writer import Writer
 
 from acsard.cli import calibrate
-from acsard.config.parsing import parse
+from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, ExitError, UnreachableError, UsageError
 from tests.unit.calibration.cut import usual
 

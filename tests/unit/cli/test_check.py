@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from acsard.cli.check import main
-from acsard.config.parsing import from_builtins, parse
+from acsard.core.config.parsing import from_builtins, parse
 from acsard.host.errors import ExitError
 
 

@@ -15,8 +15,8 @@ from acsard.cli.common import (
     robot_address,
     warn_of_unknown,
 )
-from acsard.config.parsing import parse
-from acsard.config.settings import Config
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
 from acsard.host import config_file
 from acsard.host.config_file import PLACES, find, writable
 from acsard.host.errors import Exit, ExitError, UsageError

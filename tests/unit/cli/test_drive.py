@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.cli.drive import NO_END, News, Page
-from acsard.messages.schema import RobotState
+from acsard.core.messages.schema import RobotState
 from acsard.top.teleop import HELP
 from tests.unit.top.screens import STATE
 from tests.unit.top.test_teleop import SEEN

@@ -9,10 +9,10 @@ import pytest
 
 from acsard.cli import main
 from acsard.cli.echo import _shown, json_line
+from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
+from acsard.core.messages.schema import Header, Twist, TwistStamped, Vector3
 from acsard.host.errors import Exit
-from acsard.messages.encodings import Decoder, Format, encode, encoding_name
-from acsard.messages.schema import Header, Twist, TwistStamped, Vector3
-from tests.unit.messages.examples import OUTPUTS
+from tests.unit.core.messages.examples import OUTPUTS
 
 BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
 

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import (
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from acsard.cli import main
-from acsard.config.parsing import parse
+from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
 

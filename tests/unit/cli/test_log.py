@@ -15,13 +15,13 @@ from msgspec.structs import replace
 
 from acsard.cli import main
 from acsard.cli.log import SERVICE
-from acsard.config.settings import Config, RecordConfig
+from acsard.core.config.settings import Config, RecordConfig
+from acsard.core.values import Event
 from acsard.host.errors import Exit
-from acsard.record.directory import Ring
-from acsard.record.file import Recording, Writing
-from acsard.record.recovery import recover
-from acsard.record.steps import Taken, Unfinished
-from acsard.values import Event
+from acsard.recording.directory import Ring
+from acsard.recording.file import Recording, Writing
+from acsard.recording.recovery import recover
+from acsard.recording.steps import Taken, Unfinished
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from msgspec.structs import replace
 
 from acsard.cli import main
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from acsard.cli import main
-from acsard.record.file import Recording
-from acsard.record.replayed import steps
-from acsard.record.steps import MICRO
+from acsard.recording.file import Recording
+from acsard.recording.replayed import steps
+from acsard.recording.steps import MICRO
 from tests.scenarios.taped import chunks
 from tests.unit.report.seen import column
 

@@ -22,11 +22,11 @@ from acsard.asking.person import Person, ended_by_signals
 from acsard.checkup import procedure
 from acsard.cli import mcu
 from acsard.cli.exits import code_of
-from acsard.config.parsing import parse
-from acsard.config.settings import Config
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
-from acsard.sim.fake_mcu import FakeMcu
-from acsard.sim.virtual_wire import VirtualWire
 from tests.unit.checkup.robots import Busy, Robot
 
 

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from acsard.cli import run
-from acsard.config.parsing import parse
-from acsard.config.settings import Config, McuConfig, WebConfig
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.doctor.running import OPTIONS
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from acsard.cli import parser
 from acsard.cli.set import pairs
+from acsard.core.messages.schema import ServiceReply
 from acsard.host.errors import UsageError
-from acsard.messages.schema import ServiceReply
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ import pytest
 
 from acsard.cli import VERBS
 from acsard.cli.topics import ros_table
-from acsard.config.settings import Config, RosConfig
-from acsard.messages.topics import PUBLISHED
-from acsard.ros.transports import PARAMETERS, left_out, ros_names
+from acsard.core.config.settings import Config, RosConfig
+from acsard.core.messages.topics import PUBLISHED
+from acsard.core.ros.transports import PARAMETERS, left_out, ros_names
 
 
 def test_every_ros_name_is_listed_with_what_it_stands_for() -> None:

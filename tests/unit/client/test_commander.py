@@ -14,7 +14,7 @@ from acsard.client.commander import (
     Sender,
     Wish,
 )
-from acsard.values import NS_PER_S, REST, Twist
+from acsard.core.values import NS_PER_S, REST, Twist
 
 AHEAD, LEFT = Twist(0.5, 0.0), Twist(0.0, 1.0)
 MS = NS_PER_S // 1000

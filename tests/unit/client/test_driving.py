@@ -17,10 +17,10 @@ from acsard.client import driving
 from acsard.client.commander import GRACE_S, OPENED_S, objection
 from acsard.client.driving import SETTLED_S, UnheardError, drive
 from acsard.client.follower import FIRST_S, SILENT_S
+from acsard.core.messages.encodings import encode, encoding_name
+from acsard.core.messages.schema import RobotState, SourceState, Time
+from acsard.core.values import NS_PER_S
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
-from acsard.messages.encodings import encode, encoding_name
-from acsard.messages.schema import RobotState, SourceState, Time
-from acsard.values import NS_PER_S
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"

@@ -13,7 +13,7 @@ from acsard.client.follower import (
     Follower,
     restarted,
 )
-from acsard.messages.schema import RobotState, Time
+from acsard.core.messages.schema import RobotState, Time
 from tests.unit.top.screens import BEFORE, STATE
 
 TICK = 0.01

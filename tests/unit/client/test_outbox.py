@@ -9,8 +9,8 @@ import pytest
 
 from acsard.client.commander import STALE_NS, Commander, Wish
 from acsard.client.outbox import Outbox
+from acsard.core.values import REST, Twist
 from acsard.host import clock
-from acsard.values import REST, Twist
 from tests.system.harness import until
 
 PATIENCE_S = 20.0

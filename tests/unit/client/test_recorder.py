@@ -7,8 +7,8 @@ import pytest
 
 from acsard.calibration.log_table import LogError
 from acsard.client.riding import Recorder, Sample, times
-from acsard.config.settings import JointsConfig
-from acsard.messages.schema import (
+from acsard.core.config.settings import JointsConfig
+from acsard.core.messages.schema import (
     Header,
     Imu,
     JointState,

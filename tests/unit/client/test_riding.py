@@ -11,9 +11,9 @@ from acsard.calibration.guided.legs import Leg, Move
 from acsard.client.commander import OPENED_S
 from acsard.client.follower import QUIET_S
 from acsard.client.riding import HELD_UP, Phase, Riding
-from acsard.config.settings import DriveConfig
-from acsard.messages.schema import RobotState, SourceState, Time
-from acsard.values import REST, Twist
+from acsard.core.config.settings import DriveConfig
+from acsard.core.messages.schema import RobotState, SourceState, Time
+from acsard.core.values import REST, Twist
 
 LEG = Leg("", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
 TURN = Leg("", (Move(5.0, 0.0, 0.5),), by_key=True)

@@ -11,10 +11,10 @@ from acsard import client
 from acsard.client import Client, NoAnswerError
 from acsard.client.commander import SPACING_S
 from acsard.client.driving import UnheardError
-from acsard.config.settings import DriveConfig, JointsConfig
-from acsard.drive.kinematics import Kinematics
-from acsard.incoming.commands import Arrival, Receiver
-from acsard.values import Command
+from acsard.core.config.settings import DriveConfig, JointsConfig
+from acsard.core.incoming.commands import Arrival, Receiver
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import Command
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
 

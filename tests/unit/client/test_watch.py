@@ -8,11 +8,11 @@ from typing import Any
 
 from msgspec.structs import replace
 
-from acsard.bus.subscription import QUEUED
 from acsard.client.follower import ASK_S, SILENT_S
 from acsard.client.watch import Watch
-from acsard.messages.encodings import encode
-from acsard.messages.schema import RobotState, Time
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import RobotState, Time
+from acsard.daemon.bus.subscription import QUEUED
 from tests.unit.top.screens import STATE
 
 

@@ -7,7 +7,8 @@ import socket
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import BusConfig, Config, McuConfig
+from acsard.core.config.settings import BusConfig, Config, McuConfig
+from acsard.core.messages.schema import DiagnosticStatus, Time
 from acsard.doctor.daemon_findings import (
     clocks,
     door,
@@ -21,7 +22,6 @@ from acsard.doctor.daemon_findings import (
 )
 from acsard.doctor.finding import Finding
 from acsard.doctor.running import Running
-from acsard.messages.schema import DiagnosticStatus, Time
 from tests.unit.doctor.test_running import INFO, STATE
 
 NOW = 1_800_000_000_000_000_000

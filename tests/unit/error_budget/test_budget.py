@@ -10,8 +10,8 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, McuConfig, OdometryConfig
-from acsard.drive.uncertainty import GYRO_SCALE
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig
+from acsard.core.motion.uncertainty import GYRO_SCALE
 from acsard.error_budget.budget import Budget, Cause, Heard, Share, budget
 from acsard.error_budget.drive_log import Line
 from tests.unit.error_budget import drives

@@ -7,9 +7,8 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, McuConfig, RatesConfig
-from acsard.error_budget.daemon_messages import Feed
-from acsard.messages.schema import (
+from acsard.core.config.settings import Config, McuConfig, RatesConfig
+from acsard.core.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
     Header,
@@ -26,7 +25,8 @@ from acsard.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
+from acsard.error_budget.daemon_messages import Feed
 
 START = Time(1000, 0)
 ZERO = Twist(Vector3(), Vector3())

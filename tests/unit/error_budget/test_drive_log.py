@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.config.settings import DriveConfig
-from acsard.drive.kinematics import Kinematics
+from acsard.core.config.settings import DriveConfig
+from acsard.core.motion.kinematics import Kinematics
 from acsard.error_budget.drive_log import Line, motion
 
 KINEMATICS = Kinematics(DriveConfig())

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from acsard.config.settings import DriveConfig
-from acsard.drive.kinematics import Kinematics
+from acsard.core.config.settings import DriveConfig
+from acsard.core.motion.kinematics import Kinematics
 from acsard.error_budget.drive_log import Stood, motion
 from acsard.error_budget.step_errors import Driving, Floats, Step, mirrored, rounding
 from tests.unit.error_budget.drives import Told, late, rounded

@@ -7,14 +7,14 @@ import os
 import pytest
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, RosConfig
+from acsard.core.config.settings import Config, RosConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
+from acsard.core.messages.topics import full_key
+from acsard.core.ros.attachments import Attachment
+from acsard.core.ros.transports import command_keys
 from acsard.foxglove.commanders import Reader, Way, ways
-from acsard.incoming.commands import Arrival
-from acsard.messages.encodings import FORMATS, DecodeError, Format, encode
-from acsard.messages.schema import Header, JointState, Time, Twist, TwistStamped, Vector3
-from acsard.messages.topics import full_key
-from acsard.ros.attachments import Attachment
-from acsard.ros.transports import command_keys
 
 TWIST = Twist(Vector3(x=0.3), Vector3(z=-0.2))
 STAMPED = TwistStamped(Header(Time(5), "elsewhere"), TWIST)

@@ -9,18 +9,18 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard import values
 from acsard.client import Client
 from acsard.client.commander import STALE_NS, Wish
-from acsard.config.settings import DriveConfig, JointsConfig
-from acsard.drive.kinematics import Kinematics
+from acsard.core import values
+from acsard.core.config.settings import DriveConfig, JointsConfig
+from acsard.core.incoming.commands import Arrival, Receiver
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Header, Message, Time, Twist, TwistStamped, Vector3
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import NS_PER_S, REST, Command
 from acsard.foxglove.drives import Drives, Viewer
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
-from acsard.incoming.commands import Arrival, Receiver
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Header, Message, Time, Twist, TwistStamped, Vector3
-from acsard.values import NS_PER_S, REST, Command
 from tests.system.harness import until
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))

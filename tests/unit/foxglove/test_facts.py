@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from acsard.foxglove.facts import Facts, key_of
 
 SOURCES = ("teleop", "app")

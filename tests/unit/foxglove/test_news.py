@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
+from acsard.core.messages.schema import Events, Happening, Time
 from acsard.foxglove.news import News
-from acsard.messages.schema import Events, Happening, Time
 
 KEPT = 20
 

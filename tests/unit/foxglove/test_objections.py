@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from acsard.client.commander import GRACE_S
+from acsard.core.values import NS_PER_S
 from acsard.foxglove.objections import Objections
-from acsard.values import NS_PER_S
 
 OBJECTS_NS = int(GRACE_S * NS_PER_S)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.config.live import LIVE
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
+from acsard.core.config.live import LIVE
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
 from acsard.foxglove.parameters import asked, news, values
 
 NOW = values(effective(Config()))

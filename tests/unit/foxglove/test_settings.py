@@ -7,8 +7,8 @@ from typing import Any, cast
 import pytest
 
 from acsard.client import Client
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.server import Listener, Shown

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from acsard.client.commander import Wish
+from acsard.core.messages.encodings import DecodeError, encode
+from acsard.core.messages.schema import Header, Time, TwistStamped, Vector3
+from acsard.core.messages.schema import Twist as Message
+from acsard.core.values import NS_PER_S, Twist
 from acsard.foxglove.twists import encoding_of, wish
-from acsard.messages.encodings import DecodeError, encode
-from acsard.messages.schema import Header, Time, TwistStamped, Vector3
-from acsard.messages.schema import Twist as Message
-from acsard.values import NS_PER_S, Twist
 
 MESSAGE = Message(Vector3(x=0.3), Vector3(z=-0.2))
 STAMPED = TwistStamped(Header(Time(5)), MESSAGE)

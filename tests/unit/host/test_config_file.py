@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tomlkit.exceptions import NonExistentKey
 
-from acsard.config.parsing import parse
+from acsard.core.config.parsing import parse
 from acsard.host.config_file import change
 from acsard.host.errors import ExitError
 

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.config.settings import LogConfig
+from acsard.core.config.settings import LogConfig
+from acsard.core.values import Event
 from acsard.host.logs import MAX_VALUE, JournalStream, Log, is_journal, render
-from acsard.values import Event
 
 
 class Journal:

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from acsard.bus.inbox import ATTACHMENT_BYTES
+from acsard.core.messages.signature import MAX_NAME, MOST, Signature, public_name, unpack
+from acsard.daemon.bus.inbox import ATTACHMENT_BYTES
 from acsard.host.own_identity import own_name, sender_id
-from acsard.messages.signature import MAX_NAME, MOST, Signature, public_name, unpack
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from acsard.core.values import NS_PER_S, Instant, Outputs, Twist, WheelSpeeds
 from acsard.host.systemd import FEEDS_PER_WATCHDOG, Systemd
-from acsard.values import NS_PER_S, Instant, Outputs, Twist, WheelSpeeds
 
 PID = 4711
 

@@ -13,10 +13,10 @@ from typing import TextIO
 
 import pytest
 
-from acsard.config.settings import LogConfig
+from acsard.core.config.settings import LogConfig
+from acsard.core.values import Event
 from acsard.host.logs import Log
 from acsard.host.terminal_modes import coloured, one_by_one
-from acsard.values import Event
 
 
 @pytest.fixture(name="terminal")

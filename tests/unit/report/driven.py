@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
-from acsard.config.settings import Config
-from acsard.record.replay import Replay
-from acsard.record.steps import Step
+from acsard.core.config.settings import Config
+from acsard.recording.replay import Replay
+from acsard.recording.steps import Step
 from acsard.report.course import Course
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World

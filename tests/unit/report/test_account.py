@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from msgspec.structs import replace
 
-from acsard.config.settings import Config, Source
+from acsard.core.config.settings import Config, Source
 from acsard.report.account import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two

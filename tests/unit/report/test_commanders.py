@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from acsard.core.thinning import Span
 from acsard.report.commanders import OTHERS
-from acsard.thinning import Span
 from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two
 

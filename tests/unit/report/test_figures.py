@@ -10,7 +10,7 @@ from typing import Any
 import plotly.graph_objects as library
 import pytest
 
-from acsard.config.parsing import parse
+from acsard.core.config.parsing import parse
 from acsard.report.drawing import Figure
 from acsard.report.figures import Pictures
 from tests.scenarios.taped import Tape, happenings

@@ -11,11 +11,11 @@ from html.parser import HTMLParser
 
 import pytest
 
-from acsard.record.steps import Step
+from acsard.core.values import Command, Event, Refusal, Twist
+from acsard.recording.steps import Step
 from acsard.report.account import Origin
 from acsard.report.course import Course, Mark
 from acsard.report.page import MOST_OPEN, escaped, page
-from acsard.values import Command, Event, Refusal, Twist
 from tests.unit.report.driven import drive_of_two, followed
 
 EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\u202e\x00<!--'
@@ -148,7 +148,7 @@ def test_what_is_missing_is_said_on_top() -> None:
 
 @pytest.mark.parametrize(("count", "opened"), [(MOST_OPEN, True), (MOST_OPEN + 1, False)])
 def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
-    from acsard.config.settings import Config
+    from acsard.core.config.settings import Config
 
     course = Course(Config())
     for n in range(count):

@@ -7,8 +7,8 @@ import io
 from msgspec.structs import replace
 from rich.console import Console
 
-from acsard.messages.schema import Figure, Info, RobotState, SourceState, Spread, Time
-from acsard.runtime.latencies import NAMES
+from acsard.core.messages.schema import Figure, Info, RobotState, SourceState, Spread, Time
+from acsard.daemon.latencies import NAMES
 from acsard.top.seen import Seen
 from acsard.top.view import screen
 

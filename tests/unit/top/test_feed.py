@@ -11,9 +11,9 @@ from msgspec.structs import replace
 
 from acsard.client import Client, Subscription
 from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
+from acsard.core.messages.encodings import DecodeError, encode, encoding_name
+from acsard.core.messages.schema import Info, RobotState, Time
 from acsard.host.errors import ReplyError
-from acsard.messages.encodings import DecodeError, encode, encoding_name
-from acsard.messages.schema import Info, RobotState, Time
 from acsard.top import feed as top_feed
 from acsard.top.feed import Feed
 from tests.unit.top.screens import BEFORE, INFO, STATE

@@ -12,8 +12,8 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.client.follower import FLEET_ASK_S
-from acsard.messages.encodings import encode
-from acsard.messages.schema import Info, Message, Time
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import Info, Message, Time
 from acsard.top import fleet as fleets
 from acsard.top.fleet import Fleet
 from acsard.top.roster import table

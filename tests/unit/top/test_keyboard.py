@@ -13,11 +13,11 @@ from msgspec.structs import replace
 
 from acsard.client.commander import GRACE_S, ZEROS
 from acsard.client.follower import ASK_S, SILENT_S
-from acsard.messages.encodings import encode
-from acsard.messages.schema import RobotState, Time
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import RobotState, Time
+from acsard.core.values import REST, Twist
 from acsard.top import keyboard
 from acsard.top.keyboard import HOLD_S, Keyboard, Ride, split
-from acsard.values import REST, Twist
 from tests.unit.top.screens import STATE
 
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"

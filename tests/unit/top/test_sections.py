@@ -7,8 +7,8 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from acsard.messages.schema import Figure, SourceState, Time
-from acsard.runtime.latencies import NAMES
+from acsard.core.messages.schema import Figure, SourceState, Time
+from acsard.daemon.latencies import NAMES
 from acsard.top.sections import FIGURES
 from tests.unit.top.screens import (
     BEFORE,

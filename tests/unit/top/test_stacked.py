@@ -7,7 +7,7 @@ import re
 import pytest
 from rich.cells import cell_len
 
-from acsard.messages.schema import SourceState
+from acsard.core.messages.schema import SourceState
 from tests.unit.top.screens import SEEN, STATE, line_with, lines_of, of, painted
 
 WIDTHS = (40, 60, 80, 160)

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rich.cells import cell_len
 
-from acsard.drive.modes import Mode
-from acsard.messages.schema import Figure, RobotState, SourceState, Spread, Time
-from acsard.runtime.latencies import NAMES
+from acsard.core.messages.schema import Figure, RobotState, SourceState, Spread, Time
+from acsard.core.motion.modes import Mode
+from acsard.daemon.latencies import NAMES
 from acsard.top.seen import MODES, Seen
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 

@@ -11,8 +11,8 @@ import zenoh
 from msgspec.structs import replace
 
 from acsard.client import Client
-from acsard.messages.encodings import encode, encoding_name
-from acsard.messages.schema import ServiceReply
+from acsard.core.messages.encodings import encode, encoding_name
+from acsard.core.messages.schema import ServiceReply
 from acsard.web.calls import (
     ELSEWHERE_AT_ONCE,
     STOPS_AT_ONCE,

@@ -6,8 +6,8 @@ from typing import Any
 
 from acsard.client import Client
 from acsard.client.commander import Commander, Sender, Wish
-from acsard.messages.signature import unpack
-from acsard.values import Twist
+from acsard.core.messages.signature import unpack
+from acsard.core.values import Twist
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 

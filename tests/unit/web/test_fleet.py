@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import zenoh
 
-from acsard.bus.address import Address
 from acsard.client import Client
-from acsard.messages.encodings import encode, encoding_name
-from acsard.messages.schema import Info
+from acsard.core.messages.encodings import encode, encoding_name
+from acsard.core.messages.schema import Info
+from acsard.daemon.bus.address import Address
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
 from acsard.web.robots import About, Robots

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.messages.signature import Signature, unpack
-from acsard.values import NS_PER_S
+from acsard.core.messages.signature import Signature, unpack
+from acsard.core.values import NS_PER_S
 from acsard.web.frames import (
     LATEST_STAMP_MS,
     Begin,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
 from acsard.web.limits import (
     CONNECTIONS,
     CONNECTIONS_ALIKE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
-from acsard.messages.schema import Figure, RobotState, Spread, Time
+from acsard.core.messages.schema import Figure, RobotState, Spread, Time
 from acsard.web.metrics import text
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)

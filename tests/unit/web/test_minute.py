@@ -6,8 +6,8 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.messages.schema import Figure, RobotState, Spread, Time, Twist, Vector3
-from acsard.values import NS_PER_S
+from acsard.core.messages.schema import Figure, RobotState, Spread, Time, Twist, Vector3
+from acsard.core.values import NS_PER_S
 from acsard.web.minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)

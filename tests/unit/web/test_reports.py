@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from acsard.values import NS_PER_S
+from acsard.core.values import NS_PER_S
 from acsard.web import reports
 from acsard.web.reports import BYTES, KEEP_NS, NICE, Reports, ReportState
 

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.bus.address import Address
 from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
-from acsard.messages.encodings import encode
-from acsard.messages.schema import RobotState, Time
-from acsard.values import NS_PER_S
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import RobotState, Time
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.address import Address
 from acsard.web import robots, streams
 from acsard.web.counts import Counts
 from acsard.web.robots import LOOK_S, About, Robots

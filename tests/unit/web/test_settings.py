@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from acsard.config.live import LIVE
-from acsard.config.parsing import effective
-from acsard.config.settings import Config
+from acsard.core.config.live import LIVE
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
 from acsard.web.settings import rows
 
 ROWS = {row.key: row for row in rows(effective(Config()))}

@@ -9,17 +9,17 @@ import pytest
 from msgspec import Struct
 
 from acsard.checkup.findings import Finding
-from acsard.config.settings import Config
-from acsard.messages.encodings import encode
-from acsard.messages.report import Report
-from acsard.values import Role
+from acsard.core.config.settings import Config
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.report import Report
+from acsard.core.values import Role
 from acsard.web import lines, told
 from acsard.web.minute import Minute
 from acsard.web.openapi import KEYS, LINES, SENT, VALUE
 from acsard.web.streams import KEYS as FOLLOWED
 from acsard.web.to_browser import Following
 from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
-from tests.unit.messages.examples import OUTPUTS, SNAPSHOT, START
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 GREETING = told.Greeting(
     "acsar", "1", "operator", "phone/1f", told.Limits(1.0, 4.0), True, 10.0

@@ -15,7 +15,7 @@ from acsard.calibration.guided.legs import Ask, Leg, Setup, Way, setup
 from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
-from acsard.config.settings import Config
+from acsard.core.config.settings import Config
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30

@@ -21,7 +21,7 @@ from acsard.calibration.guided.legs import (
     ride,
     setup,
 )
-from acsard.config.settings import Config, DriveConfig, LimitsConfig
+from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from tests.unit.calibration.guided.room import beyond
 
 SPIN = st.floats(-5.0, 5.0).filter(lambda rate: abs(rate) > 0.1)

@@ -9,9 +9,9 @@ from acsard.calibration.calibration_report import keys, parts, report
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.guided.measured import calibrated
 from acsard.calibration.guided.readings import Reading
-from acsard.config.parsing import parse
-from acsard.config.settings import DriveConfig
-from acsard.config.writing import excerpt
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import DriveConfig
+from acsard.core.config.writing import excerpt
 from acsard.terminal.output import plain
 from tests.unit.calibration.guided.test_readings import readings
 

@@ -27,7 +27,7 @@ from acsard.calibration.guided.readings import (
     turns,
 )  # fmt: skip
 from acsard.calibration.runs import Run
-from acsard.config.settings import DriveConfig
+from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.cut import BASE, IDEAL, log_of
 from tests.unit.calibration.guided.played import Player, usual_setup
 from tests.unit.calibration.robots import Plan, Robot, drive

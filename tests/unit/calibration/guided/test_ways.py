@@ -13,7 +13,7 @@ import pytest
 from acsard.calibration.guided.legs import MOST_S, setup
 from acsard.calibration.guided.ways import KINDS
 from acsard.calibration.solve import Calibration
-from acsard.config.settings import Config, DriveConfig
+from acsard.core.config.settings import Config, DriveConfig
 from tests.unit.calibration.guided.played import Player, anyone, play, usual_setup
 from tests.unit.calibration.robots import Drive, Robot, drive, wander
 from tests.unit.calibration.test_solve import off

@@ -1,0 +1,304 @@
+"""The rules between the keys of a configuration: contradictions, and warnings about surprises.
+
+Each contradiction is a line with key, value and fix; each warning is a sentence. The rules about
+motion are in `motion_rules.py`, those about simulated faults in `named_faults.py`.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+
+from acsard.core.config import motion_rules, named_faults
+from acsard.core.config.partial import Rule, told
+from acsard.core.config.settings import BusConfig, Config, McuConfig
+from acsard.core.config.validation import show
+from acsard.core.config.wire_time import (
+    COMFORTABLE_USE,
+    FIELD,
+    highest_rate,
+    line_bytes,
+    wire_ns,
+    wire_use,
+)
+from acsard.core.values import ROOT, WHEELS
+
+LEAST_BRIDGE = 2
+"""Control periods for which encoder counts must not wrap, so that one lost line does no harm."""
+
+
+def warnings(config: Config) -> list[str]:
+    """Return the warnings about settings that are allowed but may surprise, one sentence each."""
+    found = []
+    count = config.mcu.line_bytes
+    use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
+    if use > COMFORTABLE_USE:
+        comfortable = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE)
+        found.append(
+            f"control.rate = {config.rate_hz:g} takes {use:.0%} of the wire at "
+            f"{config.mcu.baud_rate} baud: lines will be superseded; "
+            f"{comfortable} Hz is comfortable"
+        )
+    found += _count_warnings(config)
+    drive, limits = config.drive, config.limits
+    needed = limits.linear_speed / drive.wheel_radius
+    if needed > limits.wheel_speed:
+        found.append(
+            f"limits.linear_speed = {limits.linear_speed:g} m/s needs {needed:.1f} rad/s but "
+            f"limits.wheel_speed = {limits.wheel_speed:g}: the robot will not reach it"
+        )
+    if config.bus.insecure:
+        found.append("bus.insecure = true: everyone who reaches the bus can drive this robot")
+    if config.access.wildcards:
+        found.append("access.wildcards = true: everyone with a certificate can stall the bus")
+    hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
+    outside = not all(_is_loopback(host) for host in hosts if host)
+    if outside and config.robot.id == Config().robot.id:
+        found.append(
+            f'robot.id = "{config.robot.id}" is the default, on a bus that leaves this machine: '
+            "a second robot there would share its keys; give each its own id"
+        )
+    ros = config.ros
+    where = "that leaves this machine" if outside else "with a router" if config.bus.connect else ""
+    if where and (ros.bridge or ros.rmw) and not ros.namespace:
+        found.append(
+            f'ros.namespace = "" on a bus {where}: a second robot there would '
+            "share its ROS topics; give each its own namespace"
+        )
+    return found + named_faults.warnings(config)
+
+
+def _count_warnings(config: Config) -> list[str]:
+    mcu = config.mcu
+    if not mcu.encoder_counts:
+        return []
+    if not mcu.wants_samples:
+        return [
+            f"mcu.encoder_counts = {mcu.encoder_counts} changes nothing: counts come with checked "
+            'lines only, and mcu.link_check = "off"; write "auto" or "require"'
+        ]
+    if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
+        return [
+            f"mcu.encoder_counts = {mcu.encoder_counts} but the simulated robot's encoders have "
+            f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong"
+        ]
+    return []
+
+
+def contradictions(config: Config) -> list[str]:
+    """Return the contradictions, one line each."""
+    return told(RULES, config)
+
+
+def _wire_problems(config: Config) -> list[str]:
+    mcu, rate = config.mcu, config.rate_hz
+    count = mcu.line_bytes
+    if wire_use(rate, mcu.baud_rate, count) <= 1.0:
+        return []
+    ms = wire_ns(count, mcu.baud_rate) / 1e6
+    most, good = (highest_rate(mcu.baud_rate, count, use) for use in (1.0, COMFORTABLE_USE))
+    bauds = [b for b in (19200, 38400, 57600, 115200) if wire_use(rate, b, count) <= 1.0]
+    faster = f"mcu.baud_rate = {bauds[0]} or more, or " if bauds else ""
+    return [
+        f"control.rate = {rate:g}: {count} B at {mcu.baud_rate} baud = {ms:.1f} ms per line, "
+        f'at most {most} Hz, {good} Hz at 80 %; write {faster}control.rate = {good} or "auto"'
+        f"{_shorter_lines(mcu, rate)}"
+    ]
+
+
+def _shorter_lines(mcu: McuConfig, rate: float) -> str:
+    """Return the fix that shortens the lines, if it makes them fit, else ""."""
+    ways = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
+    for check, way in ways:
+        count = line_bytes(mcu.trailing_comma, check)
+        if count < mcu.line_bytes and wire_use(rate, mcu.baud_rate, count) <= 1.0:
+            return f", or {way} (lines of {count} B)"
+    return ""
+
+
+def _count_problems(config: Config) -> list[str]:
+    """Find counts that wrap too soon.
+
+    The difference of two counts could then be read as a motion in the other direction.
+    """
+    counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
+    lasts = LEAST_BRIDGE / config.rate_hz
+    if fastest * counts * lasts <= FIELD / 2:
+        return []
+    return [
+        f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
+        f"{config.feedback.wheel_speed:g} rad/s they could wrap in "
+        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, and must last {LEAST_BRIDGE} control "
+        f"periods ({lasts * 1000:.0f} ms); write {int(FIELD / 2 / fastest / lasts)} at most "
+        "(count fewer edges), a lower feedback.wheel_speed, or 0"
+    ]
+
+
+def _motor_problems(config: Config) -> list[str]:
+    motors = config.mcu.wheels
+    return _repeated("motor", {f"mcu.wheels.{w}": getattr(motors, w)[1] for w in WHEELS})
+
+
+def _joint_problems(config: Config) -> list[str]:
+    return _repeated("joint name", {f"joints.{w}": getattr(config.joints, w) for w in WHEELS})
+
+
+def _source_name_problems(config: Config) -> list[str]:
+    sources = enumerate(config.commands.sources)
+    return _repeated("source name", {f"commands.sources[{i}].name": s.name for i, s in sources})
+
+
+def _frame_problems(config: Config) -> list[str]:
+    frames = {
+        "odometry.odom_frame": config.odometry.odom_frame,
+        "odometry.base_frame": config.odometry.base_frame,
+    }
+    if config.lidar.publish_tf:
+        frames["lidar.lidar_frame"] = config.lidar.lidar_frame
+    if config.footprint.publish_tf:
+        frames["footprint.footprint_frame"] = config.footprint.footprint_frame
+    return _repeated("frame", frames)
+
+
+def _gyro_problems(config: Config) -> list[str]:
+    if not config.odometry.learned_track or config.odometry.gyro:
+        return []
+    return [
+        "odometry.learned_track = true: a gyro teaches it, and odometry.gyro = false; write "
+        "odometry.gyro = true or odometry.learned_track = false"
+    ]
+
+
+def _repeated(noun: str, names: dict[str, str]) -> list[str]:
+    first: dict[str, str] = {}
+    found = []
+    for key, name in names.items():
+        if name in first:
+            found.append(f"{key} = {show(name)}: {first[name]} is the same {noun}; write another")
+        first.setdefault(name, key)
+    return found
+
+
+def _source_problems(config: Config) -> list[str]:
+    period = 1.0 / config.rate_hz
+    found = []
+    for i, source in enumerate(config.commands.sources):
+        if source.timeout < 2 * period:
+            found.append(
+                f"commands.sources[{i}].timeout = {source.timeout:g}: shorter than two control "
+                f"periods, the robot would stutter; write {2 * period:g} or more"
+            )
+    return found
+
+
+def _way_problems(config: Config) -> list[str]:
+    """Find a configuration in which no client, or no client over TLS, could reach the daemon."""
+    bus, found = config.bus, []
+    if bus.mode == "client" and not bus.connect:
+        found.append(
+            'bus.mode = "client": connects to nothing; write bus.connect = ["tcp/127.0.0.1:7447"] '
+            'or bus.mode = "peer"'
+        )
+    if not bus.listen and bus.mode == "peer":
+        found.append('bus.listen = []: nobody could connect; write ["tcp/127.0.0.1:7448"]')
+    if bus.outside and not bus.plain:
+        found.append(
+            f"bus.listen = {show(list(bus.listen))}: who comes by TLS reaches the daemon through "
+            'its address on this machine; add "tcp/127.0.0.1:7448"'
+        )
+    return found
+
+
+def _endpoint_problems(config: Config, key: str) -> list[str]:
+    bus, found = config.bus, []
+    for endpoint in _endpoints(bus).get(key, ()) if key == "listen" else bus.connect:
+        where = f"bus.{key} = {show(endpoint)}"
+        host = _host(endpoint)
+        if host is None:
+            found.append(
+                f"{where}: not an endpoint; write it like "
+                '"tcp/127.0.0.1:7448", "tcp/[::1]:7448" or "tls/0.0.0.0:7449"'
+            )
+        elif endpoint.startswith("tls/"):
+            if not bus.tls:
+                found.append(
+                    f"{where}: needs certificates; `acsard lan init` makes them and tells "
+                    "the bus.tls to write"
+                )
+        elif not _is_loopback(host) and not bus.insecure:
+            found.append(
+                f"{where}: leaves this machine, and there is no encryption or access control "
+                "on it; use 127.0.0.1 (a laptop joins by an SSH tunnel), certificates (`acsard "
+                'lan init`, then "tls/…"), or accept that anyone there can drive the robot: '
+                "bus.insecure = true"
+            )
+    return found
+
+
+def _access_problems(config: Config) -> list[str]:
+    access = config.access
+    lists = {"viewers": access.viewers, "operators": access.operators}
+    lists |= {"maintainers": access.maintainers}
+    names = {f"access.{r}[{i}]": n for r, held in lists.items() for i, n in enumerate(held)}
+    return _repeated("certificate", names)
+
+
+def _ros_problems(config: Config) -> list[str]:
+    ros = config.ros
+    if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
+        return [
+            f'ros.namespace = {show(ros.namespace)}: "{ROOT}" begins the native keys, which the '
+            'bridge\'s would fall among; write another, like "robot1"'
+        ]
+    return []
+
+
+def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
+    """Return the endpoints that are used, by key. A Zenoh client does not listen."""
+    listen = {"listen": bus.listen} if bus.mode == "peer" else {}
+    return listen | {"connect": bus.connect}
+
+
+def _host(endpoint: str) -> str | None:
+    scheme, _, address = endpoint.partition("/")
+    if set(endpoint) & set("#?;= \t"):
+        # Zenoh's own endpoint options could switch off the protection that these rules ensure.
+        return None
+    host, _, port = address.rpartition(":")
+    good = (
+        scheme in ("tcp", "tls")
+        and host
+        and port.isascii()
+        and port.isdigit()
+        and 0 < int(port) < 65536
+    )
+    return host.strip("[]") if good else None
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+RULES: tuple[Rule, ...] = (
+    _wire_problems,
+    _count_problems,
+    _motor_problems,
+    _joint_problems,
+    _source_name_problems,
+    _frame_problems,
+    _gyro_problems,
+    *motion_rules.RULES,
+    _source_problems,
+    _way_problems,
+    lambda config: _endpoint_problems(config, "listen"),
+    lambda config: _endpoint_problems(config, "connect"),
+    _access_problems,
+    _ros_problems,
+    *named_faults.RULES,
+)
+"""The rules, one function each. A rule that reads a key without a valid value is skipped."""

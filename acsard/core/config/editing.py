@@ -1,0 +1,84 @@
+"""Changes values in the text of an `acsard.toml` and keeps its comments, order and line ends.
+
+Needs the library tomlkit (extras `lan` and `mcu`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from acsard.core.config.parsing import effective, from_builtins, parse
+from acsard.core.config.validation import write
+
+
+def edited(text: str, keys: Mapping[str, object]) -> str:
+    """Return the text with dotted keys set to new values.
+
+    Raises `ConfigError` if the old or the new text is not a valid configuration, and `ValueError`
+    if the text is written in a way that cannot be changed safely.
+    """
+    from tomlkit.exceptions import TOMLKitError
+
+    wanted = effective(parse(text.encode()))
+    for key, value in keys.items():
+        *path, name = key.split(".")
+        plain = wanted
+        for part in path:
+            plain = plain[part]  # type: ignore[assignment]
+        plain[name] = value
+    try:
+        changed = _changed(text, keys)
+    except TOMLKitError as error:
+        raise ValueError(str(error)) from None
+    if parse(changed.encode()) != from_builtins(wanted):
+        raise ValueError("its tables are written in a way that cannot be changed safely")
+    return changed
+
+
+def _changed(text: str, keys: Mapping[str, object]) -> str:
+    """Return the text with new values, and with the line ends of the original text."""
+    import tomlkit
+
+    crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
+    text, keys = _dotted(text.replace("\r\n", "\n") if crlf else text, keys)
+    document = tomlkit.parse(text)
+    for key, value in keys.items():
+        *path, name = key.split(".")
+        table = document
+        for part in path:
+            if part not in table:
+                table[part] = tomlkit.table()
+            table = table[part]
+        table[name] = value
+    changed = tomlkit.dumps(document)
+    return changed.replace("\n", "\r\n") if crlf else changed
+
+
+def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
+    """Insert new keys of tables that are written as top-level dotted keys (`mcu.port = ...`).
+
+    The new keys get the same form, because tomlkit would open a table in the middle of the dotted
+    keys. Returns the text and the keys that are still to be set.
+    """
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    lines, left = text.splitlines(keepends=True), dict(keys)
+    for key, value in keys.items():
+        table = key.partition(".")[0]
+        top = next((n for n, s in enumerate(lines) if s.lstrip().startswith("[")), len(lines))
+        places = [n for n in range(top) if re.match(rf"\s*{table}\s*\.", lines[n])]
+        if not places or _has(document, key):
+            continue
+        lines.insert(places[0], f"{key} = {write(value)}\n")
+        del left[key]
+    return "".join(lines), left
+
+
+def _has(document: object, key: str) -> bool:
+    for part in key.split("."):
+        if not isinstance(document, Mapping) or part not in document:
+            return False
+        document = document[part]
+    return True

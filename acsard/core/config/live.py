@@ -1,0 +1,173 @@
+"""The settings that may change while the daemon runs, and the check of such a change.
+
+The module holds the table of these settings and when each may change. A change must satisfy the
+same rules as the file, and is applied completely or not at all. Each part of the robot decides in
+its own `use` how a change affects it. All other settings shape the wire, the bus or the base, and
+take effect only at the next start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+from msgspec import Struct
+from msgspec.structs import fields, replace
+
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.nearest import hint
+from acsard.core.config.parsing import ConfigError, effective
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import build, show
+
+When = Literal["always", "raised", "rest"]
+
+WHEN: dict[When, str] = {
+    "always": "at any time",
+    "raised": "lowered only while the robot stands",
+    "rest": "only while the robot stands",
+}
+"""When a setting may change, in words.
+
+With a lower deceleration, a robot that still drives faster than its new limits allow could not stop
+in time. The limit of the wheels cuts a speed off at once. New timeouts forget the present
+commander.
+"""
+
+
+class Live(Struct, frozen=True):
+    """A setting that may change: when, and its description."""
+
+    when: When
+    what: str
+
+
+LIVE: dict[str, Live] = {
+    "limits.linear_speed": Live("always", "highest speed, forwards and backwards"),
+    "limits.angular_speed": Live("always", "highest turn rate"),
+    "limits.linear_acceleration": Live("always", "speeding up"),
+    "limits.angular_acceleration": Live("always", "speeding up a turn"),
+    "limits.linear_deceleration": Live("raised", "slowing down, also when commands end"),
+    "limits.angular_deceleration": Live("raised", "slowing down a turn, also when commands end"),
+    "limits.linear_stop_deceleration": Live("raised", "braking by a stop or a fault"),
+    "limits.angular_stop_deceleration": Live("raised", "braking a turn by a stop or a fault"),
+    "limits.linear_jerk": Live("always", "how fast speeding up may begin"),
+    "limits.angular_jerk": Live("always", "how fast speeding up a turn may begin"),
+    "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
+    "commands.pause": Live("rest", "time that no speed may follow a zero of a shared identity"),
+    "commands.sources.*.timeout": Live("rest", "silence after which a source is gone"),
+    "odometry.covariance": Live("always", "by the model, or the diagonals as they stand"),
+    "odometry.pose_covariance_diagonal": Live(
+        "always", "x y z roll pitch yaw: where the robot is set, and of what no wheel measures"
+    ),
+    "odometry.twist_covariance_diagonal": Live(
+        "always", "x y z roll pitch yaw: of what no wheel measures"
+    ),
+    "odometry.distance_variance_per_metre": Live("always", "error of the distance, m2 per m"),
+    "odometry.yaw_variance_per_metre": Live("always", "error of the heading, rad2 per m"),
+    "odometry.yaw_variance_per_radian": Live("always", "error of the heading, rad2 per rad"),
+    "rates.odom": Live("always", "how often odom and tf are published"),
+    "rates.wheel_states": Live("always", "how often wheel_states are published"),
+    "rates.cmd_vel_out": Live("always", "how often cmd_vel_out is published"),
+    "rates.state": Live("always", "how often state is published"),
+    "rates.diagnostics": Live("always", "how often diagnostics are published"),
+    "log.level": Live("always", "the least that the log tells"),
+}
+"""The settings by dotted key as in `acsard.toml`. A source is named in place of its index, and
+"*" stands for every source.
+"""
+
+SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
+
+
+def live(key: str) -> Live | None:
+    """Return the row of a key, or None if the key takes effect only at a start."""
+    parts = key.split(".")
+    if parts[:2] == ["commands", "sources"] and len(parts) == 4:
+        parts[2] = "*"
+    return LIVE.get(".".join(parts))
+
+
+def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """Yield every leaf with its dotted name; a table in a list is named by its own name."""
+    if isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from flat(inner, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple) and value and isinstance(value[0], Mapping):
+        for table in value:
+            rest = {key: inner for key, inner in table.items() if key != "name"}
+            yield from flat(rest, f"{name}.{table['name']}")
+    else:
+        yield name, value
+
+
+def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
+    """Return the configuration with these settings, and a description of the changes ("" if none).
+
+    Raises `ConfigError` with every problem; then nothing changes. A setting that already has the
+    wished value is not a change, even if it cannot be set. `at_rest` says that the robot stands.
+    """
+    tables: dict[str, Any] = effective(config)
+    before = dict(flat(tables))
+    news = {key: value for key, value in wishes.items() if not _same(before.get(key), value)}
+    fixed = [key for key in news if live(key) is None or key not in before]
+    if fixed:
+        more = [f"and {len(fixed) - 1} more that cannot be set"] if len(fixed) > 1 else []
+        raise ConfigError([_refusal(fixed[0], news[fixed[0]], before), *more])
+    problems: list[str] = []
+    # The rules between tables need a list of tables here, not a tuple of structs.
+    tables["commands"]["sources"] = list(tables["commands"]["sources"])
+    for key, value in news.items():
+        _put(tables, key.split("."), value)
+    sections = {key.partition(".")[0] for key in news}
+    built = {name: build(SECTIONS[name], tables[name], name, problems) for name in sections}
+    if problems:
+        raise ConfigError(problems)
+    made = replace(config, **built)
+    after = dict(flat(effective(made)))
+    problems = contradictions(made)
+    if not at_rest:
+        problems += [line for key in news if (line := _must_stand(key, before[key], after[key]))]
+    if problems:
+        raise ConfigError(problems)
+    told = [f"{key} = {show(after[key])} (was {show(before[key])})" for key in news]
+    return made, ", ".join(told)
+
+
+def _same(before: object, value: object) -> bool:
+    if isinstance(before, list | tuple) and isinstance(value, list | tuple):
+        return list(before) == list(value)
+    return before == value and isinstance(before, bool) == isinstance(value, bool)
+
+
+def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
+    if key in known:
+        return (
+            f"{key} = {show(value)}: takes a start: change it in acsard.toml and start acsard anew "
+            "(`acsard set` lists what does not)"
+        )
+    return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists what can be set')}"
+
+
+def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
+    inner: Any = tables
+    for part in path[:-1]:
+        if isinstance(inner, list):
+            inner = next(table for table in inner if table["name"] == part)
+        else:
+            inner = inner[part]
+    inner[path[-1]] = list(value) if isinstance(value, tuple) else value
+
+
+def _must_stand(key: str, before: object, after: object) -> str:
+    """Return why this change must wait until the robot stands; "" if it may happen now."""
+    row = live(key)
+    if row is None or row.when == "always":
+        return ""
+    if row.when == "raised":
+        if not (isinstance(before, float) and isinstance(after, float) and after < before):
+            return ""
+        words = f"lower than {show(before)}, which may be set only while the robot stands"
+    else:
+        words = "may be set only while the robot stands"
+    return f"{key} = {show(after)}: {words}; stop it first"

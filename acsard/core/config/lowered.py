@@ -1,0 +1,73 @@
+"""Limits that `set` made lower than in the configuration file, which stay so after a restart.
+
+A limit counts as lowered while its value is below the one in the file, until `set` raises it again.
+Decelerations are not kept: with a lower one the robot brakes more softly, which is not safer. A
+jerk of 0 means "no limit", so it counts as the highest value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from acsard.core.config.live import changed
+from acsard.core.config.parsing import ConfigError
+from acsard.core.config.settings import Config, LimitsConfig
+from acsard.core.values import Event
+
+TABLE = "limits."
+
+
+def stays(key: str) -> bool:
+    """Return whether the setting with this dotted key survives a restart if it was lowered."""
+    return key.startswith(TABLE) and not key.endswith("_deceleration")
+
+
+def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
+    """Return the value of each limit but the decelerations that is now below that of the file."""
+    return {
+        TABLE + name: getattr(now, name)
+        for name in file.__struct_fields__
+        if stays(TABLE + name)
+        and _rank(name, getattr(now, name)) < _rank(name, getattr(file, name))
+    }
+
+
+def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
+    """Return the configuration with each kept limit that is below its own, and events for the log.
+
+    A kept limit may contradict the rest, for example after an upgrade. Then each of them is tried
+    alone, and an event names those that were dropped.
+    """
+    limits = config.limits
+    wishes: dict[str, object] = {
+        key: value
+        for key, value in kept.items()
+        if stays(key)
+        and (name := key.removeprefix(TABLE)) in limits.__struct_fields__
+        and _rank(name, value) < _rank(name, getattr(limits, name))
+    }
+    try:
+        return _applied(config, wishes)
+    except ConfigError:
+        events: list[Event] = []
+        for key, value in wishes.items():
+            try:
+                config, more = _applied(config, {key: value})
+                events += more
+            except ConfigError as error:
+                text = f"{key} = {value}, kept from before the restart, is dropped: {error}"
+                events.append(Event("set", text, "warning"))
+        return config, events
+
+
+def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list[Event]]:
+    if not wishes:
+        return config, []
+    made, news = changed(config, wishes, at_rest=True)
+    return made, [Event("set", f"{news}: lowered before the restart", "warning")]
+
+
+def _rank(name: str, value: float) -> float:
+    """Return a number that grows with what the limit allows."""
+    return math.inf if name.endswith("_jerk") and value == 0.0 else value

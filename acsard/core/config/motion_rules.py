@@ -1,0 +1,146 @@
+"""The rules about motion: the robot must stop soon enough, and ordinary motion must not be a fault.
+
+Each contradiction is a line with key, value and fix. The other rules are in `contradictions.py`.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import Struct
+
+from acsard.core.config.partial import Rule, told
+from acsard.core.config.settings import Config
+
+LEAST_JERK = 0.01
+"""Smallest jerk limit, m/s3 or rad/s3. With less, walking pace takes over ten seconds."""
+
+LONGEST_STOP_S = 2.0
+"""Longest time from full speed to rest by a stop, s: the longest that a person who stops the
+robot should wait.
+"""
+
+LONGEST_RAMP_S = 5.0
+"""Longest time from full speed to rest when commands end, s, because nobody steers any more."""
+
+HEADROOM = 1.1
+"""Factor by which a healthy wheel may exceed its commanded speed for a moment."""
+
+MOST_WHEEL_SPEED = 99.99
+"""Highest wheel speed that a line can express, rad/s."""
+
+LONGEST_REPLY_S = 0.25
+"""Longest time between two feedback lines, s. With two lines lost, the next one still arrives
+within one second, after which the board would count as restarted.
+"""
+
+LINES_OF_EVIDENCE = 2
+"""Number of feedback lines on which a fault must rest, so that one lost line is not a fault."""
+
+
+class _Reach(Struct, frozen=True):
+    """The highest speeds that the limits allow: m/s, rad/s, and rad/s of any wheel."""
+
+    linear: float
+    angular: float
+    wheel: float
+
+
+def _reach(config: Config) -> _Reach:
+    drive, limits = config.drive, config.limits
+    sides = (drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
+    half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
+    # If the wheels of one side are larger, the fastest turn also moves the robot forward, because
+    # each side runs at its own rim speed. The mean of the two rim speeds bounds either axis.
+    rim = limits.wheel_speed * drive.wheel_radius * sum(sides) / 2
+    fastest_rim = limits.linear_speed + limits.angular_speed * half_track
+    wished = fastest_rim / (drive.wheel_radius * min(sides))
+    return _Reach(
+        min(limits.linear_speed, rim),
+        min(limits.angular_speed, rim / half_track),
+        min(limits.wheel_speed, wished),
+    )
+
+
+def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> list[str]:
+    found = []
+    softer = f"{axis}_deceleration"
+    normal = getattr(config.limits, softer)
+    for name, most_s in ((softer, LONGEST_RAMP_S), (f"{axis}_stop_deceleration", LONGEST_STOP_S)):
+        value, least = getattr(config.limits, name), _rounded_up(speed / most_s)
+        if name != softer and value < normal:
+            found.append(
+                f"limits.{name} = {value:g}: lower than {softer}; a stop must not brake more "
+                f"softly than a timeout: write {max(normal, least):.10g} or more"
+            )
+        elif value < least:
+            found.append(
+                f"limits.{name} = {value:g}: would take {speed / value:.1f} s from full speed "
+                f"({speed:g} {unit}) to rest, and may take {most_s:g}; write {least:g} or more, "
+                f"or a lower limits.{axis}_speed"
+            )
+    return found
+
+
+def _jerk_problems(config: Config, name: str) -> list[str]:
+    jerk = getattr(config.limits, name)
+    if not 0.0 < jerk < LEAST_JERK:
+        return []
+    return [
+        f"limits.{name} = {jerk:g}: the robot would take minutes to start; write "
+        f"{LEAST_JERK:g} or more, or 0 for no limit"
+    ]
+
+
+def _feedback_problems(config: Config, asked: float) -> list[str]:
+    """Find a feedback limit that would drop lines or latch faults in allowed motion."""
+    most = config.feedback.wheel_speed
+    needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
+    if most >= needed:
+        return []
+    return [
+        f"feedback.wheel_speed = {most:g}: the limits let a wheel be asked {asked:.1f} rad/s, and "
+        f"lines above {most:g} are a fault; write {needed:g} or more, or a lower "
+        "limits.wheel_speed"
+    ]
+
+
+def _reply_problems(config: Config) -> list[str]:
+    """Find a reply period so long that one lost line would be a fault or look like a restart."""
+    period, fault_s = config.mcu.reply_period, config.feedback.fault_time
+    most = longest_reply(fault_s)
+    if period <= most:
+        return []
+    way = ""
+    if period <= LONGEST_REPLY_S:
+        way = f", or feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
+    return [
+        f"mcu.reply_period = {period:g}: a line that is lost would be a fault of a wheel, or look "
+        f"like a new start; write {most:g} at most (the firmware must report more often){way}"
+    ]
+
+
+def longest_reply(fault_s: float) -> float:
+    """Return the longest allowed `mcu.reply_period`, s, for this `feedback.fault_time` (0: off)."""
+    share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
+    return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
+
+
+def _rounded_up(value: float) -> float:
+    """Round up to three decimals, so that an advised value is sufficient."""
+    return math.ceil(round(value * 1000, 6)) / 1000
+
+
+RULES: tuple[Rule, ...] = (
+    lambda config: _braking_problems(config, "linear", _reach(config).linear, "m/s"),
+    lambda config: _braking_problems(config, "angular", _reach(config).angular, "rad/s"),
+    lambda config: _jerk_problems(config, "linear_jerk"),
+    lambda config: _jerk_problems(config, "angular_jerk"),
+    lambda config: _feedback_problems(config, _reach(config).wheel),
+    _reply_problems,
+)
+
+
+def problems(config: Config) -> list[str]:
+    """Return the contradictions, one line each."""
+    return told(RULES, config)

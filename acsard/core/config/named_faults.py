@@ -1,0 +1,130 @@
+"""The names of the simulator's faults: `mute`, `stuck_encoder=b`, `stalls=5:0.15`.
+
+The module holds the table of the names, reads a name with its arguments, and finds mistakes in
+`[sim] faults`. The faults themselves are methods of the same names in `core/simulator/faults.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import get_args
+
+from msgspec import Struct
+
+from acsard.core.config.nearest import nearest
+from acsard.core.config.partial import Rule
+from acsard.core.config.settings import Baud, Config
+from acsard.core.config.validation import show
+
+FAULTS = (
+    "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
+    "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
+    "late_watchdog", "fed_by_anything", "lost_replies", "lost_commands", "bit_errors", "unprompted",
+    "ftdi",
+)  # fmt: skip
+"""Faults without arguments."""
+
+ARGUMENTS = {
+    "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
+    "reversed_encoder": "m",
+    "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
+    "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
+    "pushed": "n", "stalls": "nn",
+}  # fmt: skip
+"""Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
+
+RESET = "reset"
+"""Fault that restarts the simulated board again and again after this many seconds. It needs a
+timer, so only `acsard sim --fault` has it.
+"""
+
+MOTORS = "abcd"
+
+MOST = 1e6
+"""Largest absolute value of a number. Beyond it sums overflow, and no robot has such values."""
+
+SHORTEST_S = 0.001
+"""Shortest stall, s. A shorter one has no visible effect."""
+
+
+class NamedFault(Struct, frozen=True):
+    """A fault with its arguments; motors are 0 to 3."""
+
+    name: str
+    values: tuple[int | float, ...] = ()
+
+
+def forms() -> list[str]:
+    """Return the faults with arguments, as they are written."""
+    return [_form(name, kinds) for name, kinds in ARGUMENTS.items()]
+
+
+def named(text: str) -> NamedFault:
+    """Parse a fault; raise `ValueError` with a description that does not repeat the text."""
+    name, _, given = text.partition("=")
+    known = {RESET: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
+    if name not in known:
+        near = nearest(name, known)
+        meant = f"did you mean {_form(near[0], known[near[0]])}?" if near else _all()
+        raise ValueError(f"not a fault; {meant}")
+    kinds, values = known[name], [word for word in given.split(":") if word]
+    if len(values) != len(kinds):
+        raise ValueError(f"it is written {_form(name, kinds)}")
+    fault = NamedFault(
+        name, tuple(_value(kind, word) for kind, word in zip(kinds, values, strict=True))
+    )
+    if name == RESET and not fault.values[0] > 0:
+        raise ValueError("seconds between resets must be above 0")
+    if name == "stalls" and not fault.values[0] > fault.values[1] >= SHORTEST_S:
+        raise ValueError(
+            f"seconds from one stall to the next, and fewer for each, {SHORTEST_S} at least"
+        )
+    if name == "other_baud" and fault.values[0] not in get_args(Baud):
+        raise ValueError(f"rates are {', '.join(map(str, get_args(Baud)))}")
+    return fault
+
+
+def warnings(config: Config) -> list[str]:
+    """Warn that the simulator has faults, so that nobody searches for them in the robot."""
+    faults = config.sim.faults
+    if not faults or not config.mcu.simulated:
+        return []
+    return [f"sim.faults = {show(faults)}: the simulator misbehaves as told; [] ends it"]
+
+
+def _problems(config: Config) -> list[str]:
+    found = []
+    for i, text in enumerate(config.sim.faults):
+        where = f"sim.faults[{i}] = {show(text)}"
+        try:
+            if named(text).name == RESET:
+                found.append(f"{where}: needs `acsard sim --fault {text}`; take it out here")
+        except ValueError as error:
+            found.append(f"{where}: {error}")
+    return found
+
+
+RULES: tuple[Rule, ...] = (_problems,)
+
+
+def _all() -> str:
+    return f"there are {', '.join((*FAULTS, *forms()))}"
+
+
+def _form(name: str, kinds: str) -> str:
+    words = {"m": "MOTOR", "n": "NUMBER"}
+    return f"{name}={':'.join(words[kind] for kind in kinds)}" if kinds else name
+
+
+def _value(kind: str, word: str) -> int | float:
+    if kind == "m":
+        if word not in tuple(MOTORS):
+            raise ValueError("motors are a, b, c and d")
+        return MOTORS.index(word)
+    try:
+        value = float(word)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= MOST:
+        raise ValueError(f"numbers are written like 5 or 0.15, up to {MOST:g}")
+    return int(value) if value.is_integer() else value

@@ -1,0 +1,366 @@
+"""The keys of `acsard.toml`: names, defaults, ranges and units, with one frozen struct per table.
+
+The `acsard.toml` at the root is the commented reference; a test proves that it equals these
+defaults. The rules between keys are in `contradictions.py`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+
+Name = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z0-9_-]{1,32}\Z",
+        extra={"unit": "1 to 32 of A-Z a-z 0-9 _ -", "example": "app"},
+    ),
+]
+Frame = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_/]{0,63}\Z",
+        extra={"unit": "a frame or joint name: 1 to 64 of A-Z a-z 0-9 _ /, no leading slash"},
+    ),
+]
+Text = Annotated[
+    str,
+    Meta(
+        pattern=r"^[^\x00]{1,256}\Z",
+        extra={"unit": "a text of 1 to 256 characters"},
+    ),
+]
+CommonName = Annotated[
+    str,
+    Meta(
+        # The name becomes a part of keys, and `state` shows it.
+        pattern=r"^(?!@)[\w .:@+-]{1,64}\Z",
+        extra={
+            "unit": "a common name of letters, digits, spaces and _.:@+-",
+            "example": "operator",
+        },
+    ),
+]
+RosNode = Annotated[
+    str,
+    Meta(
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,63}\Z",
+        extra={"unit": "a ROS name: letters, digits and _, not a digit first", "example": "acsard"},
+    ),
+]
+RosNamespace = Annotated[
+    str,
+    Meta(
+        pattern=r"^(|[A-Za-z_][A-Za-z0-9_]{0,63}(/[A-Za-z_][A-Za-z0-9_]{0,63}){0,3})\Z",
+        extra={"unit": "ROS names with / between them, or empty", "example": "robot1"},
+    ),
+]
+WebAddress = Annotated[
+    str,
+    Meta(
+        pattern=r"^https?://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9.-]{1,253}):[0-9]{1,5}\Z",
+        extra={"unit": "http(s)://, an address, a port", "example": "http://127.0.0.1:8080"},
+    ),
+]
+FaultName = Annotated[
+    str,
+    Meta(
+        pattern=r"^[\x20-\x7e]{1,64}\Z",
+        extra={"unit": "a fault of `acsard sim --fault` in quotes", "example": "ftdi"},
+    ),
+]
+Length = Annotated[float, Meta(ge=0.001, le=10.0, extra={"unit": "m"})]
+Offset = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m"})]
+Angle = Annotated[float, Meta(ge=-6.2832, le=6.2832, extra={"unit": "rad"})]
+Factor = Annotated[float, Meta(ge=0.1, le=10.0)]
+LinearSpeed = Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "m/s"})]
+AngularSpeed = Annotated[float, Meta(ge=0.0, le=50.0, extra={"unit": "rad/s"})]
+LinearRate = Annotated[float, Meta(ge=0.01, le=100.0, extra={"unit": "m/s2"})]
+AngularRate = Annotated[float, Meta(ge=0.01, le=500.0, extra={"unit": "rad/s2"})]
+LinearJerk = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "m/s3 (0 = no limit)"})]
+AngularJerk = Annotated[float, Meta(ge=0.0, le=5000.0, extra={"unit": "rad/s3 (0 = no limit)"})]
+WheelSpeed = Annotated[float, Meta(ge=0.1, le=99.99, extra={"unit": "rad/s"})]
+Variance = Annotated[float, Meta(ge=0.0, le=1e9, extra={"unit": "(m2 or rad2)"})]
+ErrorRate = Annotated[float, Meta(ge=0.0, le=10.0)]
+Deviation = Annotated[float, Meta(ge=0.0, le=1.0)]
+PublishRate = Annotated[float, Meta(ge=0.0, le=1000.0, extra={"unit": "Hz (0 = every sample)"})]
+SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
+Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
+Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
+EncoderCounts = Annotated[
+    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = do not ask for them)"})
+]
+Baud = Literal[9600, 19200, 38400, 57600, 115200]
+
+
+class RobotConfig(Struct, frozen=True):
+    id: Name = "acsar"
+
+
+class WheelMap(Struct, frozen=True):
+    front_right: Motor = "+a"
+    front_left: Motor = "+b"
+    rear_left: Motor = "+c"
+    rear_right: Motor = "+d"
+
+
+SIMULATOR = "sim"
+"""Port name that selects the built-in simulator."""
+
+
+class McuConfig(Struct, frozen=True):
+    port: Text = SIMULATOR
+    baud_rate: Baud = 115200
+    trailing_comma: bool = False
+    reply_period: Annotated[float, Meta(ge=0.0, le=2.0, extra={"unit": "s"})] = 0.0
+    link_check: Literal["off", "auto", "require"] = "off"
+    encoder_counts: EncoderCounts = 0
+    wheels: WheelMap = WheelMap()
+
+    @property
+    def simulated(self) -> bool:
+        """True if the built-in simulator takes the place of a serial device."""
+        return self.port == SIMULATOR
+
+    @property
+    def wants_samples(self) -> bool:
+        """True if the daemon asks the board for its encoder counts with every line."""
+        return self.link_check != "off" and self.encoder_counts > 0
+
+    @property
+    def line_bytes(self) -> int:
+        """Length in bytes of the longest line, in either direction, that may be on the wire."""
+        return line_bytes(self.trailing_comma, self.link_check != "off", self.wants_samples)
+
+
+class ControlConfig(Struct, frozen=True):
+    rate: Annotated[float, Meta(ge=10.0, le=1000.0, extra={"unit": "Hz"})] | Literal["auto"] = 100.0
+    auto_activate: bool = True
+    real_time: bool = True
+    state_directory: Annotated[
+        str,
+        Meta(
+            pattern=r"^(~?/[^\x00]{0,254})?\Z",
+            extra={"unit": "a directory that begins with / or ~/, or empty"},
+        ),
+    ] = ""
+
+
+class DriveConfig(Struct, frozen=True):
+    wheel_radius: Length = 0.05
+    wheel_separation: Length = 0.30
+    wheel_separation_multiplier: Factor = 1.0
+    left_wheel_radius_multiplier: Factor = 1.0
+    right_wheel_radius_multiplier: Factor = 1.0
+
+
+class JointsConfig(Struct, frozen=True):
+    front_right: Frame = "front_right_wheel_joint"
+    front_left: Frame = "front_left_wheel_joint"
+    rear_left: Frame = "rear_left_wheel_joint"
+    rear_right: Frame = "rear_right_wheel_joint"
+
+    def as_tuple(self) -> tuple[str, str, str, str]:
+        """Return the four names in `values.WHEELS` order."""
+        return self.front_right, self.front_left, self.rear_left, self.rear_right
+
+
+class FeedbackConfig(Struct, frozen=True):
+    wheel_speed: WheelSpeed = 80.0
+    wheel_acceleration: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "rad/s2"})] = 1500.0
+    response_time: Annotated[float, Meta(ge=0.01, le=5.0, extra={"unit": "s"})] = 0.2
+    fault_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s (0 = off)"})] = 0.5
+
+
+class LimitsConfig(Struct, frozen=True):
+    linear_speed: LinearSpeed = 1.0
+    angular_speed: AngularSpeed = 4.0
+    linear_acceleration: LinearRate = 1.0
+    angular_acceleration: AngularRate = 4.0
+    linear_deceleration: LinearRate = 1.0
+    angular_deceleration: AngularRate = 4.0
+    linear_stop_deceleration: LinearRate = 3.0
+    angular_stop_deceleration: AngularRate = 12.0
+    linear_jerk: LinearJerk = 0.0
+    angular_jerk: AngularJerk = 0.0
+    wheel_speed: WheelSpeed = 40.0
+
+
+class Source(Struct, frozen=True):
+    name: Name
+    priority: Annotated[int, Meta(ge=0, le=1000, extra={"example": 50})]
+    timeout: Annotated[float, Meta(ge=0.02, le=10.0, extra={"unit": "s"})] = 0.25
+
+
+class CommandsConfig(Struct, frozen=True):
+    neutral_first: bool = True
+    pause: Annotated[float, Meta(ge=0.5, le=60.0, extra={"unit": "s"})] = 1.0
+    sources: tuple[Source, ...] = (
+        Source("teleop", 100),
+        Source("app", 50),
+        Source("ros2_control", 20),
+        Source("nav", 10),
+    )
+
+
+class OdometryConfig(Struct, frozen=True):
+    odom_frame: Frame = "odom"
+    base_frame: Frame = "base_link"
+    publish_tf: bool = True
+    gyro: bool = False
+    learned_track: bool = False
+    pose_covariance_diagonal: Diagonal = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e-6)
+    twist_covariance_diagonal: Diagonal = (1e-3, 1e-3, 1e6, 1e6, 1e6, 1e-2)
+    distance_variance_per_metre: ErrorRate = 1e-4
+    yaw_variance_per_metre: ErrorRate = 1e-4
+    yaw_variance_per_radian: ErrorRate = 1e-2
+    wheel_separation_multiplier_std: Deviation = 0.0
+    left_wheel_radius_multiplier_std: Deviation = 0.0
+    right_wheel_radius_multiplier_std: Deviation = 0.0
+    distance_scale_std: Deviation = 0.0
+    covariance: Literal["model", "constant"] = "model"
+
+
+class LidarConfig(Struct, frozen=True):
+    publish_tf: bool = True
+    lidar_frame: Frame = "lidar_link"
+    lidar_x_offset: Offset = 0.0
+    lidar_y_offset: Offset = 0.0
+    lidar_z_offset: Offset = 0.0
+    lidar_roll: Angle = 0.0
+    lidar_pitch: Angle = 0.0
+    lidar_yaw: Angle = 0.0
+
+
+class FootprintConfig(Struct, frozen=True):
+    publish_tf: bool = False
+    footprint_frame: Frame = "base_footprint"
+    footprint_z_offset: Offset = 0.0
+
+
+class RatesConfig(Struct, frozen=True):
+    odom: PublishRate = 0.0
+    wheel_states: PublishRate = 0.0
+    cmd_vel_out: PublishRate = 0.0
+    state: SlowRate = 10.0
+    diagnostics: SlowRate = 1.0
+
+
+TLS = "tls/"
+"""Prefix of endpoints that present a certificate and require one."""
+
+
+class BusConfig(Struct, frozen=True):
+    mode: Literal["peer", "client"] = "peer"
+    listen: tuple[Text, ...] = ("tcp/127.0.0.1:7448",)
+    connect: tuple[Text, ...] = ()
+    tls: Annotated[
+        str,
+        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
+    ] = ""
+    insecure: bool = False
+
+    @property
+    def plain(self) -> tuple[str, ...]:
+        """Endpoints at which the daemon itself listens; empty for a Zenoh client."""
+        return tuple(e for e in self.listen if not e.startswith(TLS)) if self._peer else ()
+
+    @property
+    def outside(self) -> tuple[str, ...]:
+        """Endpoints at which the TLS gateway listens for the network; empty for a Zenoh client."""
+        return tuple(e for e in self.listen if e.startswith(TLS)) if self._peer else ()
+
+    @property
+    def _peer(self) -> bool:
+        return self.mode == "peer"
+
+
+class AccessConfig(Struct, frozen=True):
+    viewers: tuple[CommonName, ...] = ("viewer",)
+    operators: tuple[CommonName, ...] = ("operator",)
+    maintainers: tuple[CommonName, ...] = ("maintainer",)
+    wildcards: bool = False
+
+
+class RosConfig(Struct, frozen=True):
+    bridge: bool = True
+    rmw: bool = True
+    announce: bool = True
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0
+    namespace: RosNamespace = ""
+    node: RosNode = "acsard"
+    cmd_vel_type: Literal["auto", "twist", "twist_stamped"] = "auto"
+
+
+class LogConfig(Struct, frozen=True):
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    format: Literal["auto", "console", "json", "logfmt", "journal"] = "auto"
+
+
+RECORD = "ACSARD_RECORD"
+"""Environment variable in which the systemd units name the directory of recordings."""
+
+
+class RecordConfig(Struct, frozen=True):
+    directory: Annotated[
+        str,
+        Meta(pattern=r"^[^\x00]{0,256}\Z", extra={"unit": "a directory, or empty"}),
+    ] = ""
+    megabytes: Annotated[float, Meta(ge=10.0, le=1e6, extra={"unit": "MB"})] = 1000.0
+    days: Annotated[float, Meta(ge=0.01, le=3650.0, extra={"unit": "days"})] = 14.0
+
+
+class WebConfig(Struct, frozen=True):
+    page: bool = True
+    address: Annotated[tuple[WebAddress, ...], Meta(min_length=1, max_length=8)] = (
+        "http://127.0.0.1:8080",
+    )
+
+
+class SimConfig(Struct, frozen=True):
+    motor_time_constant: Annotated[float, Meta(ge=0.0, le=5.0, extra={"unit": "s"})] = 0.05
+    encoder_counts: Annotated[int, Meta(ge=16, le=1_000_000, extra={"unit": "per turn"})] = 3200
+    boot_time: Annotated[float, Meta(ge=0.0, le=10.0, extra={"unit": "s"})] = 0.0
+    track_multiplier: Factor = 1.0
+    track_rate_dependence: Annotated[float, Meta(ge=-0.4, le=2.0)] = 0.0
+    left_radius_multiplier: Factor = 1.0
+    right_radius_multiplier: Factor = 1.0
+    turn_slip: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
+    gyro_bias: Annotated[float, Meta(ge=-0.2, le=0.2, extra={"unit": "rad/s"})] = 0.0
+    gyro_noise: Annotated[float, Meta(ge=0.0, le=1.0, extra={"unit": "rad/s"})] = 0.0
+    gyro_delay: Annotated[float, Meta(ge=0.0, le=0.2, extra={"unit": "s"})] = 0.0
+    seed: Annotated[int, Meta(ge=0, le=1_000_000_000)] = 1
+    faults: tuple[FaultName, ...] = ()
+
+
+class Config(Struct, frozen=True):
+    robot: RobotConfig = RobotConfig()
+    mcu: McuConfig = McuConfig()
+    control: ControlConfig = ControlConfig()
+    drive: DriveConfig = DriveConfig()
+    joints: JointsConfig = JointsConfig()
+    limits: LimitsConfig = LimitsConfig()
+    feedback: FeedbackConfig = FeedbackConfig()
+    commands: CommandsConfig = CommandsConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    lidar: LidarConfig = LidarConfig()
+    footprint: FootprintConfig = FootprintConfig()
+    rates: RatesConfig = RatesConfig()
+    bus: BusConfig = BusConfig()
+    access: AccessConfig = AccessConfig()
+    ros: RosConfig = RosConfig()
+    log: LogConfig = LogConfig()
+    record: RecordConfig = RecordConfig()
+    web: WebConfig = WebConfig()
+    sim: SimConfig = SimConfig()
+
+    @property
+    def rate_hz(self) -> float:
+        """Control periods per second. "auto" is the highest comfortable rate, at most 100."""
+        if self.control.rate != "auto":
+            return float(self.control.rate)
+        mcu = self.mcu
+        return float(min(100, highest_rate(mcu.baud_rate, mcu.line_bytes, COMFORTABLE_USE)))

@@ -1,0 +1,174 @@
+"""Decodes a TOML table to a frozen struct, or finds every problem, each with key, value and fix.
+
+The module knows msgspec types and nothing about robots. The rules between keys are in
+`contradictions.py`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import inspect
+from msgspec.structs import FieldInfo, fields
+
+from acsard.core.config.nearest import nearest
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
+
+
+def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
+    """Decode `table` into `cls`; append a line per problem to `problems` and return None then.
+
+    `path` is the dotted name of the table, "" at the root.
+    """
+    before = len(problems)
+    made = build_partly(cls, table, path, problems, set())
+    return made if len(problems) == before else None
+
+
+def build_partly(
+    cls: type[T], table: object, path: str, problems: list[str], spoilt: set[str]
+) -> T | None:
+    """Decode `table` as `build` does, with defaults in place of invalid values.
+
+    The dotted key of each invalid value is added to `spoilt`. Returns None if a required key lacks
+    a valid value.
+    """
+    if not isinstance(table, Mapping):
+        header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
+        problems.append(f"{path} = {show(table)}: expected a table; write it as {header}")
+        return None
+    known = {field.encode_name: field for field in fields(cls)}
+    prefix, complete = f"{path}." if path else "", True
+    for key in table:
+        if key not in known:
+            near = nearest(key, known)
+            problems.append(_unknown(key, table[key], path, near, list(known)))
+            # The similar key may be the one that the user meant, so its value is not known.
+            spoilt |= {prefix + name for name in near}
+    values: dict[str, Any] = {}
+    for name, field in known.items():
+        where = prefix + name
+        if name in table:
+            value = _value(field, table[name], where, problems, spoilt)
+            if value is not None:
+                values[field.name] = value
+            elif field.required:
+                complete = False
+            else:
+                spoilt.add(where)
+        elif field.required:
+            problems.append(f"{where}: missing; write {name} = {_example(field)}")
+            complete = False
+    return cls(**values) if complete else None
+
+
+def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoilt: set[str]) -> Any:
+    """Return the value, or None if it is not valid."""
+    if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
+        return build_partly(field.type, raw, where, problems, spoilt)
+    kind = inspect.type_info(field.type)
+    if isinstance(kind, inspect.VarTupleType) and isinstance(kind.item_type, inspect.StructType):
+        if not isinstance(raw, list):
+            problems.append(f"{where} = {show(raw)}: expected tables; write them as [[{where}]]")
+            return None
+        item = kind.item_type.cls
+        made = [build(item, one, f"{where}[{i}]", problems) for i, one in enumerate(raw)]
+        return None if None in made else tuple(made)
+    if not _finite(raw):
+        value = None
+    else:
+        try:
+            value = msgspec.convert(raw, field.type)
+        except msgspec.ValidationError:
+            value = None
+    if value is None:
+        problems.append(f"{where} = {show(raw)}: expected {expected(kind)}; {_mend(field, where)}")
+    return value
+
+
+def _finite(raw: object) -> bool:
+    """Return whether all numbers are finite.
+
+    TOML has inf and nan, and msgspec's bounds admit inf.
+    """
+    if isinstance(raw, list):
+        return all(_finite(item) for item in raw)
+    return not isinstance(raw, float) or math.isfinite(raw)
+
+
+def _unknown(key: str, value: object, path: str, near: list[str], known: list[str]) -> str:
+    name = key if _BARE_KEY.fullmatch(key) else show(key)
+    where = f"{path}.{name}" if path else name
+    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+    return f"{where} = {show(value)}: unknown key; {hint}"
+
+
+def expected(kind: inspect.Type) -> str:
+    """Describe the valid values of a type, with range and unit."""
+    unit = ""
+    if isinstance(kind, inspect.Metadata):
+        unit = str((kind.extra or {}).get("unit", ""))
+        kind = kind.type
+    match kind:
+        case inspect.FloatType(ge=low, le=high) | inspect.IntType(ge=low, le=high):
+            noun = "a number" if isinstance(kind, inspect.FloatType) else "a whole number"
+            span = f" from {low:g} to {high:g}" if low is not None and high is not None else ""
+            return f"{noun}{span}{' ' + unit if unit else ''}"
+        case inspect.BoolType():
+            return "true or false"
+        case inspect.StrType():
+            return unit or "a text in quotes"
+        case inspect.LiteralType(values=values):
+            return "one of " + ", ".join(show(value) for value in values)
+        case inspect.UnionType(types=types):
+            return " or ".join(expected(one) for one in types)
+        case inspect.TupleType(item_types=items):
+            return f"a list of {len(items)}, each {expected(items[0])}"
+        case inspect.VarTupleType(item_type=item):
+            return f"a list, each {expected(item)}"
+        case _:
+            return "another kind of value"
+
+
+def _mend(field: FieldInfo, where: str) -> str:
+    if field.required:
+        return f"for example {_example(field)}"
+    return f"the default is {where.rpartition('.')[2]} = {show(field.default)}"
+
+
+def _example(field: FieldInfo) -> str:
+    kind = inspect.type_info(field.type)
+    extra = kind.extra if isinstance(kind, inspect.Metadata) else None
+    return show((extra or {}).get("example", 1))
+
+
+def show(value: object) -> str:
+    """Format a value as TOML, cut to one short line."""
+    text = write(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def write(value: object) -> str:
+    """Format a value as TOML."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            # JSON's escapes are valid in TOML, except that TOML also requires an escape for DEL.
+            return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
+        case list() | tuple():
+            return "[" + ", ".join(write(item) for item in value) + "]"
+        case Mapping():
+            return "{" + ", ".join(f"{key} = {write(item)}" for key, item in value.items()) + "}"
+        case _:
+            try:
+                return str(value)
+            except ValueError:
+                return "a number of thousands of digits"

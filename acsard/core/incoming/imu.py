@@ -1,0 +1,110 @@
+"""Decodes a sample on `imu` into the turn rate about base_link's z axis, or refuses it.
+
+The sample is a sensor_msgs/Imu in any encoding. In JSON and msgpack only `angular_velocity` is
+required. Its z axis points up, so a turn to the left is positive. If several gyros send, the daemon
+follows the first one and changes to another when that one is silent. Two gyros have two biases, so
+the first sample after a change is marked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import MutableMapping
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, sender
+from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
+from acsard.core.messages.schema import Covariance3, Header, Imu, Quaternion, Vector3
+from acsard.core.messages.signature import public_name
+from acsard.core.values import NS_PER_S, Event, GyroSample
+
+MAX_RATE = 50.0
+"""rad/s. No base turns so fast, and no gyro on a base measures it."""
+
+FOLLOWED_NS = NS_PER_S // 2
+"""Silence after which the daemon may follow another gyro, ns."""
+
+OWN = "gyro of the simulator/own"
+"""The sender id with which the simulator signs the samples of its gyro."""
+
+MOST_WHO = 64
+"""Characters of a sender's name that an error message shows."""
+
+UNTOLD = [0.0] * 9
+
+
+class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """An Imu in which only the turn rate is required."""
+
+    header: Header = Header()
+    orientation: Quaternion = Quaternion()
+    orientation_covariance: Covariance3 = []
+    angular_velocity: Vector3
+    angular_velocity_covariance: Covariance3 = []
+    linear_acceleration: Vector3 = Vector3()
+    linear_acceleration_covariance: Covariance3 = []
+
+
+_readings = Decoder(_Reading)
+
+
+class ImuTold:
+    """Follower of the gyros on the bus, one at a time."""
+
+    def __init__(self, own: bool = False) -> None:
+        """Start.
+
+        With `own` the robot is the simulated one, whose gyro is the only one that counts.
+        """
+        self._own = own
+        self._followed = public_name(OWN) if own else ""
+        self._heard_ns = -FOLLOWED_NS
+
+    def hear(
+        self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
+    ) -> GyroSample | None:
+        """Decode a gyro sample. Count and log a refused one and return None."""
+        try:
+            sample = reading(arrival)
+            anew = self._follow(sender(arrival), arrival.arrived_ns)
+        except DecodeError as error:
+            counters[f"imu_{error.reason}"] = counters.get(f"imu_{error.reason}", 0) + 1
+            events.append(Event("imu_refused", str(error), "warning", kind=error.reason))
+            return None
+        return replace(sample, anew=True) if anew else sample
+
+    def _follow(self, who: str, now_ns: int) -> bool:
+        """Follow this sender; return whether another one was followed before."""
+        other = who != self._followed
+        if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
+            raise DecodeError("second_sender", f"{who[:MOST_WHO]} sends beside {self._followed}")
+        before, self._followed, self._heard_ns = self._followed, who, now_ns
+        return other and before != ""
+
+
+def reading(arrival: Arrival) -> GyroSample:
+    """Decode one sample; raise `DecodeError`. Orientation and acceleration are ignored."""
+    if not arrival.put:
+        raise DecodeError("not_a_put", "a DELETE is not a sample")
+    if len(arrival.payload) > MAX_COMMAND_BYTES:
+        raise DecodeError("too_big", f"{len(arrival.payload)} bytes")
+    got: Imu | _Reading
+    if detect(arrival.encoding, arrival.payload) == "cdr":
+        got = decode_cdr(Imu, arrival.payload)
+    else:
+        got = _readings.decode(arrival.encoding, arrival.payload)
+    rate, variances = got.angular_velocity, got.angular_velocity_covariance or UNTOLD
+    said = (rate.x, rate.y, rate.z, variances[8])
+    if not all(map(math.isfinite, said)):
+        raise DecodeError("not_finite", "NaN or infinity in the angular velocity")
+    # sensor_msgs/Imu marks an absent measurement by -1 in the first variance.
+    if variances[0] == -1.0:
+        raise DecodeError("no_rate", "this IMU measures no angular velocity")
+    if variances[8] < 0.0:
+        raise DecodeError("wrong_shape", f"a variance of {variances[8]:g}")
+    if max(map(abs, said[:3])) > MAX_RATE or variances[8] > MAX_RATE**2:
+        raise DecodeError("absurd", f"over {MAX_RATE:g} rad/s, or a variance of that squared")
+    stamp_ns = got.header.stamp.to_ns()
+    return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])

@@ -1,0 +1,349 @@
+"""Answers a query, or turns it into the `Request` to the robot that it stands for.
+
+A service runs only if the query's key is exactly its own, because a get on `<id>/**` must never
+stop or clear anything. All other keys may also be queried by wildcard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via, asker
+from acsard.core.messages.cdr import CdrError
+from acsard.core.messages.encodings import (
+    FORMATS,
+    DecodeError,
+    Format,
+    detect,
+    encode,
+    encoding_name,
+)
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.schema import (
+    MESSAGES,
+    HardwareInterface,
+    Info,
+    Interfaces,
+    Message,
+    ServiceReply,
+    TopicInfo,
+    Topics,
+    WhoAmI,
+)
+from acsard.core.messages.topics import (
+    JSON_TREE,
+    PUBLISHED,
+    VERBS,
+    WHOAMI,
+    full_key,
+    offered,
+    whoami_key,
+)
+from acsard.core.ros.attachments import Attachment, unpack
+from acsard.core.ros.parameters import (
+    MAX_REQUEST_BYTES,
+    SETTING,
+    Parameters,
+    failure,
+    outcome,
+    wished,
+)
+from acsard.core.ros.transports import PARAMETERS, in_ros_words
+from acsard.core.values import ROLES, Answer, Outputs, Request
+
+Current = Callable[[str], Message | None]
+
+MAX_WILDCARD = 512
+"""Characters of the longest key expression with a wildcard that is compared with keys. A longer one
+would take time from the control loop, and no key is as long."""
+
+BUSY = "busy: too many queries at once; ask again"
+
+
+class Query(Struct, frozen=True):
+    """A query as the bus shell took it from Zenoh, with keys below `acsard/<id>/`."""
+
+    ticket: int
+    """The number by which replies name the query."""
+    topic: str
+    """The row of the topic table that the query matched."""
+    asked: str
+    """The key expression that the client wrote."""
+    fmt: str
+    """The `fmt` parameter, "" if it is absent."""
+    payload: bytes
+    encoding: str
+    arrived_ns: int | None = None
+    via: Via = "native"
+    attachment: bytes = b""
+
+
+class Reply(Struct, frozen=True):
+    """A reply to a query; with `ok` False an error reply."""
+
+    ticket: int
+    """The ticket of the query."""
+    key: str
+    payload: bytes
+    encoding: str
+    ok: bool = True
+    attachment: bytes = b""
+
+
+class _Waiting(Struct, frozen=True):
+    """The data needed to reply when the robot answers: key, encoding and the attachment to echo."""
+
+    key: str
+    form: Format
+    asked: Attachment | None
+    ros: bool = False
+    wish: bytes = b""
+    """The payload of a ROS request that sets parameters, "" for others. The reply must match its
+    form."""
+
+
+class Queries:
+    """The answers to queries, from constant values and the present messages."""
+
+    def __init__(self, config: Config, info: Info) -> None:
+        self._config = config
+        self._fixed: dict[str, object] = {
+            "info": info,
+            "config": effective(config),
+            "topics": topic_table(config),
+        }
+        self._parameters = Parameters(effective(config))
+        self._waiting: dict[int, _Waiting] = {}
+        """Service calls that wait for the robot's answer, by ticket."""
+
+    def use(self, config: Config) -> None:
+        """Answer with this configuration from now on."""
+        self._config = config
+        self._fixed["config"] = effective(config)
+        self._parameters = Parameters(effective(config))
+
+    def serve(
+        self, query: Query, current: Current, outputs: Outputs | None
+    ) -> list[Reply] | Request:
+        """Answer a query: return its replies, or the `Request` of a service.
+
+        The list is empty if the query is not for this daemon. Raises `DecodeError` for a ROS
+        request that cannot be served; `refused` builds the reply to it.
+        """
+        if query.via != "native":
+            return self._ros(query, 0 if outputs is None else outputs.now.wall_ns)
+        try:
+            form = _format(query)
+            if query.topic in VERBS:
+                return self._service(query, form)
+            return [
+                Reply(query.ticket, key, encode(value, form), encoding_name(form, name))
+                for key, name, value in self._values(query, current, outputs)
+            ]
+        except DecodeError as error:
+            words = str(error).encode()
+            return [Reply(query.ticket, query.topic, words, "text/plain", ok=False)]
+
+    def answered(self, answer: Answer, wall_ns: int) -> Reply | None:
+        """Return the reply that carries the robot's answer, or None if no query waits for it."""
+        waiting = self._waiting.pop(answer.id, None)
+        if waiting is None:
+            return None
+        key, form, message, name = waiting.key, waiting.form, answer.message, "ServiceReply"
+        if waiting.ros:
+            message = in_ros_words(message, self._config.ros)
+        if waiting.wish:
+            service, name = key.removeprefix(PARAMETERS), ""
+            payload = outcome(service, waiting.wish, answer.success, message)
+        else:
+            payload = encode(ServiceReply(answer.success, message), form)
+        attachment = _echo(waiting.asked, wall_ns)
+        return Reply(answer.id, key, payload, encoding_name(form, name), attachment=attachment)
+
+    def _ros(self, query: Query, wall_ns: int) -> list[Reply] | Request:
+        """Serve a std_srvs/Trigger or a ROS parameter service."""
+        asked = unpack(query.attachment) if query.via == "rmw" else None
+        by = asker(query.via, query.attachment)
+        verb = VERBS.get(query.topic)
+        if verb is not None:
+            self._waiting[query.ticket] = _Waiting(query.topic, "cdr", asked, True)
+            return Request(verb, query.ticket, asked_ns=query.arrived_ns, by=by)
+        if len(query.payload) > MAX_REQUEST_BYTES:
+            raise DecodeError("too_big", f"over {MAX_REQUEST_BYTES} bytes")
+        try:
+            service = query.topic.removeprefix(PARAMETERS)
+            if service in SETTING:
+                wish = wished(query.payload)
+                self._waiting[query.ticket] = _Waiting(
+                    query.topic, "cdr", asked, True, query.payload
+                )
+                ticket, at_ns = query.ticket, query.arrived_ns
+                return Request("set", ticket, asked_ns=at_ns, by=by, settings=wish)
+            payload = self._parameters.answer(service, query.payload)
+        except CdrError as error:
+            raise DecodeError("malformed", str(error)) from None
+        attachment, encoding = _echo(asked, wall_ns), encoding_name("cdr")
+        return [Reply(query.ticket, query.topic, payload, encoding, attachment=attachment)]
+
+    def _service(self, query: Query, form: Format) -> list[Reply] | Request:
+        if query.asked != query.topic:
+            return []
+        try:
+            request = Receiver.request(
+                VERBS[query.topic],
+                query.ticket,
+                query.encoding,
+                query.payload,
+                query.arrived_ns,
+            )
+        except DecodeError as error:
+            message = ServiceReply(False, f"{error}; send {EXAMPLES[VERBS[query.topic]]}")
+            payload, name = encode(message, form), encoding_name(form, "ServiceReply")
+            return [Reply(query.ticket, query.topic, payload, name)]
+        self._waiting[query.ticket] = _Waiting(query.topic, form, None)
+        return replace(request, by=asker(query.via, query.attachment))
+
+    def _values(
+        self, query: Query, current: Current, outputs: Outputs | None
+    ) -> list[tuple[str, str, object]]:
+        topic = query.topic
+        if topic == "schema/<Type>":
+            keys = {f"schema/{name}": value for name, value in SCHEMAS.items()}
+            return [(key, "", value) for key, value in keys.items() if self._matches(query, key)]
+        if topic == WHOAMI:
+            found = [role for role in ROLES if whoami_key(role) == query.asked]
+            by = asker(query.via, query.attachment)
+            return [(query.asked, "WhoAmI", WhoAmI(role, by)) for role in found]
+        if topic == "interfaces":
+            return [(topic, "Interfaces", interfaces(self._config, outputs))]
+        if topic in self._fixed:
+            value = self._fixed[topic]
+            return [(topic, type(value).__name__ if isinstance(value, Message) else "", value)]
+        value = current(topic.removeprefix(JSON_TREE))
+        return [] if value is None else [(topic, type(value).__name__, value)]
+
+    def _matches(self, query: Query, key: str) -> bool:
+        """Return whether a query asks for a key.
+
+        The expression of the query is below `acsard/<id>/`, or it is whole if its first two chunks
+        are not exactly these.
+        """
+        if "*" not in query.asked:
+            return query.asked == key
+        if len(query.asked) > MAX_WILDCARD:
+            return False
+        whole = full_key(self._config.robot.id, key)
+        return includes(query.asked, key) or includes(query.asked, whole)
+
+
+def includes(expression: str, key: str) -> bool:
+    """Return whether a Zenoh key expression includes a key, in time linear in both."""
+    chunks = key.split("/")
+    reached = {0}
+    for part in expression.split("/"):
+        if not reached:
+            return False
+        if part == "**":
+            reached = set(range(min(reached), len(chunks) + 1))
+        else:
+            reached = {n + 1 for n in reached if n < len(chunks) and _fits(part, chunks[n])}
+    return len(chunks) in reached
+
+
+def _fits(pattern: str, chunk: str) -> bool:
+    """Return whether a chunk of a key expression includes a chunk of a key."""
+    if pattern == "*":
+        return True
+    first, *middle = pattern.split("$*")
+    if not middle:
+        return pattern == chunk
+    last = middle.pop()
+    if not chunk.startswith(first):
+        return False
+    at = len(first)
+    for text in middle:
+        at = chunk.find(text, at)
+        if at < 0:
+            return False
+        at += len(text)
+    return chunk.endswith(last) and at <= len(chunk) - len(last)
+
+
+def refused(query: Query, why: str, wall_ns: int) -> Reply | None:
+    """Return the refusal of a query, or None if no reply could find its caller.
+
+    ROS clients do not receive error replies, so they get a normal response that reports a failure.
+    """
+    if query.via == "native":
+        return Reply(query.ticket, query.topic, why.encode(), "text/plain", ok=False)
+    try:
+        asked = unpack(query.attachment) if query.via == "rmw" else None
+    except DecodeError:
+        return None
+    if query.topic in VERBS:
+        payload, name = encode(ServiceReply(False, why), "cdr"), "ServiceReply"
+    else:
+        payload, name = failure(query.topic.removeprefix(PARAMETERS), why, query.payload), ""
+    encoding = encoding_name("cdr", name)
+    return Reply(query.ticket, query.topic, payload, encoding, attachment=_echo(asked, wall_ns))
+
+
+def most_bytes(topic: str) -> int:
+    """Return how many bytes of a query's payload are worth keeping."""
+    return MAX_REQUEST_BYTES if topic.startswith(PARAMETERS) else MAX_COMMAND_BYTES
+
+
+def _echo(asked: Attachment | None, wall_ns: int) -> bytes:
+    """Return the attachment by which rmw_zenoh matches a reply: the request's sequence and GID."""
+    return b"" if asked is None else Attachment(asked.sequence, wall_ns, asked.gid).pack()
+
+
+def _format(query: Query) -> Format:
+    """Return the reply's encoding: `?fmt=`, else that of a service's payload, else JSON."""
+    for form in FORMATS:
+        if query.fmt == form:
+            return form
+    if query.fmt:
+        raise DecodeError(
+            "unknown_format", f"fmt={query.fmt}: write fmt=json, fmt=msgpack or fmt=cdr"
+        )
+    if query.topic in VERBS and query.payload:
+        try:
+            return detect(query.encoding, query.payload)
+        except DecodeError:
+            pass  # a service without a payload ignores one that cannot be decoded
+    return "json"
+
+
+def topic_table(config: Config) -> Topics:
+    """Return the topic table with this robot's full keys."""
+    robot = config.robot.id
+    return Topics(
+        [
+            TopicInfo(full_key(robot, t.key), t.direction, t.type, t.rate, t.note)
+            for t in offered(config)
+        ]
+    )
+
+
+def interfaces(config: Config, outputs: Outputs | None) -> Interfaces:
+    """Return the command and state interfaces, named as in ros2_control."""
+    linked = outputs is not None and outputs.linked
+    claimed = outputs is not None and outputs.mode == "driving"
+    joints = config.joints.as_tuple()
+    return Interfaces(
+        [HardwareInterface(f"{j}/velocity", "command", "rad/s", linked, claimed) for j in joints]
+        + [
+            HardwareInterface(f"{j}/{name}", "state", unit, linked, False)
+            for j in joints
+            for name, unit in (("position", "rad"), ("velocity", "rad/s"))
+        ]
+    )
+
+
+assert all(topic.type in MESSAGES for topic in PUBLISHED)

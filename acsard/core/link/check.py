@@ -1,0 +1,75 @@
+"""Encodes and decodes the checked line: the plain line with a sequence number and a CRC.
+
+    command  ap12.50,bn08.75,cp15.00,dn10.25#07S*HHHH
+    reply    ap12.50,bn08.75,cp15.00,dn10.25#07@TTTTAAAABBBBCCCCDDDD*HHHH
+
+After `#` come two digits of the sequence. Then a command has the letters of its requests, and a
+reply has the sample fields if the command asked for them. After `*` comes the CRC-16/XMODEM of
+everything before it. All digits are upper-case hexadecimal, so each line has one correct form.
+`codec.py` handles the plain part.
+"""
+
+from __future__ import annotations
+
+import binascii
+import re
+
+from msgspec import Struct
+
+from acsard.core.link.codec import FrameError
+
+SEQUENCES = 256
+"""The sequence counts modulo this number."""
+
+ASK_SAMPLE = b"S"
+"""The request letter that asks for the sample fields."""
+
+ASK_NOTHING = b"H"
+"""A request letter that asks for nothing and that the board ignores. No reply carries letters, so a
+line that comes back with it is an echo."""
+
+# The pattern also restricts the characters of the plain part, because zero bytes in front of a line
+# do not change an XMODEM CRC.
+_REPLY = re.compile(rb"([a-dnp0-9., ]*)#([0-9A-F]{2})(?:@([0-9A-F]{20}))?\*([0-9A-F]{4})")
+
+
+class Reading(Struct, frozen=True):
+    """The sample fields of a reply, taken when the board read its encoders.
+
+    `mcu_ms` is the board's clock in ms. `counts` are those of the motors a to d; they rise when the
+    motor turns in its `p` direction. All five numbers are modulo 65536.
+    """
+
+    mcu_ms: int
+    counts: tuple[int, int, int, int]
+
+
+class Checked(Struct, frozen=True):
+    """A reply with a correct CRC: its plain part, the sequence that it answers and its sample."""
+
+    plain: bytes
+    sequence: int
+    reading: Reading | None
+
+
+def seal(line: bytes, sequence: int, letters: bytes = b"") -> bytes:
+    """Return a command line (ending in CR LF) with this sequence, these requests and the CRC."""
+    body = b"%b#%02X%b" % (line.removesuffix(b"\r\n"), sequence, letters)
+    return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+
+
+def unseal(line: bytes) -> Checked:
+    """Return the parts of a reply without its line end; raise `FrameError` if any part is wrong."""
+    match = _REPLY.fullmatch(line)
+    if match is None:
+        has_suffix = b"#" in line or b"*" in line
+        raise FrameError("wrong_check" if has_suffix else "unchecked", line)
+    plain, sequence, sample, crc = match.groups()
+    if binascii.crc_hqx(line[:-5], 0) != int(crc, 16):
+        raise FrameError("wrong_check", line)
+    return Checked(plain, int(sequence, 16), None if sample is None else _reading(sample))
+
+
+def _reading(sample: bytes) -> Reading:
+    mcu_ms, a, b, c, d = (int(sample[start : start + 4], 16) for start in range(0, 20, 4))
+    return Reading(mcu_ms, (a, b, c, d))

@@ -1,0 +1,132 @@
+"""Encodes four wheel speeds as one line of the board's plain protocol, and decodes such a line.
+
+`ap12.50,bn08.75,cp15.00,dn10.25`: motor letter, `p` or `n` for the direction, rad/s. Encoding is
+exact to the byte. Decoding is strict about meaning and lenient about form (spaces after commas, a
+trailing comma, one or two integer digits, one to three decimals). A line counts as a whole or not
+at all. Only this module maps motor letters and signs to wheels.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import lru_cache
+from typing import Literal
+
+from acsard.core.config.settings import WheelMap
+from acsard.core.values import STILL, AcsardError, WheelSpeeds
+
+LETTERS = "abcd"
+
+Motors = tuple[float, float, float, float]
+
+MAX_SPEED = 99.99
+"""rad/s, the largest number with two integer digits and two decimals."""
+
+Reason = Literal[
+    "malformed", "wheel_twice", "over_range", "unchecked", "wrong_check", "stale_sequence"
+]
+
+_TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
+TOKENS = _TOKEN + (rb", *" + _TOKEN) * 3
+"""The four values of a line, as a regular expression."""
+_LINE = re.compile(TOKENS + rb"(?:, *)?")
+
+
+class FrameError(AcsardError):
+    """A line that is not a valid frame; `reason` is the name under which it is counted."""
+
+    def __init__(self, reason: Reason, line: bytes) -> None:
+        super().__init__(reason, line)
+        self.reason = reason
+
+    def __str__(self) -> str:
+        # Format only when the message is shown: a noisy wire raises hundreds of these in one step.
+        reason, line = self.args
+        return f"{reason}: {line[:60]!r}"
+
+
+class Codec:
+    """An encoder and decoder of lines for one wiring and one dialect."""
+
+    def __init__(self, wheels: WheelMap, trailing_comma: bool = False) -> None:
+        motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
+        place = {motor[1]: index for index, motor in enumerate(motors)}
+        self._wiring = tuple(
+            (letter, place[letter], -1.0 if motors[place[letter]][0] == "-" else 1.0)
+            for letter in LETTERS
+        )
+        self._by_word = {
+            letter.encode() + direction: (index, sign * way)
+            for letter, index, sign in self._wiring
+            for direction, way in ((b"p", 1.0), (b"n", -1.0))
+        }
+        self._end = b",\r\n" if trailing_comma else b"\r\n"
+        self.stop = self._written(STILL)
+        """The line with speed zero for all wheels."""
+        self._last = (STILL, self.stop)
+
+    def encode(self, speeds: WheelSpeeds) -> bytes:
+        """Return the command line for these speeds, clamped to 99.99 rad/s and rounded to 0.01.
+
+        Raises ValueError for a speed that is not finite, because that is a bug of the caller.
+        """
+        last, line = self._last
+        if speeds != last:  # a steady command repeats its line in each period
+            line = self._written(speeds)
+            self._last = (speeds, line)
+        return line
+
+    def _written(self, speeds: WheelSpeeds) -> bytes:
+        wheel = speeds.as_tuple()
+        tokens = [_token(letter, sign * wheel[index]) for letter, index, sign in self._wiring]
+        return ",".join(tokens).encode() + self._end
+
+    def wheels(self, motors: Motors) -> Motors:
+        """Map values of the motors a to d to wheels in `WHEELS` order, forward positive."""
+        wheel = [0.0] * 4
+        for motor, (_, index, sign) in zip(motors, self._wiring, strict=True):
+            wheel[index] = motor * sign
+        front_right, front_left, rear_left, rear_right = wheel
+        return front_right, front_left, rear_left, rear_right
+
+    def decode(self, line: bytes) -> WheelSpeeds:
+        """Return the speeds in a line without its end.
+
+        Raise `FrameError` unless all of it is valid.
+        """
+        words = _words(line)
+        if words is None:
+            raise FrameError("malformed", line)
+        wheel: list[float | None] = [None] * 4
+        places = self._by_word
+        for word, speed in words:
+            index, sign = places[word]
+            if speed > MAX_SPEED:
+                raise FrameError("over_range", line)
+            wheel[index] = speed * sign
+        front_right, front_left, rear_left, rear_right = wheel
+        if front_right is None or front_left is None or rear_left is None or rear_right is None:
+            raise FrameError("wheel_twice", line)
+        return WheelSpeeds(front_right, front_left, rear_left, rear_right)
+
+
+# A robot at rest reports one line again and again.
+@lru_cache(16)
+def _words(line: bytes) -> tuple[tuple[bytes, float], ...] | None:
+    """Return the four words of a line, each a motor and its direction, with their speeds."""
+    match = _LINE.fullmatch(line)
+    if match is None:
+        return None
+    a, of_a, b, of_b, c, of_c, d, of_d = match.groups()
+    return (a, float(of_a)), (b, float(of_b)), (c, float(of_c)), (d, float(of_d))
+
+
+def _token(letter: str, speed: float) -> str:
+    # Round in whole hundredths first: 9.999 must become 10.00 and never 010.00, and a speed that
+    # rounds to zero becomes p00.00 and never n00.00.
+    if not math.isfinite(speed):
+        raise ValueError(f"wheel speed {speed} is not finite")
+    hundredths = int(min(abs(speed), MAX_SPEED) * 100 + 0.5)
+    direction = "n" if speed < 0 and hundredths else "p"
+    return f"{letter}{direction}{hundredths // 100:02d}.{hundredths % 100:02d}"

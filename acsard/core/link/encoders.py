@@ -1,0 +1,102 @@
+"""Converts encoder counts into the angle that each motor turned since the reading before.
+
+The counts are cumulative, so a lost line loses no distance, and the board's own milliseconds do not
+depend on when the host read the line. Both are modulo 65536: a difference is used only if it cannot
+have wrapped and the motors can have turned so far. Otherwise the caller falls back to speed times
+time. The result also reports a probable restart of the board.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.config.wire_time import FIELD
+from acsard.core.link.check import Reading
+from acsard.core.link.codec import Motors
+from acsard.core.link.promptest import Promptest
+from acsard.core.values import NS_PER_S
+
+SLACK_COUNTS = 4
+"""Counts that are allowed beyond the fastest wheel: one at each end, and play in the gears."""
+
+ROUNDING_MS = 2
+"""Error of the difference of two readings that are rounded to whole milliseconds, ms."""
+
+LATEST_MS = 1000.0
+"""Delay of a line in ms above which the delay is not tracked. The session starts over after such a
+gap anyway."""
+
+DRIFT = 0.01
+"""Relative drift between the two clocks that is allowed. A ceramic resonator has half of it."""
+
+Unknown = Literal["unknown", "leap", "restarted"]
+"""The reason why a difference is unusable. "unknown": there is no earlier reading, or it is too
+old. "leap": no motor can have turned so far. "restarted": the board has been powered on again."""
+
+
+class Turned(Struct, frozen=True):
+    """Angles in rad that the motors a to d turned in the last `dt` s of the board's clock."""
+
+    motors: Motors
+    dt: float
+
+
+class Encoders:
+    """A comparison of each reading with the one before."""
+
+    def __init__(self, counts: int, wheel_speed: float, quiet_ns: int) -> None:
+        """Start.
+
+        A reading is never read before it is made. Between two readings the board's clock can
+        therefore gain on the host's only by the delay of the first one. A larger gain than
+        `quiet_ns` means that the board has restarted.
+
+        Args:
+            counts: Encoder counts per turn, 0 if unknown.
+            wheel_speed: The highest speed of a wheel, rad/s.
+            quiet_ns: The duration of silence that ends a link, ns.
+        """
+        self._angle = math.tau / counts if counts else 0.0
+        self._fastest = wheel_speed / math.tau * counts / 1000
+        self._early_ms = quiet_ns * 1000 / NS_PER_S
+        self._last: tuple[Reading, int] | None = None
+        self._promptest = Promptest(DRIFT, LATEST_MS)
+        """The least delay of a reading, in ms."""
+
+    def forget(self) -> None:
+        """Forget the last reading, which belongs to another session or is accounted for."""
+        self._last = None
+
+    def turned(self, reading: Reading, at_ns: int) -> Turned | Unknown:
+        """Return how far the motors turned since the last reading, or why that is unknown.
+
+        `at_ns` is the host's time of the reading. It serves only to detect a restart or a wrap.
+        """
+        last, self._last = self._last, (reading, at_ns)
+        if last is None:
+            return "unknown"
+        before, before_ns = last
+        host_ms = (at_ns - before_ns) * 1000 / NS_PER_S
+        mcu_ms = (reading.mcu_ms - before.mcu_ms) % FIELD
+        if self._promptest.add(host_ms, mcu_ms) < -self._early_ms:
+            return "restarted"
+        if self._most(max(host_ms, mcu_ms)) >= FIELD / 2:
+            return "unknown"
+        pairs = zip(reading.counts, before.counts, strict=True)
+        a, b, c, d = (_signed(now - then) for now, then in pairs)
+        if max(abs(a), abs(b), abs(c), abs(d)) > self._most(mcu_ms):
+            return "leap"
+        angle = self._angle
+        return Turned((a * angle, b * angle, c * angle, d * angle), mcu_ms / 1000)
+
+    def _most(self, ms: float) -> float:
+        """Return a bound on the counts that a wheel makes in `ms` milliseconds."""
+        return self._fastest * (ms + ROUNDING_MS) + SLACK_COUNTS
+
+
+def _signed(difference: int) -> int:
+    """Return the difference of two counters modulo 65536 that is nearest to 0."""
+    return (difference + FIELD // 2) % FIELD - FIELD // 2

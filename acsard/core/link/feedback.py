@@ -1,0 +1,305 @@
+"""Turns a good line into feedback: the time of its sample and the motion since the last line.
+
+The time between two samples comes from the best clock that is available:
+
+- the board's own clock, if the board sends it with its counts;
+- the lines that left, if the board answers each one (`clock_of_answers.py`);
+- the period of a free-running board (`clock_of_reports.py`), where `habit.py` detects which of the
+  two kinds the board is;
+- otherwise the times of the reads, spread evenly over the lines of a read.
+
+`session.py` decides by arrival times alone whether the link can be trusted.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.core.config.settings import McuConfig
+from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
+from acsard.core.link.check import Reading
+from acsard.core.link.clock_of_answers import Prompts
+from acsard.core.link.clock_of_reports import BRIDGED_S, Slots
+from acsard.core.link.codec import Codec, Motors
+from acsard.core.link.encoders import Encoders, Turned
+from acsard.core.link.habit import Habit
+from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
+
+APART_NS = 1000
+"""Least distance between the stamps of two lines, ns. A line with an equal stamp would be taken for
+the one before."""
+
+LATER = 0.05
+"""Gain of the filter for the mean offset between two clocks."""
+
+FULL_READ = 1024
+"""Bytes of a full read of the port. After a full read more data may wait."""
+
+
+class Feedback(Struct, frozen=True, gc=False):
+    """A good line: its sample was taken at `at`, `dt` s after the previous one.
+
+    After a gap `dt` is 0, because nobody knows how the robot moved in it, and `gap` is its length
+    in s. `turned` is how far the wheels turned since the previous line by their encoders' counts,
+    in rad and `WHEELS` order, or None if unknown. It is also valid after a gap.
+    """
+
+    at: Instant
+    speeds: WheelSpeeds
+    dt: float
+    gap: float = 0.0
+    turned: Motors | None = None
+    bridged: float = 0.0
+    """Seconds at the start of `dt` that no line reported. The speeds of the lines around it stand
+    in."""
+    asked_ns: int | None = None
+    """Monotonic time at which the answered line was made, None if that line is unknown."""
+    since: float = 0.0
+    """Seconds since the previous line arrived, 0 after a silence. The plausibility checks use
+    it."""
+    heard_ns: int = 0
+    """Monotonic time at which the line was complete here."""
+    counted: Motors | None = None
+    """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
+    the speeds show whole counts (`snapping.py`)."""
+    steps: Motors = (0.0, 0.0, 0.0, 0.0)
+    """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
+
+
+class Told(Struct, frozen=True, gc=False):
+    """The place of a line on one of the clocks; `due_ns` is when it was due to be complete here."""
+
+    clock: Literal["slots", "prompts", "reads"]
+    due_ns: int
+    dt: float | None = None
+    """Seconds since the last line by the same clock, None for the first line."""
+    bridged: float = 0.0
+    """Seconds of `dt` that no line reported."""
+    place: float = 0.0
+    """Slot of the line on the clock with the number `found`."""
+    found: int = 0
+    early: bool = False
+    """Whether the line came before it was due. Then `due_ns` is its arrival, and the time to the
+    next line is the difference of their `due_ns`."""
+
+
+class Timeline:
+    """The times of the good lines in order.
+
+    Call `read` for each read, then for each of its lines `place`, or `spoilt` if the line is bad.
+    """
+
+    def __init__(
+        self, mcu: McuConfig, codec: Codec, wheel_speed: float, quiet_ns: int, rate_hz: float
+    ) -> None:
+        """Start.
+
+        Args:
+            mcu: The table `[mcu]`.
+            codec: The codec for the board's wiring.
+            wheel_speed: The highest speed that a wheel can have, rad/s.
+            quiet_ns: The duration of silence after which the link is stale, ns.
+            rate_hz: Control rate.
+        """
+        self._codec, self._baud_rate, self._quiet_ns = codec, mcu.baud_rate, quiet_ns
+        self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
+        self._counts = mcu.encoder_counts
+        known = (mcu.reply_period,) if mcu.reply_period else ()
+        self._slots = Slots((*known, 1 / rate_hz))
+        self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
+        self._prompts = Prompts(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
+        self._habit = Habit(mcu.reply_period > 0)
+        self._last: Instant | None = None
+        self._heard_ns = self._end_ns = 0
+        self._forgotten = True
+        self._told = Told("reads", 0)
+        """The place of the last good line."""
+        self._later = 0.0
+        """How much later a reply is due by its line than by the slots, mean in ns."""
+        self.leaps = 0
+        """Number of readings with impossible counts. The speeds replaced them."""
+        self.restarted = False
+        """Whether the last line's clock shows that the board has restarted."""
+
+    def forget(self) -> None:
+        """Start a new session: the next line does not follow the last one."""
+        self._encoders.forget()
+        self._slots.forget()
+        self._prompts.forget()
+        self._forgotten = True
+
+    def left(self, made_ns: int) -> None:
+        """Note that a command line left that was made at `made_ns`."""
+        self._prompts.left(made_ns)
+        self._habit.left()
+
+    def read(self, at: Instant, size: int, lines: int, following: int) -> None:
+        """Take a read of `size` bytes that completes `lines` lines.
+
+        Behind the last line `following` bytes came.
+        """
+        before, end_ns = self._end_ns, at.mono_ns
+        if following:
+            end_ns -= wire_ns(following, self._baud_rate)
+        end_ns = self._end_ns = max(before, end_ns)
+        self._at, self._rest = at, lines
+        self._share_ns = (end_ns - before) / lines
+        habit, slots = self._habit, self._slots
+        if habit.speaks is not False:
+            slots.read(end_ns, lines, size < FULL_READ)
+        habit.read(lines, (end_ns - before) / self._usual_ns)
+        if habit.speaks is False:
+            slots.forget()
+        self._prompts.read(end_ns, lines)
+
+    def spoilt(self) -> None:
+        """Note that the next line of the read is bad.
+
+        A prompted board still made it as a reply.
+        """
+        self._rest -= 1
+        if not self._habit.speaks:
+            self._prompts.skip()
+
+    def place(
+        self,
+        speeds: WheelSpeeds,
+        reading: Reading | None,
+        following: int,
+        length: int,
+        silent: bool,
+        asked_ns: int | None = None,
+    ) -> Feedback:
+        """Return the feedback of the read's next line.
+
+        Args:
+            speeds: The speeds in the line.
+            reading: The sample fields of a checked reply, if it has them.
+            following: Bytes of the read that came behind the line.
+            length: Bytes of the line.
+            silent: Whether the link was silent before it.
+            asked_ns: When the line was made that this reply answers, if it is known.
+        """
+        self._rest -= 1
+        # Bytes that followed in the same read were on the wire after this line was complete.
+        came_ns = self._at.mono_ns
+        if following:
+            came_ns -= wire_ns(following, self._baud_rate)
+        came_ns = max(came_ns, self._heard_ns)
+        since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
+        told = self._told_by(asked_ns, came_ns)
+        dt, bridged = self._since_last(told)
+        first = self._last is None
+        turned, wheels = self._turned(reading, came_ns), None
+        # A prompted board makes no line unless it is asked, so a silence of the host leaves no line
+        # missing.
+        clocked = told.clock != "reads" or self._prompts.lossy
+        known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
+        if turned is not None:
+            dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
+            wheels = self._codec.wheels(turned.motors)
+        gap = 0.0
+        if self._forgotten or self.restarted or not known or dt >= BRIDGED_S:
+            gap = 0.0 if first else max(since, dt)
+            self._share_ns = min(self._share_ns, wire_ns(length, self._baud_rate))
+            self._told = self._told_by_reads() if told.clock == "reads" else told
+            dt = bridged = since = 0.0
+        self._forgotten = False
+        at = self._sampled(came_ns, self._told, length)
+        since = 0.0 if silent else since
+        return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
+
+    def _told_by(self, asked_ns: int | None, came_ns: int) -> Told:
+        """Return the place of the next line on the best available clock."""
+        speaks, slots = self._habit.speaks, self._slots
+        if asked_ns is not None or not speaks:
+            answered = self._prompts.answer(asked_ns)
+            prompts = self._prompts
+            ours = asked_ns is not None or speaks is False or prompts.thinks
+            if ours and answered is not None:
+                if answered.due_ns - came_ns > self._usual_ns / 2:
+                    # The usual delay comes from a first reply that was read late, during a stall
+                    # that the line before has already counted. This line's time is therefore its
+                    # arrival.
+                    return Told("prompts", came_ns, early=True)
+                return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
+        else:
+            answered = None
+        if slots.period is None:
+            return self._told_by_reads()
+        place, slot_ns, last = slots.place(self._rest), slots.time_ns(self._rest), self._told
+        due_ns = min(slot_ns, came_ns)
+        if answered is not None:
+            self._compare(answered.due_ns - slot_ns)
+        if last.clock != "slots" or last.found != slots.found:
+            return Told("slots", due_ns, place=place, found=slots.found)
+        passed = place - last.place if place > last.place else 0.0
+        missing = passed - 1.0 if passed > 1.0 else 0.0
+        dt, bridged = passed * slots.period, missing * slots.period
+        return Told("slots", due_ns, dt, bridged, place, slots.found)
+
+    def _told_by_reads(self) -> Told:
+        return Told("reads", int(self._end_ns - self._share_ns * self._rest))
+
+    def _since_last(self, told: Told) -> tuple[float, float]:
+        """Return the time since the last good line, and the part of it that no line reported, s.
+
+        If different clocks placed the two lines, the host times of both decide, so changes of the
+        clock do not add up.
+        """
+        last = self._told
+        back = told.due_ns < last.due_ns
+        self._told = replace(told, due_ns=last.due_ns) if back else told
+        by_clock = told.dt if told.clock == last.clock else None
+        if by_clock is not None and not last.early:
+            return by_clock, told.bridged
+        late_ns = self._late_ns(told.clock) - self._late_ns(last.clock)
+        dt = max(0.0, (told.due_ns - last.due_ns - late_ns) / NS_PER_S)
+        if by_clock is not None:
+            return dt, told.bridged
+        period = self._usual_ns / NS_PER_S
+        missing = dt > 1.5 * period and self._habit.speaks is not False
+        return dt, dt - period if missing else 0.0
+
+    def _compare(self, later_ns: int) -> None:
+        """Update the mean by which replies are due later by their lines than by the slots."""
+        if self._told.found != self._slots.found:
+            self._later = float(later_ns)
+        self._later += LATER * (later_ns - self._later)
+
+    def _late_ns(self, clock: str) -> float:
+        """Return how much later a line is due by this clock than by the slots, mean in ns."""
+        if clock == "reads":
+            return self._slots.late_ns
+        return self._later if clock == "prompts" else 0.0
+
+    @property
+    def _usual_ns(self) -> float:
+        return self._slots.usual or self._period_ns
+
+    def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
+        """Return when the sample of a line was taken: before its own bytes were on the wire."""
+        mono_ns = min(came_ns, told.due_ns) - wire_ns(length, self._baud_rate)
+        last, read = self._last, self._at
+        wall_ns = read.wall_ns - read.mono_ns + mono_ns
+        if last is not None and mono_ns < last.mono_ns + APART_NS:
+            late_ns = last.mono_ns + APART_NS - mono_ns
+            mono_ns, wall_ns = mono_ns + late_ns, max(wall_ns + late_ns, last.wall_ns + APART_NS)
+        self._last = Instant(mono_ns, wall_ns)
+        return self._last
+
+    def _turned(self, reading: Reading | None, at_ns: int) -> Turned | None:
+        """Return how far the motors turned since the line before, None if unknown."""
+        self.restarted = False
+        if reading is None or not self._counts:
+            self._encoders.forget()
+            return None
+        turned = self._encoders.turned(reading, at_ns)
+        if isinstance(turned, Turned):
+            return turned
+        self.restarted = turned == "restarted"
+        self.leaps += turned == "leap"
+        return None

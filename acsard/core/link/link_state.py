@@ -1,0 +1,141 @@
+"""Decides whether the link can carry motion: received lines and silences move it through a table.
+
+- down: the port is closed.
+- booting: the port is open or the board has restarted, and fewer than GOOD_LINES good lines came.
+- up: lines come in time, and correct if they are checked.
+- stale: the link was up. Then no good line came for `quiet`, or BAD_LINES bad checked lines came in
+  a row, or no line left for the board's watchdog time although the port is open, or the received
+  lines were the daemon's own.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from acsard.core.values import NS_PER_S
+
+State = Literal["down", "booting", "up", "stale"]
+Sign = Literal["closed", "opened", "restarted", "trusted", "silent", "damaged", "blocked", "echo"]
+
+TABLE: dict[tuple[State, Sign], State] = {
+    ("down", "opened"): "booting",
+    ("booting", "closed"): "down",
+    ("booting", "opened"): "booting",
+    ("booting", "trusted"): "up",
+    ("up", "closed"): "down",
+    ("up", "opened"): "booting",
+    ("up", "restarted"): "booting",
+    ("up", "silent"): "stale",
+    ("up", "damaged"): "stale",
+    ("up", "blocked"): "stale",
+    ("up", "echo"): "stale",
+    ("stale", "closed"): "down",
+    ("stale", "opened"): "booting",
+    ("stale", "trusted"): "up",
+}
+"""Maps (state, sign) to the next state. Without an entry the state stays."""
+
+WORDS: dict[State, str] = {
+    "down": "the serial port is closed; it is being reopened",
+    "booting": "the port is open; waiting for the microcontroller's first good lines",
+    "up": "linked",
+    "stale": "the microcontroller has fallen silent",
+}
+
+GOOD_LINES = 3
+"""Good lines before the link is trusted. A board that just reset may print anything for a while."""
+
+BAD_LINES = 5
+"""Bad lines in a row after which a checked link asks for the check again."""
+
+
+SPARSE = 2
+"""Silences in a row, each ended by one good line, that make the lines sparse. A single one is a
+link that was lost for a moment."""
+
+
+class Link:
+    """The state of the link and its counts of good and bad lines. Only `sign` changes the state."""
+
+    def __init__(self, quiet_ns: int) -> None:
+        """Start; after `quiet_ns` of silence the link is stale."""
+        self.quiet_ns = quiet_ns
+        self.state: State = "down"
+        self.sparse_s = 0.0
+        """Seconds between the last two good lines if they repeatedly are too far apart, else 0."""
+        self._silences = 0
+        """Silences in a row, each ended by one good line."""
+        self._good_in_row = self._bad_in_row = 0
+        self._heard_ns: int | None = None
+
+    def sign(self, sign: Sign) -> None:
+        """Apply a sign by the table. Every sign except "trusted" resets the count of good lines."""
+        self.state = TABLE.get((self.state, sign), self.state)
+        if sign == "trusted":
+            return
+        self._good_in_row = 0
+        if sign in ("closed", "opened", "restarted"):
+            self._heard_ns = None
+        if sign in ("closed", "opened"):
+            self._bad_in_row = 0
+            self.excuse()
+
+    def silent(self, now_ns: int) -> bool:
+        """Return whether no good line came within `quiet_ns`, or none at all in this session."""
+        return self._heard_ns is None or now_ns - self._heard_ns > self.quiet_ns
+
+    def good(self, at_ns: int) -> int | None:
+        """Count a good line.
+
+        Return the ns since the one before, None for the first of a session.
+        """
+        since_ns = None if self._heard_ns is None else at_ns - self._heard_ns
+        if not self.silent(at_ns):
+            self.excuse()
+        else:
+            self.missed()
+            if since_ns is not None:
+                self._silences += 1
+                self.sparse_s = since_ns / NS_PER_S if self._silences >= SPARSE else 0.0
+        self._good_in_row += 1
+        self._bad_in_row = 0
+        self._heard_ns = at_ns
+        return since_ns
+
+    def excuse(self) -> None:
+        """Reset the count of silences: the last line came in time, or the host was late."""
+        self._silences, self.sparse_s = 0, 0.0
+
+    def missed(self) -> None:
+        """Note a bad line or a silence.
+
+        Unless the link is up, this resets the count of good lines.
+        """
+        if self.state != "up":
+            self._good_in_row = 0
+
+    def bad(self) -> bool:
+        """Count a bad line.
+
+        Return True if it is the last of BAD_LINES in a row, so that the check must be asked for.
+        """
+        self.missed()
+        self._bad_in_row += 1
+        return self._bad_in_row == BAD_LINES
+
+    @property
+    def damaged(self) -> bool:
+        """Whether the last BAD_LINES lines were bad."""
+        return self._bad_in_row >= BAD_LINES
+
+    def judge(self, now_ns: int, may_rise: bool) -> None:
+        """Update the state for silence or trust.
+
+        `may_rise` is False if the link must not come up now.
+        """
+        silent = self.silent(now_ns)
+        if self.state == "up":
+            if silent:
+                self.sign("silent")
+        elif self._good_in_row >= GOOD_LINES and may_rise and not silent:
+            self.sign("trusted")

@@ -1,0 +1,366 @@
+"""Follows one serial port through opens, losses and silences.
+
+The session takes the bytes that the port received and returns feedback, with the time at which each
+line was complete. It writes the lines that leave in the form in force, plain or checked. It decides
+nothing about motion: `link_state.py` decides whether the link may carry motion, and
+`negotiation.py` which form is in force. The link is not up while the session asks the board for the
+check.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from acsard.core.config.motion_rules import LONGEST_REPLY_S
+from acsard.core.config.settings import FeedbackConfig, McuConfig
+from acsard.core.link import link_words
+from acsard.core.link.check import Reading, unseal
+from acsard.core.link.codec import Codec, FrameError
+from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.link.echo import EchoDetector
+from acsard.core.link.feedback import Feedback, Timeline
+from acsard.core.link.hearing import Hearing
+from acsard.core.link.lines import LineReader
+from acsard.core.link.link_state import Link
+from acsard.core.link.link_state import State as LinkState
+from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
+from acsard.core.link.snapping import Snapping
+from acsard.core.link.throttle import Throttle
+from acsard.core.link.whose_silence import Lateness
+from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
+
+NAMES: dict[LinkState, EventName] = {
+    "down": "link_down",
+    "booting": "link_booting",
+    "up": "link_up",
+    "stale": "link_stale",
+}
+"""The event that reports each state of the link."""
+
+LONG_GAP_NS = 1 * NS_PER_S
+"""A gap this long in either direction means the MCU may have been reset: commanders start over."""
+
+BLOCKED_NS = int(WATCHDOG_S * NS_PER_S)
+"""The output is blocked when no line has left for this long: the MCU has stopped by itself."""
+
+IDENTITY = b"!acsard-mcu "
+"""Begins the line with which an MCU of ours names itself when it has booted."""
+
+
+class McuSession:
+    """Follows one serial port."""
+
+    def __init__(
+        self,
+        mcu: McuConfig,
+        rate_hz: float,
+        wheel_speed: float = FeedbackConfig().wheel_speed,
+        longest_reply: float = LONGEST_REPLY_S,
+    ) -> None:
+        """Start without a port.
+
+        Args:
+            mcu: The table `[mcu]`.
+            rate_hz: Control rate.
+            wheel_speed: The highest speed that a wheel can have, rad/s.
+            longest_reply: The highest value that mcu.reply_period may have, s.
+        """
+        self.codec = Codec(mcu.wheels, mcu.trailing_comma)
+        self._lines = LineReader()
+        self.quiet_ns = int(NS_PER_S * max(0.1, 4 / rate_hz, 3 * mcu.reply_period))
+        """Duration of silence after which the link is stale, ns."""
+        self.negotiation = Negotiation(mcu, self.codec.stop)
+        self._link = Link(self.quiet_ns)
+        self.lateness = Lateness(mcu.simulated, self.quiet_ns)
+        self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
+        self._echo = EchoDetector()
+        self.snapping = Snapping()
+        self._hearing = Hearing()
+        self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
+        self.rejects: Counter[str] = Counter()
+        self._rejected: dict[str, tuple[int, bytes]] = {}
+        """Lines rejected in this update by reason: their number and the last one."""
+        self.good_lines = 0
+        self._heard_ns: int | None = None
+        self.restarted = False
+        """True if the last `update` saw a new session with the MCU: the port was opened again, the
+        MCU has started again, or a long gap has ended."""
+        self.events: list[Event] = []
+        """Events of the last `update`, for the log."""
+        self._starting_over = False
+        self._announced: tuple[LinkState, str, bool, bool]
+        self._announced = ("down", self.negotiation.in_force, False, False)
+        self._opened = 0
+        self._blind, self._just_blind = Throttle(), False
+        self._made: tuple[bytes, int] | None = None
+        """The line just made and its time, until its fate is known."""
+        self._left_ns = 0
+        """When the last line that left was made, or when the port was opened."""
+        self._held_up = False
+        """True if the last line made did not leave."""
+        self.blocked = False
+        """True if the port is open, but its driver has not taken a line for `BLOCKED_NS`."""
+
+    @property
+    def link(self) -> LinkState:
+        """Whether there is a link, and whether it may carry motion (`up`)."""
+        return self._link.state
+
+    def update(
+        self,
+        now: Instant,
+        port_open: bool,
+        opened: int,
+        received: tuple[Received, ...],
+        unsent: bool = False,
+    ) -> list[Feedback]:
+        """Take the port's state and bytes, and return the good lines in order.
+
+        Args:
+            now: Both clocks at this step.
+            port_open: Whether the port is open.
+            opened: The number of openings of the port. Another number starts a new session.
+            received: The bytes since the last update.
+            unsent: True if the last line did not leave.
+        """
+        self.restarted, self._starting_over, self.events = False, False, []
+        self._settle(not unsent, port_open)
+        feedback = []
+        if not port_open or opened != self._opened:
+            self._begin(port_open, opened, now.mono_ns)
+        if port_open:
+            for piece in received:
+                feedback += self._read(piece)
+            more = self._lines.too_long - self.rejects.get("too_long", 0)
+            if more > 0:
+                self._reject("too_long", more=more)
+                self._bad()
+            if self.lateness.look(now.mono_ns, good=bool(feedback)):
+                self._link.excuse()
+            if self.lateness.step_s:
+                heard = self._hearing.now
+                heard.late_s = max(heard.late_s, self.lateness.step_s)
+            self._judge(now.mono_ns)
+        if self._rejected:
+            self._announce_rejects()
+        self._announce()
+        return feedback
+
+    def line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
+        """Return the line with these speeds, in the form in force, or None if none is due.
+
+        While the MCU does not answer, and while the session asks it for the check, only stops
+        leave. The first stop leaves at once, because the MCU may still obey the line before.
+        """
+        line = self._next_line(now_ns, speeds)
+        self._made = None if line is None else (line, now_ns)
+        return line
+
+    def _next_line(self, now_ns: int, speeds: WheelSpeeds) -> bytes | None:
+        if self.negotiation.asking:
+            return self.negotiation.question(now_ns)
+        if self.silent(now_ns):
+            self._just_blind = self._blind.lets(now_ns, BLIND_PERIOD_NS)
+            if not self._just_blind:
+                return None
+            speeds = STILL
+        line = self.codec.stop if speeds == STILL else self.codec.encode(speeds)
+        return self.negotiation.seal(line, now_ns)
+
+    def silent(self, now_ns: int) -> bool:
+        """Return whether no good line came for `quiet`, or none at all in this session."""
+        return self._link.silent(now_ns)
+
+    def feedback_age_s(self, now_ns: int) -> float | None:
+        """Return the seconds since the last good line of any session, None before the first."""
+        return None if self._heard_ns is None else (now_ns - self._heard_ns) / NS_PER_S
+
+    def words(self, port_trouble: str = "") -> str:
+        """Return a sentence about the link; `port_trouble` is the reason of a closed port."""
+        if self.link == "down" and port_trouble:
+            return port_trouble
+        if self.blocked:
+            return link_words.BLOCKED
+        heard, late = self._hearing, self.lateness
+        return link_words.words(self._link, self.negotiation, heard, late, self._longest_reply)
+
+    @property
+    def note(self) -> str:
+        """The check in force, as an addition to a reason; "" with `link_check = "off"`."""
+        check = self.negotiation
+        return "" if check.state == "off" else f" (serial lines {check.in_force})"
+
+    # sessions
+
+    def _settle(self, went: bool, port_open: bool) -> None:
+        """Note whether the line just made has left. A line that did not uses up no throttle."""
+        self.negotiation.settle(went)
+        made, self._made = self._made, None
+        blind, self._just_blind = self._just_blind, False
+        if made is None:
+            return
+        self._held_up = not went
+        if went:
+            line, made_ns = made
+            self._echo.left(line)
+            self._timeline.left(made_ns)
+            self.restarted = self.blocked and made_ns - self._left_ns >= LONG_GAP_NS
+            self._left_ns = made_ns
+        elif blind and port_open:
+            self._blind.undo()
+
+    def _begin(self, port_open: bool, opened: int, now_ns: int) -> None:
+        self._link.sign("opened" if port_open else "closed")
+        self.restarted = opened != self._opened
+        self._opened = opened
+        self._left_ns, self._held_up, self.blocked = now_ns, False, False
+        if port_open:
+            self._blind = Throttle()
+        self._lines.clear()
+        self._timeline.forget()
+        self._echo.forget()
+        self.snapping.forget()
+        self._hearing.forget()
+        self.negotiation.begin(fresh=True)
+
+    def _restart(self, how: str) -> None:
+        """Start over with an MCU that has started again: its motors stand still now."""
+        if self.link == "up":
+            self.events.append(Event("mcu_restarted", f"the microcontroller {how}", "warning"))
+        self._link.sign("restarted")
+        self.restarted = self._starting_over = True
+        self._timeline.forget()
+        self.snapping.forget()
+        self.negotiation.begin()
+
+    def _judge(self, now_ns: int) -> None:
+        # A step that comes late also finds an old line, but then the computer was late.
+        late = self.lateness.step_s > 0.0
+        long = now_ns - self._left_ns > BLOCKED_NS
+        self.blocked = self._held_up and (self.blocked or (long and not late))
+        if self.blocked:
+            self._link.sign("blocked")
+        # The link is never up in the update that saw a restart: the arbiter must see it lost first.
+        self._link.judge(now_ns, may_rise=not self._starting_over)
+        check, up = self.negotiation, self._link.state == "up"
+        quiet = not up and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
+        if quiet and (check.state == "plain" or check.checked):
+            check.begin()
+        check.judge(now_ns)
+        if up or self.blocked:
+            self._hearing.forget()
+        elif self._hearing.judge(now_ns):
+            self.events.append(Event(NAMES[self.link], self.words(), "warning"))
+
+    def _reject(self, reason: str, line: bytes = b"", more: int = 1) -> None:
+        """Count lines that were not taken; `line` is the last of them."""
+        self.rejects[reason] += more
+        before, _ = self._rejected.get(reason, (0, b""))
+        self._rejected[reason] = (before + more, line)
+
+    def _announce_rejects(self) -> None:
+        """Add one event per reason. One per line would cost a period for a read full of junk."""
+        for reason, (count, line) in self._rejected.items():
+            text = f"{line[:60]!r}" if line else ""
+            self.events.append(
+                Event("lines_rejected", text, "warning", kind=reason, count=count, news=False)
+            )
+        self._rejected.clear()
+
+    def _bad(self) -> None:
+        """Note a bad line. After several in a row the session asks for the check again."""
+        if self._link.bad() and self.negotiation.checked:
+            self._link.sign("damaged")
+            self.negotiation.begin()
+
+    def _announce(self) -> None:
+        """Add an event for the link and one for the check if they have changed."""
+        link, check = self._link.state, self.negotiation
+        before = self._announced
+        self._announced = (link, check.in_force, bool(check.trouble), self.blocked)
+        if self._announced == before:
+            return
+        if link != before[0] or self.blocked > before[3]:
+            plain = not (self.blocked or link_words.damaged(self._link, check))
+            text = self.lateness.words(link) if plain else self.words()
+            good = link in ("up", "booting") and not self.blocked
+            self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
+        if check.in_force != before[1] and not check.asking:
+            self.events.append(link_words.check_event(check, self._wants_samples))
+        if check.trouble and not before[2]:
+            self.events.append(Event("link_check", MENDS[check.trouble], "error"))
+
+    # lines
+
+    def _read(self, piece: Received) -> list[Feedback]:
+        """Return the good lines of one read, and show each line to the timeline."""
+        lines, timeline, feedback = self._lines.feed(piece.data), self._timeline, []
+        link = self._link
+        if link.state != "up":
+            self._hearing.now.take(piece.data)
+        if lines:
+            timeline.read(piece.at, len(piece.data), len(lines), lines[-1][1])
+        for line, following in lines:
+            got = self._line(line, piece.at, following)
+            if got is None:
+                timeline.spoilt()
+            else:
+                feedback.append(got)
+            if link.state != "up":
+                self._hearing.now.line(line, got is not None)
+        return feedback
+
+    def _line(self, line: bytes, read_at: Instant, following: int) -> Feedback | None:
+        if line.startswith(IDENTITY):
+            self._restart(f"has started: {line.decode('ascii', 'replace')}")
+            return None
+        check = self.negotiation
+        asking = check.asking
+        if check.echoes or (asking and check.echoed(line)):
+            self._reject("echo")
+            self._link.missed()
+            return None
+        reading, asked_ns = None, None
+        try:
+            if check.checked or (asking and b"#" in line):
+                reply = unseal(line)
+                speeds, reading = self.codec.decode(reply.plain), reply.reading
+                asked_ns = check.answered(reply, read_at.mono_ns)
+            else:
+                speeds = self.codec.decode(line)
+                if not asking and self._echo.report(line, speeds):
+                    check.found_echo()
+                    self._link.sign("echo")
+                    self._reject("echo")
+                    return None
+        except FrameError as error:
+            self._reject(error.reason, line)
+            self._bad()
+            return None
+        if asked_ns is None and asking:
+            check.heard_plain()
+            return None
+        return self._good(speeds, reading, read_at, (following, len(line) + 2), asked_ns)
+
+    def _good(
+        self,
+        speeds: WheelSpeeds,
+        reading: Reading | None,
+        read_at: Instant,
+        size: tuple[int, int],
+        asked_ns: int | None,
+    ) -> Feedback:
+        """Return the feedback of a good line; `size` is the bytes behind it, then its own."""
+        self.good_lines += 1
+        self._heard_ns = read_at.mono_ns
+        since_ns = self._link.good(read_at.mono_ns)
+        if since_ns is not None and since_ns >= LONG_GAP_NS:
+            self.restarted = True
+        silent = since_ns is None or since_ns > self.quiet_ns
+        feedback = self._timeline.place(speeds, reading, *size, silent, asked_ns)
+        more = self._timeline.leaps - self.rejects.get("count_leap", 0)
+        if more > 0:
+            self._reject("count_leap", more=more)
+        if self._timeline.restarted:
+            self._restart("has started again: its clock went back")
+        return self.snapping.look(feedback)

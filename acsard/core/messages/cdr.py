@@ -1,0 +1,290 @@
+"""Encodes msgspec structs as CDR, the encoding of ROS 2, and decodes them.
+
+The codec is derived from the struct type and knows nothing about robots. It writes plain CDR
+(XCDR1), little endian, behind the 4-byte encapsulation header; alignment counts from the byte after
+the header. It reads both byte orders. Each struct type (`cdr_types.py`) is compiled once, and
+neighbouring numbers are packed in one call, so a message costs a few calls and not one per field.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from functools import cache, lru_cache
+from operator import attrgetter
+from typing import Any, Generic, TypeVar, cast
+
+from msgspec import inspect
+
+from acsard.core.messages.cdr_types import (
+    SIZES,
+    Build,
+    builder,
+    leaves,
+    limit,
+    number_code,
+    plain,
+    struct_info,
+)
+from acsard.core.values import AcsardError
+
+T = TypeVar("T")
+
+HEADER = b"\x00\x01\x00\x00"
+"""Encapsulation header of plain CDR, little endian."""
+
+_ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
+
+
+class CdrError(AcsardError):
+    """Bytes that are not a valid message of the expected type."""
+
+
+class Cdr(Generic[T]):
+    """Codec of one struct type. Raises `TypeError` for a type that CDR cannot represent."""
+
+    def __init__(self, cls: type[T]) -> None:
+        # A cache key must be hashable, and mypy does not know that of a type variable.
+        of_type: Any = cls
+        self._parts, self._build = _compiled(of_type)
+
+    def encode(self, message: T) -> bytes:
+        """Encode the message with its header, little endian, without trailing padding."""
+        out = bytearray(HEADER)
+        for part in self._parts:
+            part.write(out, message)
+        if not self._parts:
+            # In CDR a struct without fields takes one byte.
+            out.append(0)
+        return bytes(out)
+
+    def decode(self, payload: bytes) -> T:
+        """Decode a message.
+
+        Raises `CdrError`, and no other exception, if the payload is not valid. Bytes after the
+        message are ignored as padding.
+        """
+        order = _ORDERS.get(payload[:2])
+        if order is None or len(payload) < 4:
+            raise CdrError(f"needs the header of plain CDR, has {payload[:4].hex(' ')}")
+        source = _Source(payload, order)
+        found: list[object] = []
+        for part in self._parts:
+            part.read(source, found)
+        return cast(T, self._build(iter(found)))
+
+
+class _Source:
+    """Reader of a payload.
+
+    It aligns from the end of the header and never reads beyond the payload.
+    """
+
+    def __init__(self, data: bytes, order: str) -> None:
+        self.data, self.order = data, order
+        self.at = len(HEADER)
+
+    def take(self, codes: str) -> tuple[Any, ...]:
+        raw = codes.replace("?", "B")
+        values = self._unpack(_layout(self.order, raw, (self.at - len(HEADER)) & 7))
+        return tuple(map(_whole, codes, values)) if "?" in codes else values
+
+    def take_many(self, code: str, count: int) -> list[Any]:
+        self.at += -(self.at - len(HEADER)) % SIZES[code]
+        # Do not cache this layout: a stranger may send sequences of every length.
+        values = self._unpack(struct.Struct(f"{self.order}{count}{code.replace('?', 'B')}"))
+        return [_whole(code, value) for value in values] if code == "?" else list(values)
+
+    def _unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        start, self.at = self.at, self.at + layout.size
+        if self.at > len(self.data):
+            raise CdrError(f"ends after {len(self.data)} bytes, in the middle of a field")
+        return layout.unpack_from(self.data, start)
+
+    def count(self, least: int) -> int:
+        """Read the length of a sequence whose items take at least `least` bytes each."""
+        (count,) = self.take("I")
+        if count * least > len(self.data) - self.at:
+            raise CdrError(f"a length of {count} in {len(self.data)} bytes")
+        return int(count)
+
+    def text(self) -> str:
+        count = self.count(1)
+        raw = self.data[self.at : self.at + count]
+        self.at += count
+        # Some writers encode an empty string without any byte, not even the final zero.
+        if raw[-1:] not in (b"\0", b""):
+            raise CdrError("a string without its end")
+        try:
+            return raw[:-1].decode()
+        except UnicodeDecodeError as error:
+            raise CdrError(f"a string that is not UTF-8: {error.reason}") from None
+
+
+def _whole(code: str, value: Any) -> Any:
+    if code == "?" and value > 1:
+        raise CdrError(f"a boolean of {value}")
+    return bool(value) if code == "?" else value
+
+
+@cache
+def _layout(order: str, codes: str, start: int) -> struct.Struct:
+    """Return the layout of numbers that begin at `start` (mod 8), each aligned to its size."""
+    text, at = order, start
+    for code in codes:
+        pad = -at % SIZES[code]
+        text += f"{pad}x{code}"
+        at += pad + SIZES[code]
+    return struct.Struct(text)
+
+
+def _packs(codes: str) -> tuple[Callable[..., bytes], ...]:
+    """Return the function that packs these numbers, for each start from 0 to 7 (mod 8)."""
+    return tuple(_layout("<", codes, start).pack for start in range(8))
+
+
+_put_count = _packs("I")
+
+
+@lru_cache(256)
+def _text_bytes(text: str) -> bytes:
+    """Encode a string with its length.
+
+    Results are cached, because a robot repeats the same few strings.
+    """
+    raw = text.encode() + b"\0"
+    return struct.pack("<I", len(raw)) + raw
+
+
+def _put_text(out: bytearray, text: str) -> None:
+    out += bytes(-len(out) & 3)
+    out += _text_bytes(text)
+
+
+Get = Callable[[Any], Any]
+
+
+class _Numbers:
+    """Neighbouring numbers of a message, which may belong to different nested structs."""
+
+    def __init__(self, run: list[tuple[str, inspect.Type]]) -> None:
+        self._codes = "".join(number_code(kind) for _, kind in run)
+        self._packs = _packs(self._codes)
+        bounds = [(index, limit(kind)) for index, (_, kind) in enumerate(run)]
+        self._limits = [(index, *bound) for index, bound in bounds if bound is not None]
+        get = attrgetter(*[path for path, _ in run])
+        self._get: Get = get if len(run) > 1 else lambda message: (get(message),)
+
+    def write(self, out: bytearray, message: object) -> None:
+        out += self._packs[(len(out) - len(HEADER)) & 7](*self._get(message))
+
+    def read(self, source: _Source, found: list[object]) -> None:
+        values = source.take(self._codes)
+        for index, low, high in self._limits:
+            if not low <= values[index] <= high:
+                raise CdrError(f"{values[index]} where {low:g} to {high:g} may be")
+        found += values
+
+
+class _Text:
+    """A string of a message."""
+
+    def __init__(self, get: Get) -> None:
+        self._get = get
+
+    def write(self, out: bytearray, message: object) -> None:
+        _put_text(out, self._get(message))
+
+    def read(self, source: _Source, found: list[object]) -> None:
+        found.append(source.text())
+
+
+class _List:
+    """Items of one type: a sequence of at most `most` items, or an array of exactly `most`."""
+
+    def __init__(self, get: Get, kind: inspect.Type, most: int | None, fixed: bool) -> None:
+        self._get, self._most = get, most
+        self._fixed = most if fixed else None
+        self._code = number_code(kind)
+        self._array = self._code * (self._fixed or 0)
+        self._packs = _packs(self._array) if self._array else None
+        self._text = isinstance(plain(kind), inspect.StrType)
+        self._parts: tuple[_Part, ...] = ()
+        item = plain(kind)
+        if isinstance(item, inspect.StructType):
+            self._parts, self._build = _compiled(item.cls)
+        elif not (self._code or self._text):
+            raise TypeError(f"CDR has no sequence of {kind}")
+
+    def write(self, out: bytearray, message: object) -> None:
+        items = self._get(message)
+        start = (len(out) - len(HEADER)) & 7
+        if self._fixed is None:
+            out += _put_count[start](len(items))
+        elif len(items) != self._fixed:
+            raise ValueError(f"{len(items)} items in an array of {self._fixed}")
+        if self._packs is not None:
+            out += self._packs[start](*items)
+            return
+        if self._code:
+            # An empty sequence has no padding after its length.
+            if items:
+                out += bytes(-(len(out) - len(HEADER)) % SIZES[self._code])
+                out += struct.pack(f"<{len(items)}{self._code}", *items)
+            return
+        for item in items:
+            if self._text:
+                _put_text(out, item)
+            for part in self._parts:
+                part.write(out, item)
+
+    def read(self, source: _Source, found: list[object]) -> None:
+        least = SIZES[self._code] if self._code else 1
+        count = source.count(least) if self._fixed is None else self._fixed
+        if self._most is not None and count > self._most:
+            raise CdrError(f"{count} items where {self._most} may be")
+        if self._array:
+            found.append(list(source.take(self._array)))
+        elif self._code:
+            found.append(source.take_many(self._code, count) if count else [])
+        elif self._text:
+            found.append([source.text() for _ in range(count)])
+        else:
+            found.append([self._item(source) for _ in range(count)])
+
+    def _item(self, source: _Source) -> object:
+        inner: list[object] = []
+        for part in self._parts:
+            part.read(source, inner)
+        return self._build(iter(inner))
+
+
+_Part = _Numbers | _Text | _List
+
+
+@cache
+def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
+    """Return the parts of a struct type in order, and the function that builds an instance."""
+    info = struct_info(cls)
+    parts: list[_Part] = []
+    run: list[tuple[str, inspect.Type]] = []
+
+    def end_run() -> None:
+        if run:
+            parts.append(_Numbers(run))
+            run.clear()
+
+    for path, kind in leaves(info):
+        if number_code(kind):
+            run.append((path, kind))
+            continue
+        end_run()
+        match plain(kind):
+            case inspect.StrType():
+                parts.append(_Text(attrgetter(path)))
+            case inspect.ListType(item_type=item, min_length=least, max_length=most):
+                parts.append(_List(attrgetter(path), item, most, fixed=most == least))
+            case _:
+                raise TypeError(f"CDR cannot tell {cls.__name__}.{path}")
+    end_run()
+    return tuple(parts), builder(info)

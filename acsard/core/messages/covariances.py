@@ -1,0 +1,65 @@
+"""Converts planar covariances to the 6x6 matrices of ROS messages.
+
+A matrix is row major with the axes x, y, z, roll, pitch, yaw. Wheels cannot measure z, roll and
+pitch, so these axes get the configured variances, clamped to a range that RViz can draw and a
+filter can invert. With `odometry.covariance = "constant"` both matrices are the configured
+diagonals.
+"""
+
+from __future__ import annotations
+
+from acsard.core.config.settings import Diagonal, OdometryConfig
+from acsard.core.values import PoseCovariance, TwistVariances
+
+SMALLEST, LARGEST = 1e-6, 1e6
+"""Smallest and largest variance of an axis that is not measured."""
+
+UNKNOWN = [LARGEST if cell % 7 == 0 else 0.0 for cell in range(36)]
+"""Covariance of a twist that is not measured at all."""
+
+
+class Covariances:
+    """Builder of the covariance matrices of nav_msgs/Odometry."""
+
+    def __init__(self, odometry: OdometryConfig) -> None:
+        self._constant = odometry.covariance == "constant"
+        self._pose = odometry.pose_covariance_diagonal
+        self._twist = odometry.twist_covariance_diagonal
+        self._unmeasured = _bounded(self._pose)
+        self._unmeasured_rates = _bounded(self._twist)
+
+    def of_pose(self, p: PoseCovariance) -> list[float]:
+        """Return the covariance of the pose in the odom frame.
+
+        The rotations are about the axes of odom, through the robot's position.
+        """
+        if self._constant:
+            return _diagonal(*self._pose)
+        z, roll, pitch = self._unmeasured
+        # fmt: off
+        return [
+            p.xx,    p.xy,   0.0,  0.0,  0.0,   p.xyaw,
+            p.xy,    p.yy,   0.0,  0.0,  0.0,   p.yyaw,
+            0.0,     0.0,    z,    0.0,  0.0,   0.0,
+            0.0,     0.0,    0.0,  roll, 0.0,   0.0,
+            0.0,     0.0,    0.0,  0.0,  pitch, 0.0,
+            p.xyaw,  p.yyaw, 0.0,  0.0,  0.0,   p.yawyaw,
+        ]
+        # fmt: on
+
+    def of_twist(self, v: TwistVariances) -> list[float]:
+        """Return the covariance of the twist in the base frame."""
+        if self._constant:
+            return _diagonal(*self._twist)
+        return _diagonal(v.linear, v.lateral, *self._unmeasured_rates, v.angular)
+
+
+def _bounded(diagonal: Diagonal) -> tuple[float, float, float]:
+    z, roll, pitch = (min(max(v, SMALLEST), LARGEST) for v in diagonal[2:5])
+    return z, roll, pitch
+
+
+def _diagonal(*variances: float) -> list[float]:
+    cells = [0.0] * 36
+    cells[::7] = variances
+    return cells

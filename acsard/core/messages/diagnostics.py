@@ -1,0 +1,194 @@
+"""Converts `Outputs` and `Snapshot` to the rows of `diagnostics`, as rqt_robot_monitor shows them.
+
+A row is in every message of a run or in none. The monitor keeps a row that it has once received,
+and shows it as stale when it stays away. Level OK means that the robot needs no attention. WARN
+means that a person should know about it. ERROR means that it keeps the robot from driving.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from msgspec import Struct
+
+from acsard.core.config.settings import Config
+from acsard.core.config.wire_time import wire_use
+from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
+from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.learned_track import tracks
+from acsard.core.motion.words import waiting
+from acsard.core.values import (
+    WHEELS,
+    GyroStatus,
+    Measured,
+    Outputs,
+    Recording,
+    RoutersStatus,
+    Snapshot,
+    WheelsStatus,
+)
+
+OK, WARN, ERROR = 0, 1, 2
+
+OF_MODE = {"stopped": WARN, "fault": ERROR}
+"""Levels of the modes that wait until a person clears a latch."""
+
+REFUSED_S = 2.0
+"""Time for which a refusal is shown, s: two messages at the default rate."""
+
+MISSED_SHARE = 0.01
+"""Share of the last minute's periods above which missed periods are a warning."""
+
+NO_ROUTER, NOT_YET = "a peer, no router", "not connected yet"
+
+
+class Row(Struct, frozen=True):
+    """A diagnostic status, before the robot's name is added."""
+
+    name: str
+    level: int
+    message: str
+    values: dict[str, str]
+
+
+def diagnostics(
+    config: Config, outputs: Outputs, snapshot: Snapshot, certificate: tuple[int, str]
+) -> DiagnosticArray:
+    """Return all rows.
+
+    `certificate` is the level of the certificate's expiry and its description, which is empty
+    without a certificate.
+    """
+    mode = {"mode": outputs.mode, "source": outputs.source}
+    rows = [
+        Row("mode", OF_MODE.get(outputs.mode, OK), outputs.reason, mode),
+        _serial_link(config, outputs, snapshot),
+        _control_loop(snapshot),
+        _commands(outputs, snapshot),
+        _wheels(snapshot.doubt, snapshot.counters),
+        *_gyro(config, snapshot.gyro),
+        *_routers(config.bus.connect, snapshot.routers),
+        *_recording(snapshot.recording),
+        *_latch_file(snapshot.latch_file),
+        *([Row("certificate", *certificate, {})] if certificate[1] else []),
+    ]
+    return DiagnosticArray(
+        Header(Time.from_ns(outputs.now.wall_ns)),
+        [
+            DiagnosticStatus(
+                row.level,
+                f"acsard: {row.name}",
+                row.message,
+                config.robot.id,
+                [KeyValue(key, value) for key, value in row.values.items()],
+            )
+            for row in rows
+        ],
+    )
+
+
+def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
+    mcu = config.mcu
+    use = wire_use(config.rate_hz, mcu.baud_rate, mcu.line_bytes)
+    named = zip(WHEELS, snapshot.encoders, strict=False)
+    values = {"port": mcu.port, "wire_use": f"{use:.2f}", "check": snapshot.check}
+    if snapshot.feedback_age_s is not None:
+        values["feedback_age_s"] = f"{snapshot.feedback_age_s:.2f}"
+    values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
+    level, message = OK if outputs.link == "up" else ERROR, outputs.link
+    if mcu.simulated:
+        level, message = max(level, WARN), f"{message}: the simulator, no wheel turns"
+    return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))
+
+
+def _control_loop(snapshot: Snapshot) -> Row:
+    figures, missed = snapshot.figures, snapshot.missed_last_minute
+    kept = figures.get("period_lateness", Measured()).last_minute.count
+    values = {
+        f"{name}{when}_{share}_us": f"{getattr(spread, share):.0f}"
+        for name, one in figures.items()
+        for when, spread in (("", one.since_start), ("_minute", one.last_minute))
+        for share in ("p50", "p99", "max")
+    }
+    return Row(
+        "control loop",
+        WARN if missed > MISSED_SHARE * (kept + missed) else OK,
+        f"{missed} of {kept + missed} periods missed in the last minute",
+        values | _counted(snapshot.counters, "missed") | _counted(snapshot.counters, "bus"),
+    )
+
+
+def _commands(outputs: Outputs, snapshot: Snapshot) -> Row:
+    values = {s.name: waiting(s.waits_for) or "driving" for s in snapshot.sources}
+    values |= _counted(snapshot.counters, "command")
+    message = f"commanded by {outputs.source}" if outputs.source else "waiting for a command"
+    age_s = snapshot.refused_age_s
+    refused = age_s is not None and age_s < REFUSED_S
+    if refused:
+        message = f"{message}; refused: {snapshot.refused}"
+    return Row("commands", WARN if refused else OK, message, values)
+
+
+def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
+    """Return the row about the agreement of the front and rear wheels."""
+    left, right = doubt.differ
+    values = {
+        "left_out": ", ".join(doubt.left_out),
+        "slipping": ", ".join(doubt.slipping),
+        "front_more_left": f"{left:.3f}",
+        "front_more_right": f"{right:.3f}",
+    }
+    level, message = WARN if doubt.text else OK, doubt.text or "front and rear agree"
+    return Row("wheels", level, message, values | _counted(counters, "wheels"))
+
+
+def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:
+    """Return the row of the gyro, or nothing if no gyro is configured."""
+    if gyro.does == "off":
+        return []
+    values, track = {"delay_s": f"{gyro.delay:.3f}"}, ""
+    if gyro.bias is not None:
+        values["bias_rad_s"] = f"{gyro.bias:.5f}"
+    if gyro.track is not None:
+        configured = config.drive.wheel_separation_multiplier
+        learned = configured * gyro.track
+        values["wheel_separation_multiplier"] = f"{configured:.3f}"
+        values["learned_multiplier"] = f"{learned:.3f}"
+        values["learned_multiplier_std"] = f"{learned * gyro.track_deviation:.3f}"
+        values["multiplier_in_use"] = f"{learned if gyro.track_use == 'used' else configured:.3f}"
+        track = f"; effective track: {tracks(gyro, configured)}"
+    level = OK if gyro.does in ("used", "waiting for rest") else WARN
+    return [Row("gyro", level, WORDS[gyro.does] + track, values)]
+
+
+def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
+    """Return the row of the endpoints in `bus.connect`, or nothing if it names none."""
+    missing, peers = routers.missing, routers.peers
+    values = dict.fromkeys(endpoints, NOT_YET) | dict.fromkeys(routers.connected, "connected")
+    values |= dict.fromkeys(missing, "not connected") | dict.fromkeys(peers, NO_ROUTER)
+    words = f"not connected to {', '.join(missing)}" if missing else "connected"
+    if NOT_YET in values.values():
+        words = NOT_YET
+    if peers:
+        words += f"; {', '.join(peers)} is no router: who connects here sees this robot only"
+    return [Row("router", WARN if missing or peers else OK, words, values)] if values else []
+
+
+def _recording(recording: Recording) -> list[Row]:
+    """Return the row of the recorder, or nothing if recording is switched off."""
+    if not recording.where:
+        return []
+    missing = {"steps_missing": str(recording.missing)}
+    level, message = WARN if recording.trouble else OK, recording.trouble or "on"
+    return [Row("recording", level, message, missing)]
+
+
+def _latch_file(trouble: str | None) -> list[Row]:
+    """Return the row of the latch file, or nothing if latches are not stored."""
+    if trouble is None:
+        return []
+    return [Row("latch file", WARN if trouble else OK, trouble or "written", {})]
+
+
+def _counted(counters: dict[str, int], kind: str) -> dict[str, str]:
+    return {name: str(count) for name, count in counters.items() if name.startswith(kind)}

@@ -1,0 +1,124 @@
+"""The encodings msgpack, JSON and CDR, and the detection of an incoming payload's encoding.
+
+A Zenoh Encoding that names one of them decides. Otherwise the first bytes decide: `{` (after white
+space) is JSON, a msgpack map header is msgpack, and `00 00` or `00 01` is CDR. Decoding raises
+`DecodeError` and no other exception.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Generic, Literal, TypeVar
+
+import msgspec
+
+from acsard.core.messages.cdr import Cdr, CdrError
+from acsard.core.values import AcsardError
+
+Format = Literal["msgpack", "json", "cdr"]
+FORMATS: tuple[Format, ...] = ("msgpack", "json", "cdr")
+
+T = TypeVar("T")
+
+_MIME: dict[Format, str] = {
+    "msgpack": "application/msgpack",
+    "json": "application/json",
+    "cdr": "application/cdr",
+}
+_pack = msgspec.msgpack.Encoder()
+_text = msgspec.json.Encoder()
+
+
+class DecodeError(AcsardError):
+    """A payload that cannot be used; `reason` is the counter's name."""
+
+    def __init__(self, reason: str, text: str) -> None:
+        super().__init__(text)
+        self.reason = reason
+
+
+_AT_BYTE = re.compile(r"JSON is malformed: (.*) \(byte (\d+)\)")
+
+
+def encoding_name(form: Format, type_name: str = "") -> str:
+    """Return the Zenoh Encoding of a payload that the daemon publishes."""
+    return f"{_MIME[form]};acsard.{type_name}.v1" if type_name else _MIME[form]
+
+
+def encode(message: object, form: Format) -> bytes:
+    """Encode the message; raise `DecodeError` for CDR of a type that CDR cannot represent."""
+    if form == "cdr":
+        return _codec(type(message)).encode(message)
+    return _pack.encode(message) if form == "msgpack" else _text.encode(message)
+
+
+def _codec(cls: type[T]) -> Cdr[T]:
+    try:
+        return Cdr(cls)
+    except TypeError:
+        raise DecodeError(
+            "unknown_format", f"{cls.__name__} is no ROS message and has no CDR form: use JSON"
+        ) from None
+
+
+def detect(encoding: str, payload: bytes) -> Format:
+    """Return the encoding of the payload; raise `DecodeError` if it is unknown."""
+    mime = encoding.partition(";")[0]
+    for form in FORMATS:
+        if mime == _MIME[form]:
+            return form
+    if mime == "text/json":
+        return "json"
+    first = payload.lstrip(b" \t\r\n")[:1]
+    if first == b"{":
+        return "json"
+    if first and (0x80 <= first[0] <= 0x8F or first[0] in (0xDE, 0xDF)):
+        return "msgpack"
+    if payload[:2] in (b"\x00\x00", b"\x00\x01"):
+        return "cdr"
+    raise DecodeError(
+        "unknown_encoding",
+        f"neither a JSON object, a msgpack map nor CDR: {payload[:16]!r}",
+    )
+
+
+class Decoder(Generic[T]):
+    """Decoder of payloads of one type in any of the encodings."""
+
+    def __init__(self, cls: type[T]) -> None:
+        self._cls = cls
+        self._pack = msgspec.msgpack.Decoder(cls)
+        self._text = msgspec.json.Decoder(cls)
+
+    def decode(self, encoding: str, payload: bytes) -> T:
+        """Decode a message; raise `DecodeError` if the payload is not a valid one."""
+        form = detect(encoding, payload)
+        if form == "cdr":
+            return decode_cdr(self._cls, payload)
+        try:
+            return self._pack.decode(payload) if form == "msgpack" else self._text.decode(payload)
+        except msgspec.ValidationError as error:
+            raise DecodeError("wrong_shape", str(error)) from None
+        except (msgspec.MsgspecError, ValueError, OverflowError, RecursionError) as error:
+            words = _where(str(error), payload) if form == "json" else str(error)
+            raise DecodeError("malformed", words) from None
+
+
+def _where(words: str, payload: bytes) -> str:
+    """Replace the byte offset in msgspec's JSON error by the line and the column."""
+    match = _AT_BYTE.fullmatch(words)
+    if match is None:
+        return words
+    before, what = payload[: int(match[2])], match[1]
+    if payload[len(before) :].lower().startswith((b"nan", b"inf")):
+        what, before = "JSON has no NaN and no infinity", before.removesuffix(b"-")
+    line = before.rpartition(b"\n")[2].decode(errors="replace")
+    return f"line {before.count(10) + 1}, column {len(line) + 1}: {what}"
+
+
+def decode_cdr(cls: type[T], payload: bytes) -> T:
+    """Decode a CDR payload; raise `DecodeError` if it is not valid."""
+    try:
+        return _codec(cls).decode(payload)
+    except CdrError as error:
+        raise DecodeError("malformed", str(error)) from None

@@ -1,0 +1,78 @@
+"""The JSON Schemas of published types, received types and `Config`, for `schema/<Type>`.
+
+A published message has all its fields, and later versions may add more: all fields are required and
+others are allowed. A received message may omit fields with a default, and unknown fields are
+refused. A type that is used in both directions has two schemas: its name for publishing, and the
+name with `In` appended for receiving.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from acsard.core.config.settings import Config
+from acsard.core.messages.schema import (
+    MESSAGES,
+    DoorState,
+    Imu,
+    JointState,
+    Release,
+    SetPose,
+    Settings,
+    Twist,
+    TwistStamped,
+)
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+ONLY_IN = (Twist, SetPose, Release, Settings, DoorState)
+BOTH_WAYS = (TwistStamped, JointState, Imu)
+
+ENOUGH: dict[type, list[str]] = {
+    TwistStamped: ["twist"],
+    JointState: ["name", "velocity"],
+    Imu: ["angular_velocity"],
+}
+"""Required fields of a received type, if they are not exactly the fields without a default."""
+
+Schema = dict[str, Any]
+
+
+def going_out(cls: type, name: str) -> Schema:
+    """Return the schema of a type as the daemon writes it."""
+    schema = _described(cls, name)
+    for part in (schema, *schema["$defs"].values()):
+        if "properties" in part:
+            part.pop("additionalProperties", None)
+            part["required"] = list(part["properties"])
+            for field in part["properties"].values():
+                field.pop("default", None)
+    return schema
+
+
+def coming_in(cls: type, name: str) -> Schema:
+    """Return the schema of a type as the daemon accepts it."""
+    schema = _described(cls, name)
+    return schema | {"required": ENOUGH[cls]} if cls in ENOUGH else schema
+
+
+def _described(cls: type, name: str) -> Schema:
+    # A pattern is an ECMAScript expression, which has no \Z; its $ matches only at the end.
+    text = msgspec.json.encode(msgspec.json.schema(cls)).replace(rb'\\Z"', b'$"')
+    whole: Schema = msgspec.json.decode(text)
+    parts, own = whole["$defs"], whole["$ref"].rpartition("/")[2]
+    top: Schema = parts.pop(own) | {"title": name}
+    return {"$schema": DIALECT, "$id": f"urn:acsard:{name}.v1"} | top | {"$defs": parts}
+
+
+SCHEMAS: dict[str, Schema] = {
+    **{
+        name: (coming_in if cls in ONLY_IN else going_out)(cls, name)
+        for name, cls in MESSAGES.items()
+    },
+    **{f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In") for cls in BOTH_WAYS},
+    "Config": going_out(Config, "Config"),
+}
+"""Every schema by its name, as in the key `schema/<Type>`."""

@@ -1,0 +1,286 @@
+"""Converts `Outputs` to messages: those that are due, and the present value of any published key.
+
+Only messages with a subscriber are built. All messages of one feedback line carry its stamp.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator
+
+from msgspec.structs import asdict
+
+from acsard.core.config.settings import Config
+from acsard.core.messages.covariances import UNKNOWN, Covariances
+from acsard.core.messages.diagnostics import diagnostics
+from acsard.core.messages.expiry import expiry
+from acsard.core.messages.happened import Happened
+from acsard.core.messages.schema import (
+    DiagnosticArray,
+    Figure,
+    Header,
+    JointState,
+    Message,
+    Odometry,
+    Pose,
+    PoseWithCovariance,
+    Quaternion,
+    RobotState,
+    SourceState,
+    Spread,
+    TFMessage,
+    Time,
+    Transform,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+    TwistWithCovariance,
+    Vector3,
+)
+from acsard.core.motion.learned_track import tracks
+from acsard.core.motion.words import waiting
+from acsard.core.values import (
+    NS_PER_S,
+    REST,
+    Estimate,
+    Instant,
+    Outputs,
+    Snapshot,
+)
+from acsard.core.values import Spread as Measurements
+from acsard.core.values import Twist as BodyTwist
+
+Look = Callable[[], Snapshot]
+
+
+class _Rate:
+    """Rate limit of one topic; 0 Hz means no limit."""
+
+    def __init__(self, hz: float) -> None:
+        self._period_ns = int(NS_PER_S / hz) if hz else 0
+        self._next_ns = -2 * self._period_ns
+
+    def due(self, now_ns: int, at_once: bool = False) -> bool:
+        # Allow a twentieth of the period as grace. Otherwise a step that is a microsecond early
+        # would wait for the next period.
+        if not at_once and now_ns < self._next_ns - self._period_ns // 20:
+            return False
+        behind = at_once or now_ns - self._next_ns > self._period_ns
+        self._next_ns = (now_ns if behind else self._next_ns) + self._period_ns
+        return True
+
+
+class Report:
+    """Builder of messages.
+
+    It remembers only the last outputs, the last estimate and the last events.
+    """
+
+    def __init__(
+        self, config: Config, start: Instant, certificate_ends_ns: int | None = None
+    ) -> None:
+        self.certificate_ends_ns = certificate_ends_ns
+        """Wall-clock time at which the certificate ends, ns. The TLS gateway reports it if the
+        daemon may not read the certificate.
+        """
+        self._names = list(config.joints.as_tuple())
+        self._start = start
+        self._estimate: Estimate | None = None
+        self._outputs: Outputs | None = None
+        self._happened = Happened()
+        self.use(config)
+
+    def use(self, config: Config) -> None:
+        """Use this configuration from now on."""
+        self._config = config
+        self._rates = {key: _Rate(hz) for key, hz in asdict(config.rates).items()}
+        self._covariances = Covariances(config.odometry)
+
+    def due(
+        self, outputs: Outputs, wanted: Collection[str], look: Look
+    ) -> Iterator[tuple[str, Message]]:
+        """Yield the (key, message) pairs to publish after this step, for the keys in `wanted`.
+
+        They come one by one, feedback first, because a `state` takes as long to build as ten
+        others.
+        """
+        self._outputs = outputs
+        if outputs.events:
+            self._happened.add(outputs.events, outputs.now)
+        if outputs.estimates:
+            self._estimate = outputs.estimates[-1]
+        if not wanted:
+            return iter(())
+        if not outputs.estimates and not (
+            outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted
+        ):
+            # Most steps end here when no client follows the robot closely.
+            return iter(())
+        return self._due(outputs, wanted, look)
+
+    def _due(
+        self, outputs: Outputs, wanted: Collection[str], look: Look
+    ) -> Iterator[tuple[str, Message]]:
+        for estimate in outputs.estimates:
+            if ("odom" in wanted or "tf" in wanted) and self._rates["odom"].due(
+                estimate.at.mono_ns
+            ):
+                if "odom" in wanted:
+                    yield "odom", self._odom(estimate)
+                if "tf" in wanted and self._config.odometry.publish_tf:
+                    yield "tf", self._tf(estimate)
+            if "wheel_states" in wanted and self._rates["wheel_states"].due(estimate.at.mono_ns):
+                yield "wheel_states", self._wheel_states(estimate)
+        now_ns = outputs.now.mono_ns
+        if outputs.due and "cmd_vel_out" in wanted and self._rates["cmd_vel_out"].due(now_ns):
+            yield "cmd_vel_out", self._cmd_vel_out(outputs)
+        if outputs.events and "events" in wanted and (told := self._happened.told()):
+            yield "events", told
+        for key, build in (("state", self._state), ("diagnostics", self._diagnostics)):
+            if key in wanted and self._rates[key].due(now_ns, outputs.status_changed):
+                yield key, build(outputs, look())
+
+    def current(self, key: str, look: Look) -> Message | None:
+        """Return the present value of a published key, or None if it has no value yet."""
+        estimate, outputs = self._estimate, self._outputs
+        match key:
+            case "tf_static":
+                return self.tf_static()
+            case "odom":
+                return self._odom(estimate, look().measured is not None) if estimate else None
+            case "tf":
+                return self._tf(estimate) if estimate and self._config.odometry.publish_tf else None
+            case "wheel_states":
+                return self._wheel_states(estimate, look().speeds is not None) if estimate else None
+            case "cmd_vel_out":
+                return self._cmd_vel_out(outputs) if outputs else None
+            case "state":
+                return self._state(outputs, look()) if outputs else None
+            case "diagnostics":
+                return self._diagnostics(outputs, look()) if outputs else None
+            case "events":
+                return self._happened.told()
+            case _:
+                return None
+
+    def tf_static(self) -> TFMessage:
+        """Return all static transforms in one message, without those that are switched off."""
+        base = Header(Time.from_ns(self._start.wall_ns), self._config.odometry.base_frame)
+        lidar, footprint = self._config.lidar, self._config.footprint
+        transforms = []
+        if lidar.publish_tf:
+            place = Vector3(lidar.lidar_x_offset, lidar.lidar_y_offset, lidar.lidar_z_offset)
+            turn = from_rpy(lidar.lidar_roll, lidar.lidar_pitch, lidar.lidar_yaw)
+            transforms.append(TransformStamped(base, lidar.lidar_frame, Transform(place, turn)))
+        if footprint.publish_tf:
+            place = Vector3(z=footprint.footprint_z_offset)
+            transforms.append(
+                TransformStamped(base, footprint.footprint_frame, Transform(place, Quaternion()))
+            )
+        return TFMessage(transforms)
+
+    def _odom(self, estimate: Estimate, live: bool = True) -> Odometry:
+        """Build the message with the stamp of its sample.
+
+        If the feedback is not `live`, the twist is zero with the covariance of an unmeasured one.
+        """
+        frames, pose = self._config.odometry, estimate.pose
+        of_pose = self._covariances.of_pose(estimate.covariance)
+        of_twist = self._covariances.of_twist(estimate.twist_variances) if live else UNKNOWN
+        return Odometry(
+            Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame),
+            frames.base_frame,
+            PoseWithCovariance(Pose(Vector3(pose.x, pose.y), from_yaw(pose.yaw)), of_pose),
+            TwistWithCovariance(_twist(estimate.twist if live else REST), of_twist),
+        )
+
+    def _tf(self, estimate: Estimate) -> TFMessage:
+        frames, pose = self._config.odometry, estimate.pose
+        header = Header(Time.from_ns(estimate.at.wall_ns), frames.odom_frame)
+        where = Transform(Vector3(pose.x, pose.y), from_yaw(pose.yaw))
+        return TFMessage([TransformStamped(header, frames.base_frame, where)])
+
+    def _wheel_states(self, estimate: Estimate, live: bool = True) -> JointState:
+        return JointState(
+            header=Header(Time.from_ns(estimate.at.wall_ns)),
+            name=self._names,
+            position=list(estimate.positions),
+            velocity=list(estimate.speeds.as_tuple()) if live else [],
+        )
+
+    def _cmd_vel_out(self, outputs: Outputs) -> TwistStamped:
+        header = Header(Time.from_ns(outputs.now.wall_ns), self._config.odometry.base_frame)
+        return TwistStamped(header, _twist(outputs.applied))
+
+    def _state(self, outputs: Outputs, snapshot: Snapshot) -> RobotState:
+        return RobotState(
+            stamp=Time.from_ns(outputs.now.wall_ns),
+            mode=outputs.mode,
+            reason=outputs.reason,
+            x=snapshot.pose.x,
+            y=snapshot.pose.y,
+            yaw=snapshot.pose.yaw,
+            linear=snapshot.measured.linear if snapshot.measured else None,
+            angular=snapshot.measured.angular if snapshot.measured else None,
+            wheels=list(snapshot.speeds.as_tuple()) if snapshot.speeds else [],
+            link=outputs.link,
+            source=outputs.source,
+            sources=[
+                SourceState(s.name, s.priority, s.age_s, waiting(s.waits_for))
+                for s in snapshot.sources
+            ],
+            refused=snapshot.refused,
+            certificate=self._certificate(outputs.now)[1],
+            counters=snapshot.counters,
+            figures={
+                name: Figure(_spread(one.since_start), _spread(one.last_minute))
+                for name, one in snapshot.figures.items()
+            },
+            gyro=snapshot.gyro.does,
+            track=tracks(snapshot.gyro, self._config.drive.wheel_separation_multiplier),
+            encoders=list(snapshot.encoders),
+            doubt=snapshot.doubt.text,
+            sender=snapshot.sender,
+            recording=snapshot.recording.trouble,
+            latch=0 if outputs.latches.in_force is None else outputs.latches.in_force.number,
+            latch_file=snapshot.latch_file or "",
+            feedback_age=snapshot.feedback_age_s,
+        )
+
+    def _certificate(self, now: Instant) -> tuple[int, str]:
+        """Return the level (0 ok, 1 warning, 2 error) and the words about the certificate.
+
+        The words are empty without TLS.
+        """
+        if not self._config.bus.tls:
+            return 0, ""
+        return expiry(self.certificate_ends_ns, now.wall_ns)
+
+    def _diagnostics(self, outputs: Outputs, snapshot: Snapshot) -> DiagnosticArray:
+        return diagnostics(self._config, outputs, snapshot, self._certificate(outputs.now))
+
+
+def _spread(spread: Measurements) -> Spread:
+    return Spread(spread.count, spread.p50, spread.p99, spread.max)
+
+
+def _twist(twist: BodyTwist) -> Twist:
+    return Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+
+
+def from_yaw(yaw: float) -> Quaternion:
+    """Return the rotation by `yaw` rad about z."""
+    return Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+
+
+def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Return the rotation by roll, pitch and yaw about the fixed axes x, y, z (REP-103), rad."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return Quaternion(
+        x=sr * cp * cy - cr * sp * sy,
+        y=cr * sp * cy + sr * cp * sy,
+        z=cr * cp * sy - sr * sp * cy,
+        w=cr * cp * cy + sr * sp * sy,
+    )

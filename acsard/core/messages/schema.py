@@ -1,0 +1,438 @@
+"""The message structs, shaped and named like their ROS 2 counterparts, with the unit of each field.
+
+One schema serves several encodings: a field means the same in msgpack, JSON and CDR. Structs refuse
+unknown fields, so a misspelt axis in a command is an error and not a robot that stands still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, get_args
+
+from msgspec import Meta, Struct
+
+from acsard.core.link.link_state import State
+from acsard.core.messages.topics import Direction
+from acsard.core.motion.modes import Mode
+from acsard.core.values import NS_PER_S, ROLES, EventName, GyroDoes, Level, Plain
+
+# Annotations for `cdr.py`: the width of an int, and the fixed length of an array.
+Seconds = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1, extra={"cdr": "i"})]
+Nanoseconds = Annotated[int, Meta(ge=0, lt=NS_PER_S, extra={"cdr": "I"})]
+Byte = Annotated[int, Meta(ge=0, le=255, extra={"cdr": "B"})]
+Covariance = Annotated[list[float], Meta(min_length=36, max_length=36)]
+
+Covariance3 = Annotated[list[float], Meta(min_length=9, max_length=9)]
+
+LatchNumber = Annotated[int, Meta(ge=0, lt=1 << 53)]
+"""Number of a latch, exact as a JavaScript number."""
+
+FEW = Meta(max_length=64)
+"""Bound of a list: more joints than any robot of ours has, so that a stranger's long list is
+refused quickly.
+"""
+
+
+def one_of(values: Iterable[object]) -> Meta:
+    """List the possible values in the JSON Schema.
+
+    Decoding accepts other values of a later version.
+    """
+    return Meta(extra_json_schema={"enum": list(values)})
+
+
+class Message(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of every struct on the bus."""
+
+
+class Time(Message, frozen=True):
+    """Wall-clock time since 1970-01-01 UTC; `sec` is an int32 as in ROS."""
+
+    sec: Seconds = 0
+    nanosec: Nanoseconds = 0
+
+    @classmethod
+    def from_ns(cls, wall_ns: int) -> Time:
+        """Convert ns since 1970 to a `Time`, clamped to int32 seconds (1901 to 2038)."""
+        sec, nanosec = divmod(wall_ns, NS_PER_S)
+        return cls(max(-(2**31), min(2**31 - 1, sec)), nanosec)
+
+    def to_ns(self) -> int:
+        """Return the time in ns since 1970."""
+        return self.sec * NS_PER_S + self.nanosec
+
+
+class Header(Message, frozen=True):
+    """Time at which the data was sampled, and the frame in which it is expressed."""
+
+    stamp: Time = Time()
+    frame_id: str = ""
+
+
+class Vector3(Message, frozen=True):
+    """Three components in the unit of the field that holds them."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+class Quaternion(Message, frozen=True):
+    """A rotation as a unit quaternion."""
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    w: float = 1.0
+
+
+class Twist(Message, frozen=True):
+    """Velocity: `linear` m/s, `angular` rad/s. A planar base uses only linear.x and angular.z."""
+
+    linear: Vector3
+    angular: Vector3
+
+
+class TwistStamped(Message, frozen=True):
+    """A twist with the time for which it was meant."""
+
+    header: Header
+    twist: Twist
+
+
+class Pose(Message, frozen=True):
+    """Pose: `position` in m, and `orientation`."""
+
+    position: Vector3
+    orientation: Quaternion
+
+
+class PoseStamped(Message, frozen=True):
+    """A pose in `header.frame_id` at the time `header.stamp`."""
+
+    header: Header
+    pose: Pose
+
+
+class PoseWithCovariance(Message, frozen=True):
+    """A pose with its 6x6 covariance, row major, (x, y, z, roll, pitch, yaw), m and rad."""
+
+    pose: Pose
+    covariance: Covariance
+
+
+class TwistWithCovariance(Message, frozen=True):
+    """A twist with its 6x6 covariance, row major, m/s and rad/s."""
+
+    twist: Twist
+    covariance: Covariance
+
+
+class Odometry(Message, frozen=True):
+    """Pose of `child_frame_id` in `header.frame_id`, with the twist in `child_frame_id`."""
+
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance
+
+
+class Transform(Message, frozen=True):
+    """A transform: `translation` in m, and `rotation`."""
+
+    translation: Vector3
+    rotation: Quaternion
+
+
+class TransformStamped(Message, frozen=True):
+    """Pose of `child_frame_id` in `header.frame_id`."""
+
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+class TFMessage(Message, frozen=True):
+    """A list of transforms."""
+
+    transforms: list[TransformStamped]
+
+
+class JointState(Message, frozen=True):
+    """Per joint `name`: `position` rad (continuous), `velocity` rad/s, `effort` N m (unused)."""
+
+    header: Header = Header()
+    name: Annotated[list[str], FEW] = []
+    position: Annotated[list[float], FEW] = []
+    velocity: Annotated[list[float], FEW] = []
+    effort: Annotated[list[float], FEW] = []
+
+
+class Imu(Message, frozen=True):
+    """An inertial measurement in `header.frame_id`: rad/s and m/s2, each with its 3x3 covariance.
+
+    A covariance whose first element is -1 marks a quantity that is not measured.
+    """
+
+    header: Header
+    orientation: Quaternion
+    orientation_covariance: Covariance3
+    angular_velocity: Vector3
+    angular_velocity_covariance: Covariance3
+    linear_acceleration: Vector3
+    linear_acceleration_covariance: Covariance3
+
+
+class SourceState(Message, frozen=True):
+    """A source of commands: `age` in s since its last accepted command (null: none yet), and the
+    condition that it waits for, in words.
+    """
+
+    name: str
+    priority: int
+    age: float | None
+    waits_for: str
+
+
+class Spread(Message, frozen=True):
+    """Median, 99th percentile and maximum of `count` measurements, us."""
+
+    count: int
+    p50: float
+    p99: float
+    max: float
+
+
+class Figure(Message, frozen=True):
+    """A duration that the daemon measures of itself."""
+
+    since_start: Spread
+    last_minute: Spread
+
+
+class RobotState(Message, frozen=True):
+    """Summary of the robot: mode and reason, pose (m, rad), twist (m/s, rad/s), wheels (rad/s).
+
+    Without feedback the speeds are unknown: `linear` and `angular` are null, `wheels` is empty.
+    """
+
+    stamp: Time
+    mode: Annotated[str, one_of(mode.value for mode in Mode)]
+    reason: str
+    x: float
+    y: float
+    yaw: float
+    linear: float | None
+    angular: float | None
+    wheels: list[float]
+    """Measured speeds in the order front right, front left, rear left, rear right."""
+    link: Annotated[str, one_of(get_args(State))]
+    source: str
+    sources: list[SourceState]
+    refused: str
+    """The last refused command and the reason; empty if no command was refused."""
+    counters: dict[str, int]
+    certificate: str = ""
+    """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
+    figures: dict[str, Figure] = {}
+    """Durations of the control loop by the names in `daemon/latencies.py`, up to a second old."""
+    gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
+    """Use of the gyro in odometry, a value of `values.GyroDoes`."""
+    encoders: list[int] = []
+    """Counts per wheel turn, inferred from the speeds, in the order of `wheels`; 0 if unknown."""
+    doubt: str = ""
+    """The wheel that is left out of the pose, or the side that slips, in words; else empty."""
+    sender: str = ""
+    """Public name of the followed sender of `source`."""
+    track: str = ""
+    """Effective track divided by the wheel separation, as learned from the gyro and as
+    configured, and which of them is in use, in words; empty until one is learned.
+    """
+    recording: str = ""
+    """Why nothing is recorded at present although recording is on, in words; else empty."""
+    latch: LatchNumber = 0
+    """Number of the fault, else of the stop, else of "inactive"; 0 while none is latched."""
+    latch_file: str = ""
+    """Why a stop would not survive a restart, in words; empty if it would, and in the simulator."""
+    feedback_age: float | None = None
+    """Seconds since the last good line of the microcontroller; null before the first one."""
+
+
+class DoorState(Message, frozen=True):
+    """Status that the TLS gateway (the process `door`) reports to the daemon."""
+
+    opened: Annotated[int, Meta(ge=0, lt=1 << 62)]
+    """Start time of the gateway in ns of the machine's monotonic clock. Another value means that
+    the gateway has restarted.
+    """
+    connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
+    """Number of connections from the network at present."""
+    crowded: Annotated[int, Meta(ge=0, lt=1 << 31)]
+    """Number of checks, four a second, at which all connections were in use."""
+    certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
+    """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
+
+
+class KeyValue(Message, frozen=True):
+    """A diagnostic value as text."""
+
+    key: str
+    value: str
+
+
+class DiagnosticStatus(Message, frozen=True):
+    """A diagnostic status; `level` is 0 ok, 1 warning, 2 error, 3 stale."""
+
+    level: Annotated[Byte, one_of(range(4))]
+    name: str
+    message: str
+    hardware_id: str
+    values: list[KeyValue]
+
+
+class DiagnosticArray(Message, frozen=True):
+    """The state of every part of the robot at one time."""
+
+    header: Header
+    status: list[DiagnosticStatus]
+
+
+class Happening(Message, frozen=True):
+    """An event as in the log."""
+
+    stamp: Time
+    name: Annotated[str, one_of(get_args(EventName))]
+    level: Annotated[str, one_of(get_args(Level))]
+    text: str
+    by: str
+    """Client that asked, sent or commands; empty if no client did."""
+    count: int
+    """Number of occurrences since the previous event of this name. For an event that goes on
+    without a pause of a minute, it is the number since the event began.
+    """
+
+
+class Events(Message, frozen=True):
+    """The last events, oldest first.
+
+    An event that goes on is one row, with the time of its last repetition.
+    """
+
+    stamp: Time
+    """Time of the last event."""
+    total: int
+    """Number of events since the start, with each repetition counted. A repeated event moves to
+    the end. Of the last N rows, where N is the growth of `total`, those that a reader does not
+    have yet are new.
+    """
+    events: list[Happening]
+
+
+class ServiceReply(Message, frozen=True):
+    """Result of a service call, with a message about the outcome or the remedy."""
+
+    success: bool
+    message: str
+
+
+class SetPose(Message, frozen=True):
+    """Pose that base_link gets in odom: `x` and `y` in m, `yaw` in rad."""
+
+    x: float
+    y: float
+    yaw: float
+
+
+class Release(Message, frozen=True):
+    """The latch that `clear` or `activate` releases, by `RobotState.latch`; null names none."""
+
+    latch: LatchNumber | None = None
+
+
+class Settings(Message, frozen=True):
+    """New values of settings, by their dotted keys in `acsard.toml`."""
+
+    settings: Annotated[dict[str, Plain], FEW]
+
+
+class Info(Message, frozen=True):
+    """Identity of the daemon."""
+
+    id: str
+    version: str
+    pid: int
+    port: str
+    simulated: bool
+    rate: float
+    """Control rate, Hz."""
+    listen: list[str]
+    connect: list[str]
+
+
+class HardwareInterface(Message, frozen=True):
+    """One line of `ros2 control list_hardware_interfaces`."""
+
+    name: str
+    kind: Annotated[str, one_of(("command", "state"))]
+    unit: Annotated[str, one_of(("rad", "rad/s"))]
+    available: bool
+    claimed: bool
+    """True for a command interface while a source drives."""
+
+
+class Interfaces(Message, frozen=True):
+    """The command and state interfaces of the base."""
+
+    interfaces: list[HardwareInterface]
+
+
+class TopicInfo(Message, frozen=True):
+    """One row of the topic table."""
+
+    key: str
+    direction: Annotated[str, one_of(get_args(Direction))]
+    type: str
+    rate: str
+    note: str
+
+
+class Topics(Message, frozen=True):
+    """The topic table of this daemon, with full keys."""
+
+    topics: list[TopicInfo]
+
+
+class WhoAmI(Message, frozen=True):
+    """The caller of the query as the daemon sees it."""
+
+    role: Annotated[str, one_of(ROLES)]
+    """A role that the caller has at least, by the access rules."""
+    sender: str
+    """The caller's public name and its transport, as in the log."""
+
+
+MESSAGES: dict[str, type[Message]] = {
+    cls.__name__: cls
+    for cls in (
+        Odometry,
+        TFMessage,
+        JointState,
+        PoseStamped,
+        Imu,
+        Twist,
+        TwistStamped,
+        RobotState,
+        DoorState,
+        DiagnosticArray,
+        Events,
+        ServiceReply,
+        SetPose,
+        Release,
+        Settings,
+        Info,
+        Interfaces,
+        Topics,
+        WhoAmI,
+    )
+}
+"""Every type that is a message of its own, by name. The key `schema/<Type>` answers for these."""

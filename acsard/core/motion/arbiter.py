@@ -1,0 +1,256 @@
+"""Chooses one command among many commanders: first the source, then the sender of that source.
+
+- The robot follows the live source of the highest priority. Among sources of equal priority the
+  first one keeps the robot until it falls silent. The same holds for the senders of one source.
+- A source that is not armed yet (`neutral.py`) holds its place with zero, so that no source of a
+  lower priority drives past it.
+- A source that sends zeros holds the robot still for any length of time, because an operator who
+  wants that and a controller that has failed look the same. `state` and the log report it.
+
+Each refusal has a name under which it is counted, and `words.py` has the sentences for people.
+`values.Command` explains source, sender and clock.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.motion.freshness import LONGEST_PROOF_NS, Freshness
+from acsard.core.motion.neutral import Sender
+from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wait
+
+MAX_SENDERS = 16
+"""Senders remembered per source. A sender that is live and armed is never replaced."""
+
+Objection = Literal["", "unknown_source", "not_finite", "crowded", "unproven", "stale"]
+"""The reason to refuse a command, or "" if the command counts."""
+
+LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
+"""Durations, s, after which `state` reports that a sender still sends zeros or still waits."""
+
+NOTHING, COMMAND = Wait("nothing"), Wait("command")
+
+
+class Choice(Struct, frozen=True):
+    """The twist to follow, or None if no sender may drive; `wait` then has the reason."""
+
+    source: str = ""
+    twist: Twist | None = None
+    wait: Wait = COMMAND
+    arrived_ns: int | None = None
+    sender: str = ""
+
+
+IDLE = Choice()
+"""The choice while no source sends and none is doubted."""
+
+
+class _Source:
+    """One configured source and its senders."""
+
+    def __init__(self, settings: Source, neutral_first: bool, pause: float) -> None:
+        self.name, self.priority = settings.name, settings.priority
+        self.neutral_first = neutral_first
+        self.senders: dict[str, Sender] = {}
+        self.use(settings, pause)
+
+    def use(self, settings: Source, pause: float) -> None:
+        """Apply this timeout and this pause from now on, also to the senders."""
+        self.pause_ns = int(pause * NS_PER_S)
+        self.timeout_ns = int(settings.timeout * NS_PER_S)
+        self.proof = Wait("proof", settings.name, min(self.timeout_ns, LONGEST_PROOF_NS) / NS_PER_S)
+        self.late = Wait("late", settings.name, settings.timeout)
+        for sender in self.senders.values():
+            sender.use(self.timeout_ns, self.pause_ns)
+
+    def add(self, name: str, now_ns: int) -> Sender | None:
+        """Return a new sender of this name, or None if the table is full of senders that drive.
+
+        The new sender replaces the one of the lowest account if the table is full.
+        """
+        if len(self.senders) >= MAX_SENDERS:
+            least = min(self.senders, key=lambda other: self._account(other, now_ns))
+            if self._account(least, now_ns)[0]:
+                return None
+            del self.senders[least]
+        added = self.senders[name] = Sender(self.timeout_ns, self.pause_ns, self.neutral_first)
+        return added
+
+    def _account(self, name: str, now_ns: int) -> tuple[bool, bool, int]:
+        """Rank a sender: armed and live before armed, and then by its last message."""
+        sender = self.senders[name]
+        armed = sender.armed(now_ns)
+        return armed and sender.live(now_ns), armed, sender.noticed_ns
+
+    def doubt(self, name: str, was_set: bool) -> None:
+        """Forget the unproven zeros of a sender, or ask for a new one if its clock was set."""
+        sender = self.senders.get(name)
+        if sender is None:
+            return
+        if was_set:
+            sender.require_neutral()
+        else:
+            sender.unlearn()
+
+    def live(self, now_ns: int) -> list[Sender]:
+        """Return the live senders: the armed ones first, each group in the order of arrival."""
+        live = [sender for sender in self.senders.values() if sender.live(now_ns)]
+        if len(live) < 2:
+            return live
+        return sorted(live, key=lambda sender: (not sender.armed(now_ns), sender.came_ns))
+
+    def latest_ns(self) -> int | None:
+        """Return when a command of any sender last counted, None if none ever did."""
+        times = [s.arrived_ns for s in self.senders.values() if s.arrived_ns is not None]
+        return max(times, default=None)
+
+    def require_neutral(self) -> None:
+        """Ask every sender for a zero before it drives again."""
+        for sender in self.senders.values():
+            sender.require_neutral()
+
+    def neutral(self, sender: Sender, lasts: float = 0.0) -> Wait:
+        """Return the wait of a sender that is not armed."""
+        pause = self.pause_ns / NS_PER_S
+        return Wait("neutral", self.name, pause, lasts=lasts, ros=sender.ros, shared=sender.shared)
+
+    def doubted(self, now_ns: int) -> Wait | None:
+        """Return the wait of a source whose stamps are refused, None if they are not."""
+        doubtful = [sender for sender in self.senders.values() if sender.doubtful(now_ns)]
+        if not doubtful:
+            return None
+        latest = max(doubtful, key=lambda sender: sender.noticed_ns)
+        if latest.doubt == "stale":
+            return self.late
+        return self.proof if latest.armed(now_ns) else self.neutral(latest)
+
+
+class Arbiter:
+    """Holds the latest command of each sender and chooses the one that the robot follows."""
+
+    def __init__(self, commands: CommandsConfig) -> None:
+        self._sources = {
+            s.name: _Source(s, commands.neutral_first, commands.pause) for s in commands.sources
+        }
+        self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
+        self._holder: _Source | None = None
+        self._since_ns = 0
+        self._freshness = Freshness()
+
+    def use(self, commands: CommandsConfig) -> None:
+        """Apply these timeouts and this pause from now on.
+
+        The last commands, the arming and the clocks of all senders stay as they are. The names and
+        priorities of the sources must be those that the arbiter was constructed with.
+        """
+        for settings in commands.sources:
+            self._sources[settings.name].use(settings, commands.pause)
+
+    def require_neutral(self, since_ns: int = 0) -> None:
+        """Forget all commands and ask each sender for a zero before it drives again.
+
+        Only a zero that arrives at `since_ns` or later counts. A zero that was sent before the stop
+        was cleared does not say that its sender stands still now.
+        """
+        self._since_ns = since_ns
+        for source in self._ranking:
+            source.require_neutral()
+        self._holder = None
+
+    def accept(self, command: Command) -> Objection:
+        """Take a command and return "", or return the reason to refuse it."""
+        source = self._sources.get(command.source)
+        if source is None:
+            return "unknown_source"
+        twist, known = command.twist, source.senders.get(command.sender)
+        if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
+            self.notice(command.source, command.sender, command.arrived_ns)
+            return "not_finite"
+        verdict = self._freshness.judge(command, source.timeout_ns)
+        if verdict == "stale":
+            if known is not None:
+                known.refuse(command, verdict)
+            return "stale"
+        sender = known or source.add(command.sender, command.arrived_ns)
+        if sender is None:
+            return "crowded"
+        if verdict in ("set", "first"):
+            # A sender has one clock on all its sources, so the doubt concerns all its zeros.
+            for other in self._ranking:
+                other.doubt(command.sender, verdict == "set")
+        sender.take(command, self._since_ns, verdict)
+        return "" if verdict in ("fresh", "set") else "unproven"
+
+    def notice(self, source: str, sender: str, arrived_ns: int) -> None:
+        """Note a message that could not be decoded: its sender is not silent."""
+        known = self._sources.get(source)
+        if known is not None and sender in known.senders:
+            known.senders[sender].notice(arrived_ns)
+
+    def choose(self, now_ns: int) -> Choice:
+        """Return the command that the robot follows now."""
+        live = [
+            (source, found[0])
+            for source in self._ranking
+            if source.senders and (found := source.live(now_ns))
+        ]
+        if not live:
+            self._holder = None
+            for source in self._ranking:
+                if source.senders and (wait := source.doubted(now_ns)) is not None:
+                    return Choice(wait=wait)
+            return IDLE
+        source, sender = live[0]
+        if len(live) > 1:
+            source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
+        self._holder = source
+        if not sender.armed(now_ns):
+            wait = source.neutral(sender, _lasts(now_ns - sender.came_ns))
+            return Choice(source.name, None, wait, sender=sender.name)
+        wait = NOTHING
+        if sender.zeros_ns is not None and (lasts := _lasts(now_ns - sender.zeros_ns)):
+            wait = Wait("zeros", source.name, lasts=lasts, kept=self._kept(source, now_ns))
+        return Choice(source.name, sender.twist, wait, sender.arrived_ns, sender.name)
+
+    def _kept(self, holder: _Source, now_ns: int) -> str:
+        """Return the name of a sender of speeds that the holder's zeros keep waiting, or ""."""
+        for source in self._ranking:
+            senders = source.live(now_ns)[source is holder :]
+            if any(sender.twist != REST for sender in senders):
+                return f"another sender of {source.name}" if source is holder else source.name
+        return ""
+
+    @property
+    def forgiven_ns(self) -> int:
+        """Sum of the delays, ns, that `Freshness` has forgiven foreign clocks."""
+        return self._freshness.forgiven_ns
+
+    def sources(self, now_ns: int) -> tuple[SourceStatus, ...]:
+        """Return the status of each source, the highest priority first."""
+        return tuple(self._status(source, now_ns) for source in self._ranking)
+
+    def _status(self, source: _Source, now_ns: int) -> SourceStatus:
+        latest = source.latest_ns()
+        age_s = None if latest is None else max(0, now_ns - latest) / NS_PER_S
+        return SourceStatus(source.name, source.priority, age_s, self._waits_for(source, now_ns))
+
+    def _waits_for(self, source: _Source, now_ns: int) -> Wait:
+        holder, live = self._holder, source.live(now_ns)
+        if not live:
+            return source.doubted(now_ns) or COMMAND
+        if not live[0].armed(now_ns):
+            return source.neutral(live[0])
+        if holder is None or source is holder:
+            return Wait("senders", senders=len(live) - 1) if len(live) > 1 else NOTHING
+        return Wait("equal" if holder.priority == source.priority else "higher", holder.name)
+
+
+def _lasts(ns: int) -> float:
+    """Return the largest of `LASTING_S` that this duration has reached, 0.0 if none."""
+    if ns < LASTING_S[0] * NS_PER_S:
+        return 0.0  # as in nearly every step
+    return max(seconds for seconds in LASTING_S if ns >= seconds * NS_PER_S)

@@ -1,0 +1,310 @@
+"""Takes the heading from a gyro, if there is one. The distance remains that of the wheels.
+
+The method is gyrodometry (Borenstein & Feng, Gyrodometry: a new method for combining data from
+gyros and odometry in mobile robots, 1996): skidding wheels do not affect a gyro, and a gyro's bias
+does not affect the wheels. The gyro's reading at rest is its bias (`gyro_bias.py`). A comparison
+with the wheels gives its delay and the effective track (`gyro_match.py`).
+
+Until both have agreed in a turn, the heading is that of the wheels, and it is corrected afterwards.
+A gyro that reads the opposite, degrees or nothing is reported and not used (`gyro_trial.py`). If a
+gyro is silent or out of all proportion to the wheels, the heading is that of the wheels.
+
+The module remembers the angle that it has returned, not the time. A sample that comes late, or is
+held back for a moment, is part of the next line's turn, so such errors do not add up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Protocol
+
+from msgspec import Struct
+
+from acsard.core.link.promptest import Promptest
+from acsard.core.motion.gyro_bias import KNOWN_S, Bias
+from acsard.core.motion.gyro_match import WINDOW_S, Match
+from acsard.core.motion.gyro_trial import PROPORTIONS, Trial
+from acsard.core.motion.learned_track import LEAST, Track
+from acsard.core.values import NS_PER_S, Event, GyroDoes, GyroSample, GyroStatus, Level
+
+REST_S = 0.2
+"""Seconds of four zero speeds after which the robot stands."""
+
+SILENT_NS = NS_PER_S // 5
+"""Age of the last sample at which the gyro is silent, ns. Until then its last rate continues."""
+
+LATEST_NS = NS_PER_S // 4
+"""Delay of a stamp above which the sender's clock was set, ns."""
+
+DRIFT = 0.01
+"""Relative drift between the gyro's clock and ours that is allowed."""
+
+DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
+"""Least and greatest delay of the gyro against the wheels, ns."""
+
+LEAST_DELAY_S = 0.002
+"""Smallest correction of the delay that is applied, s."""
+
+SLIP_S = 0.5
+"""Seconds after the last contradiction for which the wheels still count as slipping."""
+
+MOST_SLIP_S = 5.0
+"""Longest slip of the wheels, s. A gyro that contradicts the wheels for longer is stuck, or no
+gyro."""
+
+ENOUGH_BLOCKS = 20.0
+"""Blocks of turning after which the ratio to the wheels is believed."""
+
+WORDS: dict[GyroDoes, str] = {
+    "off": "",
+    "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
+    f"{REST_S + KNOWN_S:.1f} s",
+    "used": "the heading is the gyro's",
+    "silent": "the gyro is silent: the heading is the wheels' alone",
+    "disagrees": "the wheels slip: the gyro says another turn than they do",
+    "reversed": "not used: the gyro turns the other way than the wheels: check its mounting",
+    "in degrees": "not used: the gyro reads 57 times too much: degrees per second, not radians",
+    "dead": "not used: the gyro says no rate while the wheels turn the robot",
+    "not believed": "the gyro turns out of all proportion to the wheels: does its z point up?",
+}
+
+
+class Turn(Struct, frozen=True, gc=False):
+    """The turn of the robot since the line before: rad, and its variance, rad2.
+
+    The variance does not include the error of the gyro's scale, which does not average out
+    (`uncertainty.py`).
+    """
+
+    angle: float
+    variance: float
+    rate: float
+    """The present turn rate by the gyro, rad/s. The angle may include late samples, so it is not dt
+    times this rate."""
+    rate_variance: float
+    wheels: float | None = None
+    """The angle that the wheels would report for this turn, including their skid, rad."""
+    slips: bool = False
+    """Whether the wheels slip: lately they reported another turn than the gyro."""
+
+
+class Heading(Protocol):
+    """A source of the robot's turn besides its wheels: a `Gyro`."""
+
+    owes: bool
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None: ...
+
+    def taken_back(self, turn: float) -> float: ...
+
+
+class Gyro:
+    """One gyro. The caller passes its samples to `hear` and calls `turn` for each line."""
+
+    def __init__(self) -> None:
+        self._rest_s = self._since_rest_s = 0.0
+        self._learned: Track | None = None
+        """The track that the gyro before this one taught."""
+        self.owes = False
+        """Whether the turn of the last line came from the wheels and the gyro corrects it after its
+        trial."""
+        self._does: GyroDoes = "silent"
+        self.events: list[Event] = []
+        """Events of the last `turn`, for the log."""
+        self._begin()
+
+    def _begin(self) -> None:
+        """Start with an unknown gyro, of which neither bias nor delay nor direction is known."""
+        self._bias, self._match, self._trial = Bias(), Match(), Trial()
+        self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
+        """Samples later than the last line."""
+        self._promptest = Promptest(DRIFT)
+        self._last: GyroSample | None = None
+        self._delay_ns = 0
+        self._told_ns: int | None = None
+        """Time of the last sample that was taken."""
+        self._rate = 0.0
+        self._angle = self._given = 0.0
+        """Angle turned by all samples taken, and the part of it that was returned, rad."""
+        self._variance = 0.0
+        """Variance of the angle that was not returned yet, rad2."""
+        self._slip_s = self._slipped_s = 0.0
+        self._noise = 0.0
+        """Variance of the last sample."""
+        self._hole = False
+        """Whether a part of the turn since the last line, or in it, was not received."""
+        self.forgive()
+
+    @property
+    def status(self) -> GyroStatus:
+        """The present state of the gyro."""
+        known, learned = self._bias.value if self._bias.known else None, self.learned
+        track, deviation = (None, 0.0) if learned is None else (learned.share, learned.deviation)
+        return GyroStatus(self._does, known, self._delay_ns / NS_PER_S, track, deviation)
+
+    @property
+    def learned(self) -> Track | None:
+        """The effective track by the gyro, None until the robot has turned for a while."""
+        match = self._match
+        if match.blocks < ENOUGH_BLOCKS or match.ratio <= 0.0:
+            return self._learned
+        return Track(1.0 / match.ratio, max(LEAST, match.spread / match.ratio))
+
+    def hear(self, samples: tuple[GyroSample, ...]) -> None:
+        """Take the samples since the last step, in order."""
+        for sample in samples:
+            if sample.anew:
+                # The track belongs to the wheels and the floor, whichever gyro measured it.
+                self._learned = self.learned
+                self._begin()
+            self._hole |= len(self._heard) == self._heard.maxlen
+            self._heard.append((self._time_of(sample), sample))
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
+        """Return the turn until a line of the time `at_ns`, or None if the wheels must provide it.
+
+        `wheels` is the turn by the wheels in rad over `dt` s. `still` means that all four wheels
+        stood. After a gap `dt` is 0, and the turn is that of the whole gap.
+        """
+        self.events, self.owes = [], False
+        self._rest_s = self._rest_s + dt if still else 0.0
+        resting = self._rest_s > REST_S
+        self._take(at_ns, resting)
+        ahead = SILENT_NS if self._told_ns is None else at_ns - self._told_ns
+        silent = ahead - max(0, self._delay_ns) >= SILENT_NS
+        held = 0.0 if resting or silent else self._rate * max(0, ahead) / NS_PER_S
+        angle, variance = self._angle + held - self._given, self._variance
+        self._given, self._variance = self._angle + held, 0.0
+        # The wheels have provided the turn of a silence, and the samples that end it cover that
+        # turn again. So the turn of the line after a silence comes from the wheels too.
+        lost, self._hole = silent or self._hole, silent
+        self._since_rest_s = 0.0 if resting else self._since_rest_s + dt
+        # The error of the bias does not average out.
+        variance += 2.0 * self._bias.variance * self._since_rest_s * dt
+        tried = False if lost else self._try(wheels, angle, variance, dt, resting)
+        if not lost and self._bias.known and dt > 0.0 and not self._trial.open:
+            self._compare(wheels, angle, dt)
+        if resting:
+            self._shift()
+        self._judge(silent)
+        if lost or tried or self._does not in ("used", "disagrees"):
+            return None
+        rolled = angle / max(PROPORTIONS[0], self._match.ratio)
+        if not self._trial.open:
+            angle, variance = angle + self._owed, variance + self._owed_variance
+            self.forgive()
+        noise = self._noise + self._bias.variance
+        return Turn(angle, variance, self._rate, noise, rolled, self._does == "disagrees")
+
+    def forgive(self) -> None:
+        """Drop the owed correction, because the pose was set."""
+        self._owed = self._owed_variance = 0.0
+        """Excess of the gyro's turn over the wheels' during the trial, rad, owed to the pose if the
+        gyro is proven; and its variance."""
+
+    def taken_back(self, turn: float) -> float:
+        """Note that the wheels' turn of lines that this gyro `owes` has changed by `turn` rad.
+
+        Return the part of this change that the gyro has already corrected.
+        """
+        verdict = self._trial.verdict
+        if verdict == "none yet":
+            self._owed -= turn
+        return turn if verdict == "good" else 0.0
+
+    # Samples.
+
+    def _time_of(self, sample: GyroSample) -> int:
+        """Return when a sample was measured, by our clock and up to a constant.
+
+        Its stamp has no jitter.
+        """
+        last, self._last = self._last, sample
+        if last is None or sample.stamp_ns is None or last.stamp_ns is None:
+            return sample.at_ns
+        late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
+        if late > LATEST_NS:
+            self._promptest = Promptest(DRIFT)
+            return sample.at_ns
+        return sample.at_ns - max(0, int(late))
+
+    def _take(self, until_ns: int, resting: bool) -> None:
+        """Add up the samples until a time. At rest they update the bias instead."""
+        bias, heard = self._bias, self._heard
+        until_ns += self._delay_ns
+        while heard and heard[0][0] <= until_ns:
+            time_ns, sample = heard.popleft()
+            time_ns -= self._delay_ns
+            span_ns = SILENT_NS if self._told_ns is None else time_ns - self._told_ns
+            self._hole |= span_ns >= SILENT_NS
+            self._told_ns = time_ns if self._told_ns is None else max(time_ns, self._told_ns)
+            passed = max(0, span_ns) / NS_PER_S
+            span = passed if span_ns < SILENT_NS else 0.0
+            bias.drift(passed)
+            stands = resting and bias.rest(sample.rate, sample.variance, span)
+            self._rate = 0.0 if stands else sample.rate - bias.value
+            self._noise = max(bias.noise, sample.variance)
+            self._angle += self._rate * span
+            if not stands:
+                self._variance += self._noise * span * span
+
+    # Comparison with the wheels.
+
+    def _try(self, wheels: float, angle: float, variance: float, dt: float, resting: bool) -> bool:
+        """Test a gyro that is not proven yet.
+
+        Return whether this line's turn comes from the wheels.
+
+        It does, except at rest, where the wheels would not notice that a person turns the robot.
+        """
+        trial, known = self._trial, self._bias.known
+        if not trial.open or resting:
+            return False
+        if dt > 0.0:
+            trial.add(wheels, angle, dt, known)
+        if not trial.open:
+            return False
+        if known and trial.verdict == "none yet":
+            self._owed += angle - wheels
+            self._owed_variance += variance
+            self.owes = True
+        else:
+            self.forgive()
+        return True
+
+    def _compare(self, wheels: float, angle: float, dt: float) -> None:
+        self._match.add(wheels, angle, dt, self._slip_s > 0.0)
+        noise = 2.0 * self._bias.variance * WINDOW_S * WINDOW_S + self._bias.noise * WINDOW_S * dt
+        if self._match.contradiction(noise):
+            self._slip_s = SLIP_S
+        else:
+            self._slip_s = max(0.0, self._slip_s - dt)
+        self._slipped_s = self._slipped_s + dt if self._slip_s > 0.0 else 0.0
+
+    def _shift(self) -> None:
+        """Correct the gyro's delay. This happens at rest, where it moves nothing."""
+        delay = self._match.delay()
+        if delay is not None and abs(delay) >= LEAST_DELAY_S:
+            earliest, latest = DELAYS_NS
+            shifted = self._delay_ns + math.floor(delay * NS_PER_S)
+            self._delay_ns = min(max(earliest, shifted), latest)
+
+    def _judge(self, silent: bool) -> None:
+        match, before, verdict = self._match, self._does, self._trial.verdict
+        least, most = PROPORTIONS
+        wrong = match.blocks >= ENOUGH_BLOCKS and not least <= match.ratio <= most
+        if verdict != "none yet" and verdict != "good":
+            self._does = verdict
+        elif silent:
+            self._does = "silent"
+        elif not self._bias.known:
+            self._does = "waiting for rest"
+        elif wrong or self._slipped_s > MOST_SLIP_S:
+            self._does = "not believed"
+        else:
+            self._does = "disagrees" if self._slip_s > 0.0 else "used"
+        if self._does != before:
+            good = self._does in ("used", "waiting for rest")
+            level: Level = "info" if good else "warning"
+            self.events.append(Event("gyro", WORDS[self._does], level, kind=self._does))

@@ -1,0 +1,86 @@
+"""Converts between the body twist and the wheel speeds of a four-wheel differential-drive base.
+
+Let v and w be the linear and angular velocity of base_link, r_l and r_r the wheel radii, and L the
+effective track: the wheel separation times its multiplier, because skidding wheels turn the robot
+as if they stood further apart.
+
+    (1)  left = (front_left + rear_left) / 2      right = (front_right + rear_right) / 2
+    (2)  v = (r_r right + r_l left) / 2
+    (3)  w = (r_r right - r_l left) / L
+
+Solved for the wheels of a base that does both exactly:
+
+    front_left = rear_left = (v - w L / 2) / r_l    front_right = rear_right = (v + w L / 2) / r_r
+"""
+
+from __future__ import annotations
+
+from acsard.core.config.settings import DriveConfig
+from acsard.core.values import Twist, WheelSpeeds
+
+
+class Kinematics:
+    """A converter between twist (m/s, rad/s, in base_link) and wheel speeds (rad/s)."""
+
+    def __init__(self, drive: DriveConfig) -> None:
+        self.multipliers = (
+            drive.left_wheel_radius_multiplier,
+            drive.right_wheel_radius_multiplier,
+            drive.wheel_separation_multiplier,
+        )
+        self._left_radius = drive.wheel_radius * drive.left_wheel_radius_multiplier
+        self._right_radius = drive.wheel_radius * drive.right_wheel_radius_multiplier
+        self.track = drive.wheel_separation * drive.wheel_separation_multiplier
+        """The effective track L, m."""
+
+    @property
+    def radius(self) -> float:
+        """The mean radius of the two sides' wheels, m."""
+        return (self._left_radius + self._right_radius) / 2
+
+    def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
+        """Return the wheel speeds of this twist by equations (1) to (3)."""
+        half = twist.angular * self.track / 2
+        left = (twist.linear - half) / self._left_radius
+        right = (twist.linear + half) / self._right_radius
+        return WheelSpeeds(right, left, left, right)
+
+    def twist(self, speeds: WheelSpeeds) -> Twist:
+        """Return the twist of these wheel speeds by equations (1) to (3)."""
+        linear, angular = self.moved(speeds.as_tuple())
+        return Twist(linear, angular)
+
+    def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
+        """Return the motion of the base, m and rad, for wheel angles in rad and `WHEELS` order.
+
+        With wheel speeds the result is per second. It equals `twist` without the objects, because
+        each line needs it several times.
+        """
+        front_right, front_left, rear_left, rear_right = wheels
+        left = self._left_radius * (front_left + rear_left) / 2
+        right = self._right_radius * (front_right + rear_right) / 2
+        return (right + left) / 2, (right - left) / self.track
+
+    def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
+        """Return the angle of each side's wheels by the other side and the base's `turn`, rad.
+
+        The first result is for the left side, given `right`, and the second for the right side,
+        given `left`. This is equation (3) solved for either side.
+        """
+        across = turn * self.track
+        return (
+            (self._right_radius * right - across) / self._left_radius,
+            (self._left_radius * left + across) / self._right_radius,
+        )
+
+    def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
+        """Return the twist, scaled down until no wheel exceeds `wheel_speed` rad/s.
+
+        Curvature is kept.
+        """
+        speeds = self.wheel_speeds(twist)
+        fastest = max(abs(speeds.front_right), abs(speeds.front_left))
+        if fastest <= wheel_speed:
+            return twist
+        scale = wheel_speed / fastest
+        return Twist(twist.linear * scale, twist.angular * scale)

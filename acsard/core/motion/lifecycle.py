@@ -1,0 +1,259 @@
+"""Holds the latches and the other facts, and derives the mode from both.
+
+A latch is set by a stop, a fault or `deactivate`. Only `clear` releases a stop or a fault, one at a
+time, and only `activate` releases `inactive`. Neither may release a stop or a `deactivate` that its
+sender has not seen, however late the network delivers it:
+
+- A request that names a number releases the latch with exactly this number.
+- A request without a number is refused until `LOOK_FIRST_S` after the last stop or `deactivate`,
+  and after the start. A clear may release a fault that its sender has not seen, because a fault
+  that persists latches again.
+- A request that arrived before the latch was set never releases it.
+
+`modes.py` derives the mode. `core/robot.py` decides how the wheels follow it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec.structs import replace
+
+from acsard.core.motion.dates import utc
+from acsard.core.motion.modes import LEAVING, Mode, RefusedError, mode_of, require_allowed
+from acsard.core.values import NS_PER_S, Instant, Latch, Latches
+
+LOOK_FIRST_S = 2.0
+"""Seconds in which a request must name the latch: a sent packet seldom takes longer."""
+
+LONG_AGO_NS = -(2**62)
+"""Monotonic time before every other one."""
+
+
+class Lifecycle:
+    """Latches and mode of one robot. A request that is not allowed raises `RefusedError`."""
+
+    def __init__(self, active: bool, latches: Latches = Latches()) -> None:  # noqa: B008
+        """Start in the mode of these latches, or switched off if `active` is False."""
+        self.latches = latches
+        self.mode = Mode.WAITING
+        self._leaving = self._linked = self._commanded = False
+        self._dormant = not active
+        """True until the first `activate`, with `control.auto_activate = false`."""
+        found = (latches.stop, latches.fault, latches.inactive)
+        self._number = max([latch.number for latch in found if latch is not None], default=0)
+        self._stopped_ns = self._faulted_ns = LONG_AGO_NS
+        """Monotonic times at which the last stop and the last fault were latched."""
+        self._cleared_ns = LONG_AGO_NS
+        """Monotonic time at which a fault over a stop was last cleared."""
+        self._stop_asked_ns = LONG_AGO_NS
+        """Monotonic time at which the last stop arrived."""
+        self._off_ns = LONG_AGO_NS
+        """Monotonic time at which the robot was last switched off."""
+        self._began_ns: int | None = None
+        """Monotonic time of the first step, None before it."""
+        self._derive()
+
+    # facts
+
+    def begin(self, now: Instant) -> None:
+        """Note that a step begins; only the first one counts."""
+        if self._began_ns is None:
+            self._began_ns = now.mono_ns
+
+    def link(self, up: bool) -> None:
+        """Note whether the link to the board is up."""
+        if up is not self._linked:
+            self._linked = up
+            self._derive()
+
+    def command(self, fresh: bool) -> None:
+        """Note whether there is a command to follow."""
+        if fresh is not self._commanded:
+            self._commanded = fresh
+            self._derive()
+
+    def leave(self) -> None:
+        """Note that the daemon is going down."""
+        self._leaving = True
+        self._derive()
+
+    def fault(self, why: str, now: Instant) -> bool:
+        """Latch a fault; return False and keep the earlier one if a fault is latched already."""
+        if self.latches.fault is not None:
+            return False
+        self._faulted_ns = now.mono_ns
+        self._latch(fault=self._made(now, "", why))
+        return True
+
+    # requests
+
+    def stop(self, by: str, asked_ns: int, now: Instant) -> str:
+        """Latch a stop under a new number, unless a later stop is latched already."""
+        repeated = self.latches.stop is not None and asked_ns <= self._stop_asked_ns
+        if not repeated:
+            self._stopped_ns, self._stop_asked_ns = now.mono_ns, asked_ns
+            self._latch(stop=self._made(now, by, f"stopped by {by or 'request'}"))
+        if self._leaving:
+            return f"stopped and latched; {LEAVING}"
+        if self.latches.fault is not None:
+            return "stopped and latched; srv/clear releases the fault first, then the stop"
+        return "stopped and latched; srv/clear releases it"
+
+    def clear(self, number: int | None, asked_ns: int, now: Instant) -> str:
+        """Release the fault, or else the stop; return the answer, or "" if none was latched.
+
+        Args:
+            number: The latch that the sender has seen, None if the request names none.
+            asked_ns: Monotonic time at which the request arrived.
+            now: Both clocks at this step.
+        """
+        require_allowed(self.mode, "clear")
+        latches, latch = self.latches, self.latches.next
+        if latch is None:
+            return ""
+        if number is None:
+            self._require_seen_stop(asked_ns)
+            set_ns = max(self._stopped_ns, self._faulted_ns)
+        else:
+            if number != latch.number:
+                still = latch.why if latches.fault is None else f"in fault ({latch.why})"
+                raise RefusedError(_not_in_force(number, still, "srv/clear"))
+            set_ns = self._stopped_ns if latches.fault is None else self._faulted_ns
+        if asked_ns <= set_ns or now.mono_ns == set_ns:
+            raise RefusedError("a stop or a fault came at the same time or later: call it again")
+        if latches.fault is None:
+            self._latch(stop=None)
+            return "cleared; each sender must send a zero before it drives"
+        self._cleared_ns = now.mono_ns
+        self._latch(fault=None)
+        if latches.stop is None:
+            return "cleared; each sender must send a zero before it drives"
+        return f"fault cleared; still {latches.stop.why}: call srv/clear again"
+
+    def activate(self, number: int | None, asked_ns: int, now: Instant) -> bool:
+        """Switch the robot on; return True if it was off.
+
+        Args:
+            number: The latch that the sender has seen, 0 if `auto_activate` is False and no client
+                has switched the robot off, None if the request names none.
+            asked_ns: Monotonic time at which the request arrived.
+            now: Both clocks at this step.
+        """
+        require_allowed(self.mode, "activate")
+        if not self._off:
+            return False
+        latch = self.latches.inactive
+        if number is not None and number != (0 if latch is None else latch.number):
+            still = "switched off" if latch is None else latch.why
+            raise RefusedError(_not_in_force(number, still, "srv/activate"))
+        if latch is not None:
+            if number is None:
+                self._require_seen(latch, self._off_ns, asked_ns, "srv/activate")
+            if asked_ns <= self._off_ns or now.mono_ns == self._off_ns:
+                raise RefusedError(f"{latch.why} at the same time or later: call it again")
+        self._dormant = False
+        self._latch(inactive=None)
+        return True
+
+    def deactivate(self, by: str, now: Instant) -> str:
+        """Switch the robot off under a new number, also if it is off already."""
+        require_allowed(self.mode, "deactivate")
+        self._off_ns = now.mono_ns
+        self._latch(inactive=self._made(now, by, f"switched off by {by or 'request'}"))
+        return "inactive: ramping to zero; srv/activate switches it on"
+
+    def lower(self, limits: dict[str, float]) -> None:
+        """Keep these limits, which `set` made lower than in the configuration file."""
+        if limits != self.latches.lowered:
+            self.latches = replace(self.latches, lowered=limits)
+
+    @property
+    def why(self) -> str:
+        """Why the mode is `fault`, `stopped` or `inactive`, with the call that changes it."""
+        latches = self.latches
+        if latches.fault is not None:
+            fault = f"{latches.fault.why}, latched {_when(latches.fault)}"
+            if latches.stop is None:
+                return f"{fault}; call srv/clear"
+            return f"{fault}; also {_said(latches.stop)}; call srv/clear twice"
+        if latches.stop is not None:
+            return f"{_said(latches.stop)}; call srv/clear"
+        if latches.inactive is not None:
+            return f"{_said(latches.inactive)}; call srv/activate"
+        return "switched off; call srv/activate"
+
+    # latches and mode
+
+    @property
+    def _off(self) -> bool:
+        return self._dormant or self.latches.inactive is not None
+
+    def _made(self, now: Instant, by: str, why: str) -> Latch:
+        self._number = max(self._number + 1, now.wall_ns // 1_000_000)
+        return Latch(self._number, now.wall_ns, by, why)
+
+    def _latch(self, **changes: Latch | None) -> None:
+        before = self.latches
+        if any(getattr(before, name) is not latch for name, latch in changes.items()):
+            self.latches = replace(before, **changes)
+        self._derive()
+
+    def _derive(self) -> None:
+        self.mode = mode_of(
+            leaving=self._leaving,
+            fault=self.latches.fault is not None,
+            stopped=self.latches.stop is not None,
+            inactive=self._off,
+            linked=self._linked,
+            commanded=self._commanded,
+        )
+
+    def _require_seen_stop(self, asked_ns: int) -> None:
+        """Raise `RefusedError` if the sender of a clear may not know the stop that is latched."""
+        stop = self.latches.stop
+        if stop is None:
+            return
+        if asked_ns - self._cleared_ns < LOOK_FIRST_S * NS_PER_S:
+            # The network may have delivered one clear twice.
+            raise RefusedError(
+                f"a latch was cleared less than {LOOK_FIRST_S:g} s ago; the robot is still "
+                f"{stop.why}: look at it, then call srv/clear again"
+            )
+        self._require_seen(stop, self._stopped_ns, asked_ns, "srv/clear")
+
+    def _require_seen(self, latch: Latch, set_ns: int, asked_ns: int, call: str) -> None:
+        """Raise `RefusedError` if this latch is so new that the sender may not know it."""
+        began_ns = LONG_AGO_NS if self._began_ns is None else self._began_ns
+        since = asked_ns - max(set_ns, began_ns)
+        if since >= LOOK_FIRST_S * NS_PER_S:
+            return
+        age_s = max(0.1, math.floor(since / NS_PER_S * 10) / 10)
+        came = f"the robot was {latch.why} {age_s:.1f} s ago"
+        if set_ns < began_ns:
+            # The monotonic clock does not reach back before the start, and the wall clock may have
+            # been set since.
+            came = f"the daemon started {age_s:.1f} s ago and the robot is still {latch.why}"
+        raise RefusedError(
+            f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, or "
+            "with the latch of the state that you have looked at"
+        )
+
+
+def _not_in_force(number: int, still: str, call: str) -> str:
+    return (
+        f"latch {number} is not in force; the robot is still {still}: look at it, then call {call} "
+        "again"
+    )
+
+
+def _when(latch: Latch) -> str:
+    return f"at {utc(latch.at_ns)}{', before the restart' if latch.kept else ''}"
+
+
+def _said(latch: Latch) -> str:
+    """Return the words for a stop or for switching off, with the time."""
+    if not latch.why.endswith(f" by {latch.by or 'request'}"):
+        # The daemon itself set it at a start, and its reason is a whole sentence.
+        return f"{latch.why} (latched {_when(latch)})"
+    return f"{'was ' if latch.kept else ''}{latch.why} {_when(latch)}"

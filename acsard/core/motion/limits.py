@@ -1,0 +1,152 @@
+"""Limits a wished twist: speed, wheel saturation, acceleration, deceleration and jerk.
+
+There are two ways to move. `follow` obeys a commander, each axis by its own limits. `coast` goes to
+rest without one, and both axes fall together, so that no wheel's speed ever grows on the way
+(invariant 2). Jerk limits speeding up only, because comfort must not delay braking.
+"""
+
+from __future__ import annotations
+
+import math
+
+from msgspec import Struct
+
+from acsard.core.config.settings import LimitsConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.values import REST, Twist
+
+
+class _Axis(Struct, frozen=True):
+    speed: float
+    acceleration: float
+    deceleration: float
+    stop_deceleration: float
+    jerk: float
+
+
+class _State(Struct, frozen=True):
+    twist: Twist
+    linear_slope: float
+    angular_slope: float
+
+
+class Limiter:
+    """The last allowed twist, moved by the limits."""
+
+    def __init__(self, limits: LimitsConfig, kinematics: Kinematics) -> None:
+        self._kinematics = kinematics
+        self.state = _State(REST, 0.0, 0.0)
+        """The whole memory. Restoring it undoes a step whose line did not leave."""
+        self.use(limits)
+
+    def use(self, limits: LimitsConfig) -> None:
+        """Use these limits from now on. A twist above them falls by the deceleration.
+
+        A lower wheel speed limit holds at once, so it may change only at rest.
+        """
+        self._linear = _Axis(
+            limits.linear_speed,
+            limits.linear_acceleration,
+            limits.linear_deceleration,
+            limits.linear_stop_deceleration,
+            limits.linear_jerk,
+        )
+        self._angular = _Axis(
+            limits.angular_speed,
+            limits.angular_acceleration,
+            limits.angular_deceleration,
+            limits.angular_stop_deceleration,
+            limits.angular_jerk,
+        )
+        self._wheel_speed = limits.wheel_speed
+
+    @property
+    def twist(self) -> Twist:
+        """The twist that was allowed last."""
+        return self.state.twist
+
+    def follow(self, wished: Twist, dt: float) -> Twist:
+        """Move towards the finite twist `wished` for `dt` s; return the twist to apply."""
+        goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
+        now = self.state
+        linear, slope_v = _approach(
+            now.twist.linear, goal.linear, now.linear_slope, dt, self._linear
+        )
+        angular, slope_w = _approach(
+            now.twist.angular, goal.angular, now.angular_slope, dt, self._angular
+        )
+        # Each axis moves at its own pace, so the two together can ask more of a wheel than at
+        # either end.
+        twist = self._kinematics.saturate(Twist(linear, angular), self._wheel_speed)
+        self.state = _State(twist, slope_v, slope_w)
+        return twist
+
+    def coast(self, dt: float, stop: bool = False) -> Twist:
+        """Fall towards rest for `dt` s in a straight line; `stop` brakes by the stop limits.
+
+        A negative `dt` changes nothing, because it must not speed up the robot.
+        """
+        dt, twist = max(0.0, dt), self.twist
+        seconds = max(
+            abs(twist.linear) / _braking(self._linear, stop),
+            abs(twist.angular) / _braking(self._angular, stop),
+        )
+        share = 1.0 - dt / seconds if seconds > dt else 0.0
+        fallen = Twist(twist.linear * share, twist.angular * share) if share else REST
+        self.state = _State(fallen, 0.0, 0.0)
+        return fallen
+
+    def cut(self) -> Twist:
+        """Come to rest at once. Without a link the daemon cannot ramp."""
+        self.state = _State(REST, 0.0, 0.0)
+        return REST
+
+    def _within_speed(self, wished: Twist) -> Twist:
+        """Return the twist with both axes scaled together to their limits, so curvature is kept.
+
+        An axis with the limit 0 is set to zero first and does not slow down the other one.
+        """
+        linear = wished.linear if self._linear.speed else 0.0
+        angular = wished.angular if self._angular.speed else 0.0
+        scale = 1.0
+        if abs(linear) > self._linear.speed:
+            scale = self._linear.speed / abs(linear)
+        if abs(angular) * scale > self._angular.speed:
+            scale = self._angular.speed / abs(angular)
+        return Twist(linear * scale, angular * scale)
+
+
+def _braking(axis: _Axis, stop: bool) -> float:
+    return axis.stop_deceleration if stop else axis.deceleration
+
+
+def _approach(
+    speed: float, goal: float, slope: float, dt: float, axis: _Axis
+) -> tuple[float, float]:
+    """Return `speed` after `dt` s on the way to `goal`, and the slope used, within the limits."""
+    if dt <= 0.0:
+        return speed, slope
+    # Pass zero in two parts: slowing down is deceleration, and speeding up afterwards is not.
+    target = 0.0 if speed * goal < 0 else goal
+    most = axis.acceleration if abs(target) > abs(speed) else axis.deceleration
+    wanted = (target - speed) / dt
+    if axis.jerk and abs(target) > abs(speed):
+        slope = slope if slope * wanted > 0 else 0.0  # left over from braking
+        step = axis.jerk * dt
+        most = min(most, abs(slope) + step, _flattenable(abs(target - speed), step, dt))
+        # The slope may not fall faster than jerk allows unless it would pass the goal. It also
+        # never exceeds the acceleration, which may have been lowered.
+        most = min(axis.acceleration, max(most, abs(slope) - step))
+    used = max(-most, min(most, wanted))
+    # Landing exactly: wanted * dt need not give the difference back in floating point.
+    return (target if used == wanted else speed + used * dt), used
+
+
+def _flattenable(away: float, step: float, dt: float) -> float:
+    """Return the steepest slope from which falling by `step` every `dt` ends within `away`.
+
+    The slopes s, s - step and so on over n more periods add up to dt ((n + 1) s - step n (n + 1) /
+    2).
+    """
+    n = math.floor((math.sqrt(1.0 + 8.0 * away / (step * dt)) - 1.0) / 2.0)
+    return (away / dt + step * n * (n + 1) / 2.0) / (n + 1)

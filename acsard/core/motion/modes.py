@@ -1,0 +1,74 @@
+"""The robot's mode, derived from latches and facts by one ordered list.
+
+    leaving   the daemon is going down
+    fault     a fault is latched until `clear`
+    stopped   a stop is latched until `clear`
+    inactive  the robot is switched off until `activate`
+    waiting   the robot is active, but it has no link to the board
+    driving   the robot follows a fresh command
+    ready     the robot is active and linked, and it follows no command
+
+The first line that holds is the mode. Only a latch that `lifecycle.py` sets or releases, the link
+and the commands change it, so the mode itself needs no memory and no transitions.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from acsard.core.values import AcsardError, Verb
+
+
+class Mode(StrEnum):
+    # Enum's own hash is ten times slower, and every step looks the mode up.
+    __hash__ = str.__hash__
+
+    LEAVING = "leaving"
+    FAULT = "fault"
+    STOPPED = "stopped"
+    INACTIVE = "inactive"
+    WAITING = "waiting"
+    DRIVING = "driving"
+    READY = "ready"
+
+
+class RefusedError(AcsardError):
+    """A request that the robot's mode does not allow; the text is for the person who asked."""
+
+
+def mode_of(
+    *, leaving: bool, fault: bool, stopped: bool, inactive: bool, linked: bool, commanded: bool
+) -> Mode:
+    """Return the first mode of the module's list whose condition holds."""
+    if leaving:
+        return Mode.LEAVING
+    if fault:
+        return Mode.FAULT
+    if stopped:
+        return Mode.STOPPED
+    if inactive:
+        return Mode.INACTIVE
+    if not linked:
+        return Mode.WAITING
+    return Mode.DRIVING if commanded else Mode.READY
+
+
+LEAVING = "the daemon is going down"
+
+REFUSALS: dict[tuple[Mode, Verb], str] = {
+    (Mode.LEAVING, "clear"): LEAVING,
+    (Mode.LEAVING, "activate"): LEAVING,
+    (Mode.LEAVING, "deactivate"): LEAVING,
+    (Mode.FAULT, "activate"): "the robot is in fault: call srv/clear first",
+    (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: call srv/clear first",
+    (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",
+    (Mode.STOPPED, "deactivate"): "the robot is stopped and cannot move: call srv/clear first",
+}
+"""Requests that a mode refuses, and the answer to the person who asked."""
+
+
+def require_allowed(mode: Mode, verb: Verb) -> None:
+    """Raise `RefusedError` if this mode refuses the request."""
+    why = REFUSALS.get((mode, verb))
+    if why is not None:
+        raise RefusedError(why)

@@ -1,0 +1,337 @@
+"""Integrates wheel speeds into pose, twist and covariance of base_link in odom.
+
+One step of dt, with left and right the mean wheel speeds of a side (kinematics, equation 1):
+
+    (4)  d_left = r_l left dt            (5)  d_right = r_r right dt
+    (6)  d = (d_right + d_left) / 2      (7)  dyaw = (d_right - d_left) / L
+    (8)  x += d cos(yaw)                 (9)  y += d sin(yaw)
+    (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
+
+Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. They
+agree as dyaw -> 0. `uncertainty.py` and `twist_uncertainty.py` compute the errors of the pose and
+of the twist.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from itertools import takewhile
+
+from acsard.core.config.settings import FeedbackConfig, OdometryConfig
+from acsard.core.link.codec import Motors
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.bridging import NOWHERE, Rolled, Rolling, Step, count_of, plus
+from acsard.core.motion.gap_variance import Gaps
+from acsard.core.motion.gyro import Heading, Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.learned_track import Track
+from acsard.core.motion.lying_wheels.verdict import Witness
+from acsard.core.motion.noise import columns, in_use
+from acsard.core.motion.path import Path
+from acsard.core.motion.twist_uncertainty import TwistUncertainty
+from acsard.core.motion.uncertainty import COARSE_COUNTS, PoseUncertainty
+from acsard.core.values import (
+    REST,
+    STILL,
+    Estimate,
+    Event,
+    Pose,
+    Twist,
+    TwistVariances,
+    WheelSpeeds,
+    WheelsStatus,
+)
+
+REST_S = 0.2
+"""Seconds with four wheels at 0.00 after which the robot is at rest."""
+
+TAKEN_BACK = 128
+"""Largest number of lines that are recomputed when a wheel proves faulty."""
+
+
+class Odometry:
+    """The odometry: pose, covariance and wheel angles, integrated from feedback."""
+
+    def __init__(
+        self,
+        odometry: OdometryConfig,
+        kinematics: Kinematics,
+        encoder_counts: int = 0,
+        response_time: float = FeedbackConfig().response_time,
+        quiet: float = math.inf,
+    ) -> None:
+        """Start at the origin.
+
+        Args:
+            odometry: The table `[odometry]`.
+            kinematics: The kinematics of the base.
+            encoder_counts: Counts per wheel turn, 0 if unknown.
+            response_time: Response time of a slow wheel, s.
+            quiet: Duration of silence after which the daemon commands rest, s.
+        """
+        self._kinematics, self._declared = kinematics, odometry
+        self._track, self._share = in_use(odometry), 1.0
+        """The track in use, None if none is learned; and its share of the configured one."""
+        self._positions = NOWHERE
+        self._rolling = Rolling(quiet)
+        self._held = NOWHERE
+        """Counts at rest whose direction is not clear yet, rad."""
+        self._steps_seen = NOWHERE
+        """Quantization steps, rad/s, whose count the pose's covariance finally uses."""
+        self._steps_of, self._coarsest = NOWHERE, 0.0
+        """Quantization steps of the last line, and the largest known one of them, rad/s."""
+        self._path = Path()
+        self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
+        self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
+        self._gaps = Gaps()
+        self._witness = Witness(kinematics, encoder_counts, response_time)
+        self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
+        """The last lines, for recomputation."""
+        self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
+        """Angle that no wheel turns between the edges of one count, rad."""
+        self._still = 0.0
+        """Seconds without any wheel speed."""
+        self.twist = REST
+        """Twist of the last feedback."""
+        self.speeds = STILL
+        """Wheel speeds of the last feedback."""
+        self.gaps, self.unseen, self.bridged = 0, 0.0, 0.0
+        """Number of gaps in which the robot moved and the pose stood still, their duration in s,
+        and the time that gap filling covered in s."""
+        self.travelled = 0.0
+        """Distance since the start, forwards and backwards, m."""
+
+    def use(self, odometry: OdometryConfig) -> None:
+        """Use these variances from now on."""
+        self._uncertainty.use(odometry)
+        self._twist_uncertainty.use(odometry)
+
+    def turn_by(self, track: Track) -> None:
+        """Use this effective track from now on for the turns that the wheels provide."""
+        if track != self._track:
+            self._track, self._share = track, track.share
+            parameters = columns(self._declared, self._kinematics, track)
+            apart = self._kinematics.track * track.share
+            self._uncertainty.bent_by(parameters, apart)
+            self._twist_uncertainty.bent_by(parameters, apart)
+
+    def set_pose(self, pose: Pose) -> None:
+        """Set the pose of base_link in odom, as certain as at the start.
+
+        The wheel angles continue.
+        """
+        self._path.set(pose)
+        self._steps.clear()
+        self._uncertainty.set(pose.yaw)
+
+    @property
+    def pose(self) -> Pose:
+        """The present pose of base_link in odom."""
+        return self._path.pose
+
+    def missed(self) -> dict[str, int]:
+        """Return counters of the time that no line reported, without those that are 0."""
+        ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
+        return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
+
+    @property
+    def doubt(self) -> WheelsStatus:
+        """The wheels that the pose ignores, and those that slip."""
+        return self._witness.status
+
+    @property
+    def events(self) -> list[Event]:
+        """Events of the last line about wheel faults."""
+        return self._witness.events
+
+    def skip(self, feedback: Feedback) -> None:
+        """Pass over an impossible line and leave its motion to the next one.
+
+        Counts are cumulative, so they lose nothing. Without counts only the time of the line is
+        kept.
+        """
+        self._rolling.skip(feedback)
+
+    def fold(
+        self, feedback: Feedback, gyro: Heading | None = None, told: WheelSpeeds | None = None
+    ) -> Estimate:
+        """Advance by one feedback line: by its counts, else by its speeds times dt.
+
+        After a gap without counts only the uncertainty advances. At rest nothing does: a count back
+        and forth waits until its direction is clear. If `gyro` provides the turn since the line
+        before, the wheels provide only the distance. `told` is the commanded wheel speeds, by which
+        a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
+        recomputed.
+        """
+        speeds, dt, before = feedback.speeds, feedback.dt, self.twist
+        said, witness = speeds.as_tuple(), self._witness
+        rolled = self._rolling.take(feedback, self.speeds)
+        steps = feedback.steps
+        if steps is not self._steps_of or (feedback.counted and steps is not self._steps_seen):
+            self._see(feedback)
+        turn, by_wheels = None, 0.0
+        if gyro is not None:
+            by_wheels = self._wheels_turn(rolled)
+            still = witness.believed(said) == NOWHERE
+            turn = gyro.turn(feedback.at.mono_ns, rolled.known, by_wheels, still)
+        by_gyro = None if turn is None else turn.wheels
+        if witness.hear(rolled.seen, speeds, rolled.seconds, told, by_gyro):
+            self._take_back(gyro)
+        slips = witness.slips or (turn is not None and turn.slips)
+        believed = witness.believed(said)
+        linear, angular = self._kinematics.moved(believed)
+        twist = Twist(linear, angular / self._share)
+        self._still = self._still + dt if believed == NOWHERE else 0.0
+        at_rest = self._still > REST_S
+        if rolled.unknown > 0.0:
+            self._stand(rolled.unknown, before, twist)
+        pieces = self._settled(rolled, at_rest)
+        on_trial = gyro is not None and gyro.owes
+        turned = self._move(pieces, turn, speeds, on_trial, slips)
+        if gyro is not None and on_trial and turned != by_wheels:
+            gyro.taken_back(turned - by_wheels)
+        self._go_on(rolled.bridged, feedback, before, twist)
+        variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
+        if turn is not None and dt > 0.0:
+            twist = Twist(linear, turn.rate)
+        self.twist, self.speeds = twist, speeds
+        return Estimate(
+            feedback.at,
+            self._path.pose,
+            twist,
+            self._uncertainty.covariance,
+            variances,
+            self._positions,
+            speeds,
+            feedback.asked_ns,
+            feedback.heard_ns,
+        )
+
+    def _see(self, line: Feedback) -> None:
+        """Take the resolution of the line's speeds for the twist's covariance.
+
+        Take its count for the pose's covariance, finally once every wheel turns.
+        """
+        if line.steps is not self._steps_of:
+            self._steps_of = line.steps
+            self._coarsest = max([step for step in line.steps if step < math.inf], default=0.0)
+        if line.counted is None or line.steps is self._steps_seen:
+            return
+        if all(line.speeds.as_tuple()):
+            self._steps_seen = line.steps
+        self._uncertainty.show_count(count_of(line))
+
+    def _wheels_turn(self, rolled: Rolled) -> float:
+        """Return the turn since the last believed line by the wheels, rad."""
+        turned = rolled.turned
+        for piece in rolled.pieces:
+            turned = plus(turned, piece)
+        return self._kinematics.moved(self._witness.believed(turned))[1]
+
+    def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
+        """Return the wheel angles to advance by.
+
+        At rest, hold counts until their direction is clear.
+        """
+        turned = rolled.turned
+        if self._held != NOWHERE:
+            turned = plus(self._held, turned)
+        if turned == NOWHERE:
+            self._held = NOWHERE  # the count has come back
+            return rolled.pieces
+        if at_rest and max(map(abs, turned)) <= self._unsettled:
+            self._held = turned
+            return rolled.pieces
+        self._held = NOWHERE
+        return (turned, *rolled.pieces)
+
+    def _take_back(self, gyro: Heading | None) -> None:
+        """Recompute the last lines in which a wheel, now found faulty, was wrong.
+
+        The pose jumps by the error, except for the part that a gyro has corrected or will correct.
+        """
+        lies = list(takewhile(lambda step: self._witness.lied(step.speeds), reversed(self._steps)))
+        if not lies:
+            return
+        self._path.set(lies[-1].pose)
+        on_trial = 0.0
+        for step in reversed(lies):
+            arcs = self._arcs(step.pieces, step.gyro, step.share)
+            for distance, angle in arcs:
+                self._path.advance(distance, angle)
+            if step.on_trial:
+                on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
+        self._steps.clear()
+        if gyro is not None and on_trial:
+            self._path.turn(-gyro.taken_back(on_trial))
+
+    def _arcs(
+        self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
+    ) -> list[tuple[float, float]]:
+        """Return the arcs for these wheel angles, m and rad: (4) to (7) are linear.
+
+        A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
+        one.
+        """
+        believed, kinematics = self._witness.believed, self._kinematics
+        moved = [kinematics.moved(believed(one)) for one in pieces]
+        if gyro is not None:
+            return [(math.fsum([distance for distance, _ in moved]), gyro.angle)]
+        return [(distance, angle / share) for distance, angle in moved]
+
+    def _move(
+        self,
+        pieces: tuple[Motors, ...],
+        turn: Turn | None,
+        speeds: WheelSpeeds,
+        on_trial: bool,
+        slips: bool,
+    ) -> float:
+        """Advance by wheel angles in rad, one arc for each piece; return the turn, rad."""
+        path, turned = self._path, 0.0
+        pose, variance = path.pose, None if turn is None else turn.variance
+        for piece in pieces:
+            self._positions = plus(self._positions, piece)
+        for distance, angle in self._arcs(pieces, turn, self._share):
+            turned += angle
+            self.travelled += abs(distance)
+            dx, dy, heading = path.advance(distance, angle)
+            self._uncertainty.advance(distance, angle, dx, dy, heading, variance, slips)
+        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._share))
+        return turned
+
+    def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
+        """Add the uncertainty of a filled gap, or else measure how twists change between lines."""
+        if bridged > 0.0:
+            self.bridged += bridged
+            self._uncertainty.doubt(*self._gaps.bridge(bridged, before, twist))
+        elif feedback.gap:
+            self._gaps.interrupt(twist)
+        else:
+            self._gaps.follow(twist, feedback.dt)
+
+    def _twist_variances(
+        self, twist: Twist, feedback: Feedback, at_rest: bool, gyro: Turn | None, slips: bool
+    ) -> TwistVariances:
+        spread, step = self._twist_uncertainty, self._coarsest
+        if at_rest:
+            variances = spread.at_rest(self._still, step)
+        else:
+            variances = spread.of(twist, feedback.dt - feedback.bridged, step)
+        if slips:
+            variances = spread.slipping(variances)
+        if gyro is not None and feedback.dt > 0.0:
+            variances = spread.with_gyro(variances, gyro.rate_variance)
+        return variances
+
+    def _stand(self, seconds: float, before: Twist, after: Twist) -> None:
+        """Account for `seconds` of unknown motion between two twists. The pose stands still."""
+        if before != REST or after != REST:
+            self.gaps += 1
+            self.unseen += seconds
+        self._uncertainty.stand(
+            seconds * (before.linear + after.linear) / 2,
+            seconds * (before.angular + after.angular) / 2,
+            *self._gaps.unseen(seconds, before, after),
+        )

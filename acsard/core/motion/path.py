@@ -1,0 +1,82 @@
+"""Integrates a chain of exact arcs, with sums that stay exact over millions of arcs.
+
+The chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along yaw +
+dyaw/2. The rounding error of each sum is kept with it and added to the next (Kahan, Further
+Remarks on Reducing Truncation Errors, 1965). A turn is 2 pi, not the double nearest to it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.core.values import Pose
+
+TAU_REST = 2.4492935982947064e-16
+"""2 pi minus `math.tau`, rad."""
+
+
+class Path:
+    """The pose at the end of the arcs so far."""
+
+    def __init__(self) -> None:
+        self.set(Pose())
+
+    def set(self, pose: Pose) -> None:
+        """Continue from `pose`."""
+        self._x, self._x_rest = pose.x, 0.0
+        self._y, self._y_rest = pose.y, 0.0
+        self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
+        self.pose = Pose(self._x, self._y, self._yaw)
+        """Pose of base_link in odom, yaw within [-pi, pi]."""
+
+    def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
+        """Advance by an arc of length `distance` m through `turn` rad.
+
+        Return its chord: m along x, m along y, and its direction in rad.
+        """
+        half = turn / 2
+        # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
+        chord = distance * (math.sin(half) / half if half else 1.0)
+        heading = self._yaw + half
+        dx, dy = chord * math.cos(heading), chord * math.sin(heading)
+        self._x, self._x_rest = plus(self._x, dx + self._x_rest)
+        self._y, self._y_rest = plus(self._y, dy + self._y_rest)
+        self._turn(turn)
+        self.pose = Pose(self._x, self._y, self._yaw)
+        return dx, dy, heading
+
+    def turn(self, turn: float) -> None:
+        """Turn on the spot by `turn` rad."""
+        self._turn(turn)
+        self.pose = Pose(self._x, self._y, self._yaw)
+
+    def _turn(self, turn: float) -> None:
+        wrapped, rest = _wrapped(self._yaw, turn)
+        self._yaw, self._yaw_rest = plus(wrapped, rest + self._yaw_rest)
+
+
+def plus(a: float, b: float) -> tuple[float, float]:
+    """Return a + b as the nearest double, and its exact rounding error (Knuth)."""
+    total = a + b
+    of_b = total - a
+    return total, (a - (total - of_b)) + (b - of_b)
+
+
+def arc(pose: Pose, distance: float, turn: float) -> Pose:
+    """Return `pose` after an arc of length `distance` m through `turn` rad."""
+    half, yaw = turn / 2, math.remainder(pose.yaw, math.tau)
+    chord = distance * (math.sin(half) / half if half else 1.0)
+    heading = yaw + half
+    wrapped, rest = _wrapped(yaw, turn)
+    return Pose(
+        pose.x + chord * math.cos(heading), pose.y + chord * math.sin(heading), wrapped + rest
+    )
+
+
+def _wrapped(yaw: float, turn: float) -> tuple[float, float]:
+    """Return yaw + turn within [-pi, pi], and its rounding error."""
+    total, rest = plus(yaw, turn)
+    wrapped = math.remainder(total, math.tau)
+    if wrapped != total:
+        rest -= round((total - wrapped) / math.tau) * TAU_REST
+    return wrapped, rest

@@ -1,0 +1,455 @@
+"""`Robot.step(Inputs) -> Outputs` holds all parts of a robot, and alone knows their order.
+
+A step folds the feedback into odometry, chooses one command, gates it by the mode, limits it,
+inverts the kinematics and reports. It is pure: time, bytes and commands come in, decisions go out.
+The memory of a robot is in `Robot` and its parts, and only a step changes it, except that the
+control loop adds to `counters`. The control loop carries the bytes, and `core/guard.py` checks each
+line that leaves.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import assert_never
+
+from msgspec.structs import replace
+
+from acsard.core.config.live import changed
+from acsard.core.config.lowered import lowered, with_lowered
+from acsard.core.config.motion_rules import longest_reply
+from acsard.core.config.parsing import ConfigError
+from acsard.core.config.settings import Config
+from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.link.feedback import Feedback
+from acsard.core.link.session import McuSession
+from acsard.core.motion.answered import Answered
+from acsard.core.motion.arbiter import Arbiter, Choice
+from acsard.core.motion.dropped import Dropped
+from acsard.core.motion.gyro import Gyro
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.learned_track import LearnedTrack
+from acsard.core.motion.lifecycle import Lifecycle
+from acsard.core.motion.limits import Limiter
+from acsard.core.motion.modes import LEAVING, Mode, RefusedError
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.sanity import Sanity
+from acsard.core.motion.tally import Tally
+from acsard.core.motion.told import Told, missed, refused
+from acsard.core.motion.words import REFUSED, chosen
+from acsard.core.values import (
+    NS_PER_S,
+    REST,
+    STILL,
+    Answer,
+    Estimate,
+    Event,
+    GyroStatus,
+    Inputs,
+    Instant,
+    Latches,
+    Outputs,
+    Plain,
+    Pose,
+    Refusal,
+    Request,
+    Snapshot,
+)
+
+MAX_DT = 0.05
+"""Longest time, s, by which one step may change the speed, or 1.5 periods if that is longer. After
+a stall the robot must not leap."""
+
+UNHEARD_S = WATCHDOG_S - 0.05
+"""Time, s, without a line that left, after which the robot starts over from rest. The MCU stops by
+itself at `WATCHDOG_S`, by its own clock, which may be a little fast."""
+
+HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
+"""Modes in which the robot brakes at the stop deceleration."""
+
+NS_PER_MS = 1_000_000
+
+MAX_TEXT = 200
+"""Longest text of a refusal that is kept, in characters: it may quote a stranger's message."""
+
+
+class Robot:
+    """One robot base with its link, pose, mode and commanders."""
+
+    def __init__(self, config: Config, latches: Latches = Latches()) -> None:  # noqa: B008
+        """Start in the mode of these latches and with the limits that they keep lowered."""
+        self._file_limits = config.limits
+        config, self._first_events = with_lowered(config, latches.lowered)
+        self.config = config
+        """The configuration in force. A step that obeys `set` replaces it."""
+        longest_s = longest_reply(config.feedback.fault_time)
+        self.session = McuSession(
+            config.mcu, config.rate_hz, config.feedback.wheel_speed, longest_s
+        )
+        self._kinematics = Kinematics(config.drive)
+        self._odometry = Odometry(
+            config.odometry,
+            self._kinematics,
+            config.mcu.encoder_counts,
+            config.feedback.response_time,
+            self.session.quiet_ns / NS_PER_S,
+        )
+        self._gyro = Gyro() if config.odometry.gyro else None
+        multiplier = config.drive.wheel_separation_multiplier
+        self._track = LearnedTrack(multiplier) if config.odometry.learned_track else None
+        self._arbiter = Arbiter(config.commands)
+        self._limiter = Limiter(config.limits, self._kinematics)
+        self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
+        self._life = Lifecycle(config.control.auto_activate, latches)
+        self._life.lower(lowered(self._file_limits, config.limits))
+        if latches.in_force:
+            mode, why = self._life.mode, self._life.why
+            self._first_events.append(Event("mode", why, "warning", kind=f"start -> {mode}"))
+        self._choice = Choice()
+        self._speeds = STILL
+        self._made_of: tuple[int | None, Mode] = (None, self._life.mode)
+        """Arrival of the command, and the mode, that the last line was made of."""
+        self._made_ns = 0
+        """Monotonic time at which the last line was made."""
+        self._made = self._said = (self._limiter.state, 0)
+        """State of the limiter and its time, at the last line made and at the last line that left.
+        A line that did not leave does not count."""
+        self._status = ("", "", "", "")
+        self.counters: Counter[str] = Counter()
+        """Totals since the start: `commands`, `commands_first_contact` of new senders whose delays
+        were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
+        those of the port and the bus."""
+        self._refused = ""
+        self._refused_ns: int | None = None
+        self._sanity = Sanity(config.feedback)
+        self._dropped = Dropped()
+        self._answered = Answered(config.mcu.reply_period)
+        self._tally = Tally()
+        self._asked: tuple[str, str, int | None] = ("", "", None)
+        """The last request. A stop arrives twice: on a key of its own, and as a query."""
+        self._told = Told(self._life.mode)
+        self._port_trouble = ""
+        self._linked_once = False
+        self._arbiter.require_neutral()
+
+    def snapshot(self, now_ns: int) -> Snapshot:
+        """Return the values for `state` and `diagnostics`. Too slow for every step."""
+        session, since, silent = self.session, self._refused_ns, self.session.silent(now_ns)
+        counters = {"lines": session.good_lines} | self._odometry.missed()
+        counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
+        if self._arbiter.forgiven_ns:
+            counters["clocks_forgiven_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
+        gyro = GyroStatus() if self._gyro is None else self._gyro.status
+        if self._track is not None:
+            gyro = replace(gyro, track_use=self._track.use)
+        return Snapshot(
+            pose=self._odometry.pose,
+            measured=None if silent else self._odometry.twist,
+            speeds=None if silent else self._odometry.speeds,
+            sources=self._arbiter.sources(now_ns),
+            counters=counters | self.counters,
+            refused=self._refused,
+            refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
+            feedback_age_s=session.feedback_age_s(now_ns),
+            gyro=gyro,
+            doubt=self._odometry.doubt,
+            check=session.negotiation.in_force,
+            encoders=session.snapping.counts,
+            sender=self._choice.sender,
+        )
+
+    @property
+    def latches(self) -> Latches:
+        """The latches in force, also in the middle of a step that a bug has ended."""
+        return self._life.latches
+
+    @property
+    def travelled(self) -> float:
+        """Distance by odometry since the start, forwards and backwards, m."""
+        return self._odometry.travelled
+
+    def step(self, inputs: Inputs) -> Outputs:
+        """Take everything that happened since the last step, and decide what happens now."""
+        events = list(inputs.events)
+        self._life.begin(inputs.now)
+        if self._first_events:
+            events += self._first_events
+            self._first_events = []
+        if inputs.missed:
+            self.counters["missed_periods"] += inputs.missed
+            events.append(missed(inputs.missed))
+        self._settle(inputs)
+        estimates = self._fold(inputs, events)
+        answers = self._serve(inputs, events)
+        if inputs.commands or inputs.refusals:
+            self._hear(inputs, events)
+        self._choice = self._arbiter.choose(inputs.now.mono_ns)
+        self._life.command(self._choice.twist is not None)
+        news = self._news()
+        due = inputs.tick or (inputs.at_once and news)
+        line = self._drive(inputs) if due else None
+        applied = self._limiter.twist
+        link = self.session.link
+        status = (self._life.mode.value, self._reason(), link, self._choice.source)
+        another, self._status = status != self._status, status
+        # Otherwise neither the mode nor the commander has changed.
+        if another or news:
+            events += self._told.changes(self._life.mode, self._choice, status[1])
+        # Pass by position: with seventeen names a struct takes three times as long.
+        return Outputs(
+            inputs.now,
+            due,
+            line,
+            self._speeds,
+            applied,
+            link == "up",
+            estimates,
+            *status,
+            self._choice.arrived_ns,
+            another,
+            self._tally.lines(events, inputs.now.mono_ns),
+            answers,
+            news,
+            self._life.latches,
+        )
+
+    def _news(self) -> bool:
+        """Return whether the next line has a newer command or mode, so that it may go at once."""
+        return (self._choice.arrived_ns, self._life.mode) != self._made_of
+
+    # The fate of the line before.
+
+    def _settle(self, inputs: Inputs) -> None:
+        """Keep the effect of the last line if it left, and undo it if it did not."""
+        if inputs.guard_trip:
+            # The guard has sent STOP in its place.
+            self._limiter.cut()
+            self._made = (self._limiter.state, self._made_ns)
+        if not inputs.superseded:
+            self._said = self._made
+        self._made = self._said
+
+    # Feedback.
+
+    def _fold(self, inputs: Inputs, events: list[Event]) -> tuple[Estimate, ...]:
+        session, before = self.session, self.session.link
+        unsent = inputs.superseded or bool(inputs.guard_trip)
+        feedback = session.update(
+            inputs.now, inputs.port_open, inputs.opened, inputs.received, unsent
+        )
+        link = session.link
+        told = self._answered.look(self.counters["lines_sent"], session.good_lines, link == "up")
+        if told is not None:
+            events.append(told)
+        if before == "up" != link:
+            self.counters["link_lost"] += 1
+            if session.lateness.late_s:
+                self.counters["link_lost_late"] += 1
+        if link != "up":
+            self._sanity.forget()
+        self._port_trouble = inputs.port_trouble
+        if session.restarted:
+            # No sender drives before the first link, so a zero sent during the start counts.
+            self._arbiter.require_neutral(inputs.now.mono_ns if self._linked_once else 0)
+        events += session.events
+        if link != "up":
+            # Without a link the daemon cannot ramp, and the command before the loss is old.
+            self._limiter.cut()
+            self._speeds = STILL
+            self._made = self._said = (self._limiter.state, self._made_ns)
+            self._life.link(up=False)
+            if link == "down" and before != "down":
+                self._arbiter.require_neutral(inputs.now.mono_ns)
+        else:
+            self._linked_once = True
+            self._life.link(up=True)
+        now = inputs.now
+        if self._gyro is not None:
+            self._gyro.hear(inputs.gyro)
+        if not feedback:
+            return ()
+        return tuple(
+            [estimate for line in feedback if (estimate := self._believe(line, now, events))]
+        )
+
+    def _believe(self, line: Feedback, now: Instant, events: list[Event]) -> Estimate | None:
+        """Fold a line that is possible, and return None for an impossible one.
+
+        Several impossible lines in a row latch a fault.
+        """
+        why = self._sanity.impossible(line)
+        told = self._dropped.line(why)
+        if told is not None:
+            events.append(told)
+        if why:
+            self.counters["line_impossible"] += 1
+            events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))
+            self._odometry.skip(line)
+            if self._sanity.doubtful:
+                self._fault(f"impossible feedback: {why}", now, events)
+            return None
+        fault = self._sanity.watch(self._speeds, line.speeds, line.since)
+        if fault:
+            self._fault(fault, now, events)
+        if self._sanity.turned:
+            self.counters["wheels_turned"] += 1
+            events.append(Event("wheels_turned", self._sanity.turned, "warning"))
+        estimate = self._odometry.fold(line, self._gyro, self._speeds)
+        if self._gyro is not None:
+            events += self._gyro.events
+            self._learn(self._gyro, events)
+        if self._odometry.events:
+            self.counters["wheels_doubted"] += len(self._odometry.events)
+            events += self._odometry.events
+        return estimate
+
+    def _learn(self, gyro: Gyro, events: list[Event]) -> None:
+        """Use the effective track that the gyro has taught, if configured and known."""
+        if self._track is not None:
+            self._track.look(gyro.learned)
+            self._odometry.turn_by(self._track.used)
+            if self._track.event is not None:
+                events.append(self._track.event)
+
+    # Requests.
+
+    def _serve(self, inputs: Inputs, events: list[Event]) -> tuple[Answer, ...]:
+        if inputs.guard_trip:
+            trip = f"the guard replaced a line: {inputs.guard_trip}"
+            self._fault(trip, inputs.now, events)
+        if inputs.leaving and self._life.mode is not Mode.LEAVING:
+            self._life.leave()
+        if not inputs.requests:
+            return ()
+        return tuple([self._answer(r, inputs.now, events) for r in inputs.requests])
+
+    def _answer(self, request: Request, now: Instant, events: list[Event]) -> Answer:
+        before = self._life.mode
+        try:
+            message = self._obey(request, now)
+        except RefusedError as refusal:
+            return Answer(request.id, False, str(refusal))
+        asked = (request.verb, request.by, request.asked_ns)
+        if asked != self._asked or request.asked_ns is None:
+            news = self._life.mode is not before or request.verb == "set"
+            events.append(Event(request.verb, message, by=request.by, news=news))
+        self._asked = asked
+        return Answer(request.id, True, message)
+
+    def _obey(self, request: Request, now: Instant) -> str:
+        life = self._life
+        asked_ns = now.mono_ns if request.asked_ns is None else request.asked_ns
+        match request.verb:
+            case "stop":
+                return life.stop(request.by, asked_ns, now)
+            case "clear":
+                released = life.clear(request.latch, asked_ns, now)
+                if not released:
+                    return "nothing to clear: the robot is neither stopped nor in fault"
+                self._sanity.forget()
+                self._arbiter.require_neutral(asked_ns)
+                return released
+            case "activate":
+                if life.activate(request.latch, asked_ns, now):
+                    self._arbiter.require_neutral(asked_ns)
+                return "active"
+            case "deactivate":
+                return life.deactivate(request.by, now)
+            case "set_pose" | "reset_odometry":
+                return self._place(request.pose or Pose())
+            case "set":
+                return self._set(request.settings, now.mono_ns)
+            case _:
+                assert_never(request.verb)
+
+    def _place(self, pose: Pose) -> str:
+        """Set the pose, and drop the corrections that were due to the pose before."""
+        self._odometry.set_pose(pose)
+        self.session.snapping.forgive()
+        if self._gyro is not None:
+            self._gyro.forgive()
+        pose = self._odometry.pose
+        return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
+
+    def _set(self, settings: dict[str, Plain], now_ns: int) -> str:
+        """Change settings while the robot runs."""
+        # The last line made may not have left, and the wheels obey the last one that did.
+        said, made = self._said[0].twist, self._limiter.twist
+        before, at_rest = self.config, self._speeds == STILL and said == made == REST
+        try:
+            self.config, news = changed(before, settings, at_rest)
+        except ConfigError as error:
+            raise RefusedError(str(error)) from None
+        self._limiter.use(self.config.limits)
+        self._life.lower(lowered(self._file_limits, self.config.limits))
+        self._odometry.use(self.config.odometry)
+        if self.config.commands != before.commands:
+            self._arbiter.use(self.config.commands)
+            self._arbiter.require_neutral(now_ns)
+        return news or "nothing new: all of it is so already"
+
+    def _fault(self, why: str, now: Instant, events: list[Event]) -> None:
+        if self._life.fault(why, now):
+            self._arbiter.require_neutral(self._made_ns)
+            events.append(Event("fault", f"{why}; srv/clear releases it", "error"))
+
+    # Commands.
+
+    def _hear(self, inputs: Inputs, events: list[Event]) -> None:
+        now_ns = inputs.now.mono_ns
+        for refusal in inputs.refusals:
+            self._refuse(refusal, now_ns, events)
+            if refusal.source:
+                self._arbiter.notice(refusal.source, refusal.sender, refusal.arrived_ns)
+        for command in inputs.commands:
+            if command.stamp_replaced:
+                self.counters["stamps_replaced"] += 1
+            reason = self._arbiter.accept(command)
+            if reason:
+                text = f"source {command.source}: {REFUSED[reason]}"
+                refusal = Refusal(reason, text, command.source, command.sender)
+                self._refuse(refusal, now_ns, events)
+            else:
+                self.counters["commands"] += 1
+
+    def _refuse(self, refusal: Refusal, now_ns: int, events: list[Event]) -> None:
+        events.append(refused(refusal))
+        # Every sender with a clock of its own begins in this state.
+        if refusal.reason == "unproven":
+            self.counters["commands_first_contact"] += 1
+            return
+        self.counters[f"command_{refusal.reason}"] += 1
+        self._refused_ns, self._refused = now_ns, refusal.text[:MAX_TEXT]
+
+    # Limits and kinematics.
+
+    def _drive(self, inputs: Inputs) -> bytes | None:
+        now_ns, twist, limiter = inputs.now.mono_ns, self._choice.twist, self._limiter
+        self._made_of = (self._choice.arrived_ns, self._life.mode)
+        limiter.state, said_ns = self._said
+        since = (now_ns - said_ns) / NS_PER_S
+        if self.session.link != "up" or since > UNHEARD_S:
+            limiter.cut()
+        elif self._life.mode is Mode.DRIVING and twist is not None:
+            limiter.follow(twist, min(since, self._max_dt))
+        else:
+            limiter.coast(since, stop=self._life.mode in HALTED)
+        self._made, self._made_ns = (limiter.state, now_ns), now_ns
+        self._speeds = self._kinematics.wheel_speeds(limiter.twist)
+        return self.session.line(now_ns, self._speeds)
+
+    # Report.
+
+    def _reason(self) -> str:
+        match self._life.mode:
+            case Mode.DRIVING:
+                return f"driving: {chosen(self._choice)}{self.session.note}"
+            case Mode.READY:
+                return f"{chosen(self._choice)}{self.session.note}"
+            case Mode.WAITING:
+                return self.session.words(self._port_trouble)
+            case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
+                return self._life.why
+            case Mode.LEAVING:
+                return LEAVING
+            case _:
+                assert_never(self._life.mode)

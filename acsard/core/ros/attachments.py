@@ -1,0 +1,46 @@
+"""The 33-byte attachment of every rmw_zenoh_cpp sample: sequence number, time and GID.
+
+Both rmw_zenoh_cpp and acsard drop a sample or a request without it.
+"""
+
+from __future__ import annotations
+
+from struct import Struct as Layout
+
+from msgspec import Struct
+
+from acsard.core.messages.encodings import DecodeError
+
+GID_BYTES = 16
+_LAYOUT = Layout(f"<qqB{GID_BYTES}s")
+
+
+class Attachment(Struct, frozen=True):
+    """Attachment of a sample or a request.
+
+    `sequence` counts from 1 for each publisher or client, and `stamp_ns` is its wall-clock time.
+    """
+
+    sequence: int
+    stamp_ns: int
+    gid: bytes
+
+    def pack(self) -> bytes:
+        """Encode the attachment."""
+        return _LAYOUT.pack(self.sequence, self.stamp_ns, GID_BYTES, self.gid)
+
+
+def unpack(data: bytes) -> Attachment:
+    """Decode an attachment; raise `DecodeError` if it is not valid."""
+    if not data:
+        raise DecodeError("no_attachment", "has no attachment, as rmw_zenoh gives every sample one")
+    if len(data) != _LAYOUT.size:
+        raise DecodeError(
+            "bad_attachment",
+            f"an attachment of {len(data)} bytes instead of {_LAYOUT.size}: "
+            "is the sender's rmw_zenoh older than Jazzy 0.2.4?",
+        )
+    sequence, stamp_ns, length, gid = _LAYOUT.unpack(data)
+    if length != GID_BYTES:
+        raise DecodeError("bad_attachment", f"a GID of {length} bytes instead of {GID_BYTES}")
+    return Attachment(sequence, stamp_ns, gid)

@@ -1,0 +1,182 @@
+"""The table of topics for a file or a live viewer: name, ROS type with definition, encoded struct.
+
+Every topic is CDR with its message definition (MCAP's `ros2msg`). Foxglove, Lichtblick and
+PlotJuggler read any such type. `ros2 bag play` refuses a file in which any topic has another
+encoding. ROS has no message for `state`, so it has a type of its own package (`shapes.py`).
+`ros2 bag play` reports that it leaves out this topic, and the other programs show it. Names and
+types that exist in the ROS tree come from `transports.py`. The definitions are those of ROS 2
+(Jazzy and later).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container, Iterator
+from typing import Any
+
+from msgspec import Struct
+
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import MESSAGES, RobotState, TwistStamped
+from acsard.core.messages.topics import by_key
+from acsard.core.ros.names import Qos, full_name
+from acsard.core.ros.shapes import Log, State, state
+from acsard.core.ros.transports import PUBLISHED
+
+OURS = "acsard/msg/"
+"""Prefix of the types that ROS does not know. A file defines them like any other type."""
+
+Field = tuple[str, str]
+"""Type and name of a field."""
+
+_TEXT = """
+builtin_interfaces/msg/Time: int32 sec, uint32 nanosec
+std_msgs/msg/Header: builtin_interfaces/msg/Time stamp, string frame_id
+geometry_msgs/msg/Vector3: float64 x, float64 y, float64 z
+geometry_msgs/msg/Point: float64 x, float64 y, float64 z
+geometry_msgs/msg/Quaternion: float64 x, float64 y, float64 z, float64 w
+geometry_msgs/msg/Twist: geometry_msgs/msg/Vector3 linear, geometry_msgs/msg/Vector3 angular
+geometry_msgs/msg/TwistStamped: std_msgs/msg/Header header, geometry_msgs/msg/Twist twist
+geometry_msgs/msg/TwistWithCovariance: geometry_msgs/msg/Twist twist, float64[36] covariance
+geometry_msgs/msg/Pose: geometry_msgs/msg/Point position, geometry_msgs/msg/Quaternion orientation
+geometry_msgs/msg/PoseWithCovariance: geometry_msgs/msg/Pose pose, float64[36] covariance
+geometry_msgs/msg/Transform: \
+    geometry_msgs/msg/Vector3 translation, geometry_msgs/msg/Quaternion rotation
+geometry_msgs/msg/TransformStamped: \
+    std_msgs/msg/Header header, string child_frame_id, geometry_msgs/msg/Transform transform
+nav_msgs/msg/Odometry: \
+    std_msgs/msg/Header header, string child_frame_id, \
+    geometry_msgs/msg/PoseWithCovariance pose, geometry_msgs/msg/TwistWithCovariance twist
+tf2_msgs/msg/TFMessage: geometry_msgs/msg/TransformStamped[] transforms
+sensor_msgs/msg/JointState: \
+    std_msgs/msg/Header header, string[] name, \
+    float64[] position, float64[] velocity, float64[] effort
+diagnostic_msgs/msg/KeyValue: string key, string value
+diagnostic_msgs/msg/DiagnosticStatus: \
+    byte level, string name, string message, string hardware_id, \
+    diagnostic_msgs/msg/KeyValue[] values
+diagnostic_msgs/msg/DiagnosticArray: \
+    std_msgs/msg/Header header, diagnostic_msgs/msg/DiagnosticStatus[] status
+rcl_interfaces/msg/Log: \
+    builtin_interfaces/msg/Time stamp, uint8 level, string name, string msg, \
+    string file, string function, uint32 line
+acsard/msg/Counter: string name, int64 count
+acsard/msg/SourceState: string name, int64 priority, float64 age, string waits_for
+acsard/msg/RobotState: \
+    std_msgs/msg/Header header, string mode, string reason, \
+    float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \
+    float64 feedback_age, string link, string source, string sender, \
+    acsard/msg/SourceState[] sources, \
+    string refused, string gyro, string track, string doubt, string recording, \
+    string certificate, acsard/msg/Counter[] counters
+"""
+"""Message definitions. Each type has one line: its name, a colon, and its fields as `type name`,
+separated by commas. `[]` marks a sequence and `[n]` an array. Types without a ROS message are in
+the package `acsard` (`shapes.py`).
+"""
+
+
+def _parsed(text: str) -> dict[str, tuple[Field, ...]]:
+    found = {}
+    for line in text.strip().splitlines():
+        name, _, fields = line.partition(":")
+        pairs = [field.split() for field in fields.split(",")]
+        found[name] = tuple((kind, field) for kind, field in pairs)
+    return found
+
+
+DEFINITIONS = _parsed(_TEXT)
+"""The fields of each type, in order."""
+
+RULE = "=" * 80
+
+
+def schema_text(name: str) -> str:
+    """Return the definition of a type and of all nested types in MCAP's `ros2msg` format."""
+    parts = [_fields(name)]
+    parts += [f"{RULE}\nMSG: {_short(other)}\n{_fields(other)}" for other in nested(name)]
+    return "".join(parts)
+
+
+def nested(name: str) -> tuple[str, ...]:
+    """Return the types that a type contains at any depth, in the order of their first use."""
+    return tuple(dict.fromkeys(_nested(name)))
+
+
+def _nested(name: str) -> Iterator[str]:
+    for kind, _ in DEFINITIONS[name]:
+        base = kind.partition("[")[0]
+        if "/" in base:
+            yield base
+            yield from _nested(base)
+
+
+def _fields(name: str) -> str:
+    return "".join(f"{_short(kind)} {field}\n" for kind, field in DEFINITIONS[name])
+
+
+def _short(kind: str) -> str:
+    """Shorten `pkg/msg/Type` to `pkg/Type`, as message definitions write it."""
+    return re.sub("/msg/", "/", kind)
+
+
+ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"
+"""Names of the message encoding and the schema encoding in MCAP and in Foxglove's live protocol."""
+
+SOURCE = "<source>"
+
+
+class Channel(Struct, frozen=True):
+    """A topic, or one topic for each source of commands."""
+
+    name: str
+    """Topic name relative to the namespace; it may contain `<source>`."""
+    native: str
+    """Key in the native tree with the same content."""
+    schema_name: str
+    """ROS type as `pkg/msg/Name`."""
+    message: type[Struct]
+    """Struct that is encoded; for `state`, the result of `shapes.state`."""
+    qos: Qos = Qos()
+
+    def topic(self, namespace: str, source: str = "") -> str:
+        """Return the fully qualified name, with its leading slash."""
+        return full_name(namespace, self.name.replace(SOURCE, source))
+
+    @property
+    def schema(self) -> str:
+        """The text of the message definition with all nested types."""
+        return schema_text(self.schema_name)
+
+    def encode(self, message: Any) -> bytes:
+        """Encode a message as CDR. A `RobotState` is first converted to the shape of `state`."""
+        return encode(state(message) if isinstance(message, RobotState) else message, "cdr")
+
+
+def _published() -> dict[str, Channel]:
+    found = {}
+    for row in PUBLISHED:
+        topic = by_key(row.native)
+        assert topic is not None, row.native
+        found[row.native] = Channel(row.name, row.native, row.type, MESSAGES[topic.type], row.qos)
+    return found
+
+
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+
+STATE = Channel("state", "state", OURS + "RobotState", State)
+LOG = Channel("log", "events", "rcl_interfaces/msg/Log", Log, Qos(1000))
+CMD_VEL_IN = Channel(f"cmd_vel_in/{SOURCE}", f"cmd/{SOURCE}", TWIST_STAMPED, TwistStamped)
+"""The command of each source, stamped with its arrival. `LOG` has one log line for each event."""
+
+BY_KEY: dict[str, Channel] = {**_published(), STATE.native: STATE}
+"""The channels of the messages that `Report` builds, by native key."""
+
+CHANNELS: tuple[Channel, ...] = (*BY_KEY.values(), CMD_VEL_IN, LOG)
+
+
+def said(silent: Container[str]) -> tuple[Channel, ...]:
+    """Return the channels on which a robot publishes; `silent` is the result of
+    `transports.left_out`.
+    """
+    return tuple(channel for channel in CHANNELS if channel.native not in silent)

@@ -1,0 +1,355 @@
+"""The configuration as ROS parameters, for `ros2 param` and `rqt_reconfigure`.
+
+A parameter is named as in `acsard.toml`, with dots between table and key. Those in
+`core/config/live.py` can be set. This module only translates a request to set; the robot decides
+and applies it. The rcl_interfaces structs are here because no other module uses them. The
+descriptors (description, range, and when a key may be set) are derived from the declarations that
+the configuration is checked with, so both agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import cache
+from typing import Annotated, TypeVar
+
+from msgspec import Meta, Struct, inspect
+from msgspec.structs import fields
+
+from acsard.core.config.live import WHEN, flat, live
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import expected
+from acsard.core.messages.cdr import Cdr, CdrError
+from acsard.core.values import Plain
+
+Unsigned8 = Annotated[int, Meta(extra={"cdr": "B"})]
+Signed64 = Annotated[int, Meta(extra={"cdr": "q"})]
+Unsigned64 = Annotated[int, Meta(extra={"cdr": "Q"})]
+
+
+class FloatingPointRange(Struct, frozen=True):
+    """Bounds of a float parameter."""
+
+    from_value: float
+    to_value: float
+    step: float
+
+
+class IntegerRange(Struct, frozen=True):
+    """Bounds of an integer parameter."""
+
+    from_value: Signed64
+    to_value: Signed64
+    step: Unsigned64
+
+
+class ParameterDescriptor(Struct, frozen=True):
+    """Descriptor of a parameter."""
+
+    name: str
+    type: Unsigned8
+    description: str = ""
+    additional_constraints: str = ""
+    read_only: bool = True
+    dynamic_typing: bool = False
+    floating_point_range: list[FloatingPointRange] = []
+    integer_range: list[IntegerRange] = []
+
+
+def described(name: str, type_of: int) -> ParameterDescriptor:
+    """Return a parameter's descriptor; `type_of` is its ROS type, 0 for an unknown parameter."""
+    if not type_of:
+        return ParameterDescriptor(name, type_of)
+    return _described(name, type_of)
+
+
+# The cache stays small: there are about a hundred known names.
+@cache
+def _described(name: str, type_of: int) -> ParameterDescriptor:
+    kind, row = kind_of(name), live(name)
+    words = expected(kind)
+    bounds = kind.type if isinstance(kind, inspect.Metadata) else kind
+    floats, whole = [], []
+    match bounds:
+        case inspect.FloatType(ge=float(low), le=float(high)):
+            floats = [FloatingPointRange(low, high, 0.0)]
+        case inspect.IntType(ge=int(low), le=int(high)):
+            whole = [IntegerRange(low, high, 1)]
+    return ParameterDescriptor(
+        name,
+        type_of,
+        words if row is None else f"{row.what}: {words}",
+        "acsard.toml and a start" if row is None else WHEN[row.when],
+        read_only=row is None,
+        floating_point_range=floats,
+        integer_range=whole,
+    )
+
+
+def kind_of(name: str) -> inspect.Type:
+    """Return the declared type of a key of `acsard.toml`.
+
+    A source is named in place of its index. Raises `KeyError` if the key is a table.
+    """
+    cls: type[Struct] = Config
+    parts = iter(name.split("."))
+    for part in parts:
+        (field,) = (one for one in fields(cls) if one.encode_name == part)
+        kind = inspect.type_info(field.type)
+        if isinstance(kind, inspect.VarTupleType) and isinstance(
+            kind.item_type, inspect.StructType
+        ):
+            next(parts)
+            kind = kind.item_type
+        if not isinstance(kind, inspect.StructType):
+            return kind
+        cls = kind.cls
+    raise KeyError(name)
+
+
+T = TypeVar("T")
+Some = Annotated[list[T], Meta(max_length=128)]
+"""List of requested parameters. All parameters together are fewer; a longer request would take
+too long to answer in one step.
+"""
+Many = Annotated[list[T], Meta(max_length=256)]
+"""List of names, which is quicker to read and may be longer."""
+
+MAX_REQUEST_BYTES = 16384
+"""Largest size of a request: as many of the longest names as a list may hold."""
+
+NOT_SET, BOOL, INTEGER, DOUBLE, STRING = range(5)
+INTEGER_ARRAY, DOUBLE_ARRAY, STRING_ARRAY = 7, 8, 9
+
+SEPARATOR = "."
+
+Q = TypeVar("Q")
+
+
+class ParameterValue(Struct, frozen=True):
+    """Value of a parameter; `type` says which field holds it."""
+
+    type: Unsigned8 = NOT_SET
+    bool_value: bool = False
+    integer_value: Signed64 = 0
+    double_value: float = 0.0
+    string_value: str = ""
+    byte_array_value: list[Unsigned8] = []
+    bool_array_value: list[bool] = []
+    integer_array_value: list[Signed64] = []
+    double_array_value: list[float] = []
+    string_array_value: list[str] = []
+
+
+class Parameter(Struct, frozen=True):
+    """A parameter with its value."""
+
+    name: str
+    value: ParameterValue
+
+
+class SetParametersResult(Struct, frozen=True):
+    """Result of setting a parameter, with the reason if it failed."""
+
+    successful: bool
+    reason: str
+
+
+class ListRequest(Struct, frozen=True):
+    """Request to list parameters.
+
+    `depth` 0 means any depth; without prefixes all parameters are listed.
+    """
+
+    prefixes: Many[str]
+    depth: Unsigned64
+
+
+class ListReply(Struct, frozen=True):
+    """Reply with parameter names and their prefixes."""
+
+    names: list[str]
+    prefixes: list[str]
+
+
+class Names(Struct, frozen=True):
+    """Request of the services that get values, types and descriptors."""
+
+    names: Many[str]
+
+
+class Values(Struct, frozen=True):
+    """Reply with values."""
+
+    values: list[ParameterValue]
+
+
+class Types(Struct, frozen=True):
+    """Reply with types."""
+
+    types: list[Unsigned8]
+
+
+class Descriptors(Struct, frozen=True):
+    """Reply with descriptors."""
+
+    descriptors: list[ParameterDescriptor]
+
+
+class SetRequest(Struct, frozen=True):
+    """Request of both services that set parameters."""
+
+    parameters: Some[Parameter]
+
+
+class SetReply(Struct, frozen=True):
+    """Reply with one result for each parameter."""
+
+    results: list[SetParametersResult]
+
+
+class SetAtomicallyReply(Struct, frozen=True):
+    """Reply with one result for all parameters."""
+
+    result: SetParametersResult
+
+
+SETTING = ("set_parameters", "set_parameters_atomically")
+"""The services that the robot must carry out."""
+
+
+def failure(service: str, why: str, request: bytes = b"") -> bytes:
+    """Return the reply to a request that is not served.
+
+    A client without a reply would wait for ever, and a client that sets parameters expects a result
+    for each. As in rclcpp, a reply without a field for `why` is empty.
+    """
+    refused = SetParametersResult(False, why)
+    if service in SETTING:
+        with suppress(CdrError):
+            return outcome(service, request, successful=False, reason=why)
+    replies: dict[str, Struct] = {
+        "list_parameters": ListReply([], []),
+        "get_parameters": Values([]),
+        "get_parameter_types": Types([]),
+        "describe_parameters": Descriptors([]),
+        "set_parameters": SetReply([refused]),
+        "set_parameters_atomically": SetAtomicallyReply(refused),
+    }
+    reply = replies[service]
+    return Cdr(type(reply)).encode(reply)
+
+
+class Parameters:
+    """Answers the parameter services that only read, from the tables of a configuration."""
+
+    def __init__(self, tables: Mapping[str, object]) -> None:
+        self._values = {name: _value(value) for name, value in flat(tables)}
+        self._services: dict[str, Callable[[bytes], bytes]] = {
+            "list_parameters": _service(ListRequest, self._list),
+            "get_parameters": _service(Names, self._get),
+            "get_parameter_types": _service(Names, self._types),
+            "describe_parameters": _service(Names, self._describe),
+        }
+
+    def answer(self, service: str, payload: bytes) -> bytes:
+        """Answer a CDR request with a CDR reply; raise `CdrError` if the request is not valid."""
+        return self._services[service](payload)
+
+    def _list(self, asked: ListRequest) -> ListReply:
+        def within(name: str) -> bool:
+            if not asked.prefixes:
+                return not asked.depth or name.count(SEPARATOR) < asked.depth
+            return any(_below(name, prefix, asked.depth) for prefix in asked.prefixes)
+
+        names = [name for name in self._values if within(name)]
+        prefixes = {name.rpartition(SEPARATOR)[0] for name in names}
+        return ListReply(names, sorted(prefixes - {""}))
+
+    def _of(self, asked: Names) -> Iterator[tuple[str, ParameterValue]]:
+        for name in asked.names:
+            yield name, self._values.get(name, ParameterValue())
+
+    def _get(self, asked: Names) -> Values:
+        return Values([value for _, value in self._of(asked)])
+
+    def _types(self, asked: Names) -> Types:
+        return Types([value.type for _, value in self._of(asked)])
+
+    def _describe(self, asked: Names) -> Descriptors:
+        return Descriptors([described(name, value.type) for name, value in self._of(asked)])
+
+
+def wished(payload: bytes) -> dict[str, Plain]:
+    """Return the wished values by name from a request to set.
+
+    Raises `CdrError` if it is not valid.
+    """
+    asked = Cdr(SetRequest).decode(payload)
+    wishes: dict[str, Plain] = {}
+    for one in asked.parameters:
+        if one.name in wishes:
+            raise CdrError(f"{one.name} is in it twice: set it once; nothing was set")
+        wishes[one.name] = _plain(one)
+    return wishes
+
+
+def outcome(service: str, payload: bytes, successful: bool, reason: str) -> bytes:
+    """Return the reply to a request to set. The robot applies all parameters or none."""
+    result = SetParametersResult(successful, reason)
+    if service == "set_parameters_atomically":
+        return Cdr(SetAtomicallyReply).encode(SetAtomicallyReply(result))
+    asked = Cdr(SetRequest).decode(payload)
+    return Cdr(SetReply).encode(SetReply([result] * len(asked.parameters)))
+
+
+def _plain(parameter: Parameter) -> Plain:
+    value = parameter.value
+    fields: dict[int, Plain] = {
+        BOOL: value.bool_value,
+        INTEGER: value.integer_value,
+        DOUBLE: value.double_value,
+        STRING: value.string_value,
+        INTEGER_ARRAY: [float(one) for one in value.integer_array_value],
+        DOUBLE_ARRAY: [*value.double_array_value],
+        STRING_ARRAY: [*value.string_array_value],
+    }
+    if value.type not in fields:
+        raise CdrError(f"{parameter.name}: no value that a setting could have")
+    return fields[value.type]
+
+
+def _service(request: type[Q], reply: Callable[[Q], Struct]) -> Callable[[bytes], bytes]:
+    asked = Cdr(request)
+
+    def serve(payload: bytes) -> bytes:
+        answer = reply(asked.decode(payload))
+        return Cdr(type(answer)).encode(answer)
+
+    return serve
+
+
+def _below(name: str, prefix: str, depth: int) -> bool:
+    rest = name.removeprefix(prefix + SEPARATOR)
+    return name == prefix or (rest != name and (not depth or rest.count(SEPARATOR) < depth))
+
+
+def _value(value: object) -> ParameterValue:
+    match value:
+        case bool():
+            return ParameterValue(BOOL, bool_value=value)
+        case int():
+            return ParameterValue(INTEGER, integer_value=value)
+        case float():
+            return ParameterValue(DOUBLE, double_value=value)
+        case str():
+            return ParameterValue(STRING, string_value=value)
+        case [float() | int(), *_]:
+            return ParameterValue(
+                DOUBLE_ARRAY,
+                double_array_value=[float(v) for v in value if isinstance(v, float | int)],
+            )
+        case list() | tuple():
+            return ParameterValue(STRING_ARRAY, string_array_value=[*map(str, value)])
+    return ParameterValue()

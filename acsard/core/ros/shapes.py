@@ -1,0 +1,145 @@
+"""The structs whose ROS shape differs from the native one: the log, and `state`.
+
+CDR has neither maps nor null. The counters are therefore a list, and NaN stands for null.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from acsard.core.messages.schema import (
+    Byte,
+    Happening,
+    Header,
+    RobotState,
+    Time,
+    Twist,
+    TwistStamped,
+    Vector3,
+)
+from acsard.core.values import Event
+from acsard.core.values import Twist as BodyTwist
+
+Whole = Annotated[int, Meta(extra={"cdr": "q"})]
+Natural = Annotated[int, Meta(extra={"cdr": "I"})]
+
+
+class Log(Struct, frozen=True):
+    """The message rcl_interfaces/msg/Log; `name` is the name of the event."""
+
+    stamp: Time
+    level: Byte
+    name: str
+    msg: str
+    file: str = ""
+    function: str = ""
+    line: Natural = 0
+
+
+NUMBERED = re.compile(r"\d+ (x|times)\b")
+"""Start of a text that `core/motion/tally.py` has combined from several events."""
+
+LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
+"""The numbers of the log levels in ROS."""
+
+
+def log(event: Event | Happening, stamp: Time) -> Log:
+    """Return an event of a step or of `events` as one log line."""
+    by = f" (by {event.by})" if event.by else ""
+    text = f"{event.text}{by}{how_often(event.text, event.count)}"
+    return Log(stamp, LEVELS.get(event.level, 20), event.name, text)
+
+
+def how_often(text: str, count: int) -> str:
+    """Return the suffix that says how often an event happened.
+
+    It is "" for a single event, and for a text that begins with its own number.
+    """
+    return "" if count == 1 or NUMBERED.match(text) else f" ({count} times)"
+
+
+def asked(twist: BodyTwist, arrived: Time, frame: str) -> TwistStamped:
+    """Return a source's command as a message of `cmd_vel_in/<source>`, stamped with its arrival."""
+    return TwistStamped(
+        Header(arrived, frame), Twist(Vector3(x=twist.linear), Vector3(z=twist.angular))
+    )
+
+
+class Counter(Struct, frozen=True):
+    """A counter, counted since the start."""
+
+    name: str
+    count: Whole
+
+
+class Source(Struct, frozen=True):
+    """A source of commands; `age` is in s, NaN if it has never sent a command."""
+
+    name: str
+    priority: Whole
+    age: float
+    waits_for: str
+
+
+class State(Struct, frozen=True):
+    """`RobotState` without the figures of the control loop, which `diagnostics` holds.
+
+    NaN stands for null.
+    """
+
+    header: Header
+    mode: str
+    reason: str
+    x: float
+    y: float
+    yaw: float
+    linear: float
+    angular: float
+    wheels: list[float]
+    feedback_age: float
+    link: str
+    source: str
+    sender: str
+    sources: list[Source]
+    refused: str
+    gyro: str
+    track: str
+    doubt: str
+    recording: str
+    certificate: str
+    counters: list[Counter]
+
+
+def state(message: RobotState) -> State:
+    """Convert a `RobotState` to the shape of `acsard/msg/RobotState`."""
+    return State(
+        header=Header(message.stamp),
+        mode=message.mode,
+        reason=message.reason,
+        x=message.x,
+        y=message.y,
+        yaw=message.yaw,
+        linear=_known(message.linear),
+        angular=_known(message.angular),
+        wheels=message.wheels,
+        feedback_age=_known(message.feedback_age),
+        link=message.link,
+        source=message.source,
+        sender=message.sender,
+        sources=[Source(s.name, s.priority, _known(s.age), s.waits_for) for s in message.sources],
+        refused=message.refused,
+        gyro=message.gyro,
+        track=message.track,
+        doubt=message.doubt,
+        recording=message.recording,
+        certificate=message.certificate,
+        counters=[Counter(name, count) for name, count in message.counters.items()],
+    )
+
+
+def _known(value: float | None) -> float:
+    return math.nan if value is None else value

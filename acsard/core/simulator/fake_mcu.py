@@ -1,0 +1,307 @@
+"""Simulates the board's side of the serial protocol, byte for byte and in time.
+
+Bytes and the time come in, bytes go out. By default the simulated board keeps the contract: it
+boots stopped, obeys only whole valid lines, stops the motors after 300 ms without a valid line, and
+answers a checked line with a checked one. It shares no parser with the host, so an error in one is
+not hidden by the other. Its faults are in `faults.py`, each as a `with` block. Those of `[sim]
+faults` stay on:
+
+    with mcu.mute(): ...
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import count, cycle
+
+from acsard.core.config.named_faults import named
+from acsard.core.config.settings import Config, WheelMap
+from acsard.core.config.wire_time import wire_ns
+from acsard.core.simulator import protocol
+from acsard.core.simulator.faults import USB_PACKET, Faults
+from acsard.core.simulator.faults import WATCHDOG_NS as WATCHDOG_NS
+from acsard.core.simulator.vehicle import Vehicle
+from acsard.core.values import NS_PER_S
+
+MS = 1_000_000
+
+RESET_NS = 2 * NS_PER_S
+"""Time for which a board with a bootloader ignores its input after a reset."""
+
+SHORTEST_WINDOW_NS = 4 * MS
+"""Shortest time over which speeds are computed from counts. Before it ends the last speeds are
+repeated."""
+
+PROCESSING_MS = (2.1, 1.3, 3.7, 1.0, 4.9, 2.6, 1.8, 3.2)
+"""Times from the end of a line to the start of its answer, used in turn: 1 to 5 ms, without
+randomness."""
+
+
+class FakeMcu(Faults):
+    """The simulated board.
+
+    The caller passes bytes to `receive`, asks `next_ns` for the next event and collects bytes with
+    `advance`.
+    """
+
+    def __init__(self, config: Config, now_ns: int = 0) -> None:
+        super().__init__()
+        self._vehicle = Vehicle(config.sim, config.drive)
+        self.baud_rate = config.mcu.baud_rate
+        self._counts = config.sim.encoder_counts
+        self._wiring = _wiring(config.mcu.wheels)
+        self._now_ns = self._moved_ns = now_ns
+        """Monotonic times of the last `advance`, and until which the vehicle has moved."""
+        self._events: list[tuple[int, int, str, bytes]] = []
+        self._order = count()
+        self._processing = cycle(PROCESSING_MS)
+        self._held = self._batch = b""
+        self._in_free_ns = self._out_free_ns = now_ns
+        self._boot_until_ns = now_ns + int(config.sim.boot_time * NS_PER_S)
+        self._fed_ns = now_ns
+        self._on_ns = self._boot_until_ns
+        self._angles: list[float] = []
+        self._seen: list[int] = []
+        """The counts that the encoders showed last."""
+        self._window = (now_ns, self._encoders())
+        self._measured = [0.0] * 4
+        self._moved = [0] * 4
+        self._counted = [0.0] * 4
+        self._replied_ns = now_ns - NS_PER_S
+        self.heard: deque[tuple[int, bytes]] = deque(maxlen=4096)
+        """The last lines received, valid or not, with the time at which each was complete, in
+        order."""
+        self.valid_lines = 0
+        self._watchdog_trips = 0
+        if config.sim.boot_time:
+            self._schedule(self._boot_until_ns, "booted", b"")
+        self._lasting = ExitStack()
+        for text in config.sim.faults:
+            self._lasting.enter_context(self.having(named(text)))
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The robot at the last `advance`. It moves only when its state is needed."""
+        self._catch_up()
+        return self._vehicle
+
+    @property
+    def watchdog_trips(self) -> int:
+        """Number of times that the watchdog has stopped the motors."""
+        self._catch_up()
+        return self._watchdog_trips
+
+    # Time.
+
+    def receive(self, now_ns: int, data: bytes) -> None:
+        """Take bytes that the host wrote. They arrive at the pace of the wire."""
+        start, taken = max(self._in_free_ns, now_ns), 0
+        data = self._damaged(data)
+        *lines, rest = data.split(b"\n")
+        for piece in lines:
+            taken += len(piece) + 1
+            line = (self._held + piece + b"\n")[-256:]
+            self._held = b""
+            self._schedule(start + wire_ns(taken, self.baud_rate), "line", line)
+        self._held = (self._held + rest)[-256:]
+        self._in_free_ns = start + wire_ns(len(data), self.baud_rate)
+
+    def next_ns(self) -> int | None:
+        """Return the time of the next event, or None."""
+        return self._events[0][0] if self._events else None
+
+    def advance(self, now_ns: int) -> bytes:
+        """Let time pass up to `now_ns`.
+
+        Return the bytes that have arrived at the host meanwhile.
+        """
+        out = b""
+        while self._events and self._events[0][0] <= now_ns:
+            due_ns, _, what, data = heapq.heappop(self._events)
+            self._now_ns = due_ns
+            if what in ("sent", "batch"):
+                out += self._handed_over(due_ns, what, data)
+            elif what == "line":
+                self.heard.append((due_ns, data))
+                lost = self._hit("command", self.lose_command)
+                if due_ns >= self._boot_until_ns and not lost:
+                    delay = int(next(self._processing) * MS) + self.extra_delay_ns
+                    self._schedule(due_ns + delay, "act", data)
+            elif what == "act":
+                self._act(due_ns, data)
+            elif what == "booted":
+                self._name_itself(due_ns)
+            elif what == "report" and data == self._clock:
+                if due_ns >= self._boot_until_ns:
+                    self._reply(due_ns, protocol.Command({}))
+                self._schedule(due_ns + self.unprompted_ns, "report", data)
+        self._now_ns = now_ns
+        return out
+
+    def reset(self, now_ns: int, deaf_ns: int = RESET_NS) -> None:
+        """Power on again.
+
+        The board is stopped, ignores its input while the bootloader runs, and sends noise first.
+        """
+        self._now_ns = now_ns
+        self._events.clear()
+        self._held = self._batch = b""
+        self.vehicle.set_points[:] = [0.0] * 4
+        self._boot_until_ns = now_ns + deaf_ns
+        self._on_ns = now_ns + deaf_ns
+        self._window = (now_ns, self._encoders())
+        self._measured, self._counted = [0.0] * 4, [0.0] * 4
+        self._schedule(now_ns + deaf_ns // 2, "sent", b"\x00\xf8\xff~boot\r\n")
+        self._schedule(now_ns + deaf_ns, "booted", b"")
+        if self._clock:
+            self._schedule(now_ns + self.unprompted_ns, "report", self._clock)
+
+    def _schedule(self, due_ns: int, what: str, data: bytes) -> None:
+        heapq.heappush(self._events, (due_ns, next(self._order), what, data))
+
+    def _catch_up(self) -> None:
+        """Move the vehicle up to now. The watchdog trips at its own time on the way."""
+        vehicle, now_ns, moved_ns = self._vehicle, self._now_ns, self._moved_ns
+        deadline = self._fed_ns + self.watchdog_ns
+        if deadline <= now_ns and self.watchdog and any(vehicle.set_points):
+            deadline = max(deadline, moved_ns)
+            vehicle.advance((deadline - moved_ns) / NS_PER_S, self.push)
+            moved_ns = deadline
+            self._watchdog_trips += 1
+            vehicle.set_points[:] = [0.0] * 4
+        if now_ns > moved_ns:
+            vehicle.advance((now_ns - moved_ns) / NS_PER_S, self.push)
+            moved_ns = now_ns
+        self._moved_ns = moved_ns
+
+    # Lines.
+
+    def _act(self, now_ns: int, line: bytes) -> None:
+        if line.rstrip(b"\r\n") == b"?":
+            self._name_itself(now_ns)
+            return
+        command = self.understand(line)
+        if command is None:
+            if self.any_feeds:
+                self._catch_up()
+                self._fed_ns = now_ns
+            return
+        # Until now the vehicle has obeyed the line before.
+        set_points = self.vehicle.set_points
+        for motor, value in command.values.items():
+            wheel, forward = self._wiring[self.drivers[motor]]
+            set_points[wheel] = forward * self.drives[motor] * value
+        self.valid_lines += 1
+        self._fed_ns = now_ns
+        if not self.unprompted_ns:
+            self._reply(now_ns, command)
+
+    def _name_itself(self, now_ns: int) -> None:
+        if self.understand is protocol.whole:
+            self._send(
+                now_ns, protocol.identity(self._counts, self.watchdog_ns // MS, self.samples)
+            )
+
+    def _reply(self, now_ns: int, command: protocol.Command) -> None:
+        if self.muted or now_ns - self._replied_ns < self.reply_gap_ns:
+            return
+        self._replied_ns = now_ns
+        comma, end = self.ending[:-2].encode(), self.ending[-2:].encode()
+        speeds = tuple(self._speeds(now_ns))
+        text = protocol.speeds_text(speeds, self.separator, self.unpadded_replies) + comma
+        if command.sequence:
+            sample = self._sample() if command.wants_sample and self.samples else ()
+            text += protocol.suffix(text, command.sequence, sample)
+        if self._hit("reply", self.lose_reply):
+            return
+        data = self._damaged(self.noise_bytes + text + end)
+        self._send(now_ns, data[: len(data) // 2] if self.cut_replies else data)
+
+    def _send(self, now_ns: int, data: bytes) -> None:
+        self._out_free_ns = max(self._out_free_ns, now_ns) + wire_ns(len(data), self.baud_rate)
+        self._schedule(self._out_free_ns, "sent", data)
+
+    def _handed_over(self, now_ns: int, what: str, data: bytes) -> bytes:
+        """Return the bytes that the USB adapter passes to the host now, and keep the rest."""
+        until_ns = self._stalled_until(now_ns)
+        if until_ns > now_ns:
+            self._schedule(until_ns, what, data)
+            return b""
+        begun, waited = bool(self._batch), self._batch + data
+        full = len(waited) // USB_PACKET * USB_PACKET
+        if what == "batch" or not self.latency_ns:
+            full = len(waited)
+        self._batch = waited[full:]
+        if self._batch and not begun:
+            tick_ns = -(-now_ns // self.latency_ns) * self.latency_ns
+            self._schedule(tick_ns, "batch", b"")
+        return waited[:full]
+
+    def _encoders(self) -> list[int]:
+        """Return the counts of the motors a to d."""
+        angles = self.vehicle.angles
+        if angles != self._angles:
+            floor, tau, per_turn = math.floor, math.tau, self._counts
+            self._angles = angles.copy()
+            self._seen = [floor(f * angles[w] / tau * per_turn + 0.5) for w, f in self._wiring]
+        return self._seen
+
+    def _speeds(self, now_ns: int) -> list[float]:
+        """Return the speeds by the encoders: whole counts over the time since the last reading."""
+        since, before = self._window
+        gains = self.gains
+        if self.stuck is not None:
+            gains = [0.0 if motor == self.stuck else gain for motor, gain in enumerate(gains)]
+        if now_ns - since >= SHORTEST_WINDOW_NS:
+            counts = self._encoders()
+            if counts == before and self.frozen is None:
+                # No motor has turned by a count, so no gain and no swapped wire can show.
+                self._moved, self._measured = [0] * 4, [0.0] * 4
+                self._window = (now_ns, counts)
+                return [0.0] * 4
+            scale = math.tau / self._counts * NS_PER_S / (now_ns - since)
+            every = [b - a for a, b in zip(before, counts, strict=True)]
+            read = zip(self.encoders, self.encoder_signs, strict=True)
+            moved = [every[encoder] * sign for encoder, sign in read]
+            if self.frozen is not None:
+                moved[self.frozen] = self._moved[self.frozen]
+            self._moved = moved
+            said = [count * scale for count in moved]
+            if self.frozen is not None:
+                said[self.frozen] = self._measured[self.frozen]
+            self._measured = said
+            rows = zip(self._counted, moved, gains, strict=True)
+            self._counted = [total + count * gain for total, count, gain in rows]
+            self._window = (now_ns, counts)
+        seen = [speed * gain for speed, gain in zip(self._measured, gains, strict=True)]
+        return [speed if abs(speed) >= 0.005 else 0.0 for speed in seen]
+
+    def _sample(self) -> tuple[int, ...]:
+        """Return the ms from power-on to the last encoder reading, and its counts."""
+        read_ns, _ = self._window
+        return (read_ns - self._on_ns) // MS, *(round(count) for count in self._counted)
+
+    # The fault that needs a clock of its own.
+
+    @contextmanager
+    def unprompted(self, period_s: float = 0.1) -> Iterator[None]:
+        """Report by its own clock instead of answering: unpadded, with a trailing comma."""
+        period_ns = int(period_s * NS_PER_S)
+        # A new name, so that events of an older clock are ignored.
+        clock = b"clock %d" % next(self._order)
+        self._schedule(self._now_ns + period_ns, "report", clock)
+        with self._with(
+            unprompted_ns=period_ns, _clock=clock, unpadded_replies=True, ending=",\r\n"
+        ):
+            yield
+
+
+def _wiring(wheels: WheelMap) -> list[tuple[int, int]]:
+    """Return the configured wheel (`values.WHEELS` order) and sign of the motors a to d."""
+    motors = (wheels.front_right, wheels.front_left, wheels.rear_left, wheels.rear_right)
+    place = {motor[1]: (index, -1 if motor[0] == "-" else 1) for index, motor in enumerate(motors)}
+    return [place[letter] for letter in "abcd"]

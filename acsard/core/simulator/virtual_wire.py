@@ -1,0 +1,55 @@
+"""A serial line to the simulated board in virtual time: no clock runs and waiting costs nothing.
+
+It implements the line that `acsard mcu check` uses (`checkup.board.Wire`). A wrong baud rate
+garbles both directions.
+"""
+
+from __future__ import annotations
+
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.garble import garbled
+
+Piece = tuple[int, bytes]
+
+
+class VirtualWire:
+    """The host's end of the line."""
+
+    def __init__(self, mcu: FakeMcu, now_ns: int = 0) -> None:
+        self.mcu = mcu
+        self.is_open = False
+        self._baud_rate = 0
+        self._now_ns = now_ns
+
+    def open(self, baud_rate: int) -> None:
+        """Open the line, or change the baud rate of the open line."""
+        self.is_open, self._baud_rate = True, baud_rate
+
+    def close(self) -> None:
+        """Close the line: nothing goes out any more."""
+        self.is_open = False
+
+    def now_ns(self) -> int:
+        """Return the virtual time, ns."""
+        return self._now_ns
+
+    def late_ns(self) -> int:
+        """Return 0, because in virtual time nothing waits for a processor."""
+        return 0
+
+    def send(self, data: bytes) -> None:
+        """Send bytes now."""
+        assert self.is_open, "a closed line carries nothing"
+        self.mcu.receive(self._now_ns, garbled(data, self._baud_rate, self.mcu.baud_rate))
+
+    def listen(self, until_ns: int) -> list[Piece]:
+        """Let time pass; return the data that came, in pieces, each with its time."""
+        pieces = []
+        while (due_ns := self.mcu.next_ns()) is not None and due_ns <= until_ns:
+            due_ns = max(due_ns, self._now_ns)
+            data = self.mcu.advance(due_ns)
+            if data:
+                pieces.append((due_ns, garbled(data, self.mcu.baud_rate, self._baud_rate)))
+        self._now_ns = max(self._now_ns, until_ns)
+        self.mcu.advance(self._now_ns)
+        return pieces

@@ -1,0 +1,87 @@
+"""The simulated robot with an observer of its true state, and with a gyro.
+
+The board does not use these observations. It sends only what its encoders show.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from msgspec import Struct
+
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.noise import gauss
+from acsard.core.values import NS_PER_S, Pose
+
+LOOK_NS = NS_PER_S // 100
+"""Time between two observations, and between two samples of the gyro."""
+
+
+class Sight(Struct, frozen=True):
+    """An observation at monotonic `at_ns`: the true pose, and the turn rate by the gyro, rad/s.
+
+    The gyro reports the mean over the time between two observations, delayed by `[sim] gyro_delay`.
+    """
+
+    at_ns: int
+    pose: Pose
+    gyro: float
+
+
+class WatchedMcu(FakeMcu):
+    """A `FakeMcu` whose robot is observed a hundred times per second of simulated time."""
+
+    def __init__(self, config: Config, now_ns: int, see: Callable[[Sight], None]) -> None:
+        super().__init__(config, now_ns)
+        self._sim, self._see = config.sim, see
+        self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
+        self._looks = 0
+        self._look_ns = now_ns + LOOK_NS
+        self._history: deque[tuple[int, float]] = deque([(now_ns, 0.0)])
+        """Pairs of time and angle turned, as far back as the gyro needs."""
+
+    def next_ns(self) -> int:
+        """Return the time of the next event or observation."""
+        due_ns = super().next_ns()
+        return self._look_ns if due_ns is None else min(due_ns, self._look_ns)
+
+    def advance(self, now_ns: int) -> bytes:
+        """Let time pass up to `now_ns`.
+
+        Return the bytes that have arrived at the host meanwhile.
+        """
+        out = b""
+        while self._look_ns <= now_ns:
+            out += super().advance(self._look_ns)
+            self._look()
+            self._look_ns += LOOK_NS
+        return out + super().advance(now_ns)
+
+    def _look(self) -> None:
+        now_ns, sim = self._look_ns, self._sim
+        self._history.append((now_ns, self.vehicle.turned))
+        end_ns = now_ns - self._delay_ns
+        turned = self._turned(end_ns) - self._turned(end_ns - LOOK_NS)
+        while self._history[1][0] <= end_ns - LOOK_NS:
+            self._history.popleft()
+        rate = turned * NS_PER_S / LOOK_NS + sim.gyro_bias
+        rate += sim.gyro_noise * gauss(sim.seed, self._looks)
+        self._looks += 1
+        self._see(Sight(now_ns, self.vehicle.pose, rate))
+
+    def _turned(self, at_ns: int) -> float:
+        """Return the angle in rad at this time.
+
+        The robot stood still before the first observation.
+        """
+        before_ns, before = self._history[0]
+        if at_ns <= before_ns:
+            return before
+        for then_ns, turned in self._history:
+            if then_ns >= at_ns:
+                share = (at_ns - before_ns) / max(1, then_ns - before_ns)
+                return before + share * (turned - before)
+            before_ns, before = then_ns, turned
+        return before

@@ -1,0 +1,95 @@
+"""Finds the endpoint, the id and the certificates for a tool that connects to a robot."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from msgspec import ValidationError, convert
+
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.settings import TLS, Config, Name
+from acsard.daemon.bus.zenoh_sessions import reachable
+from acsard.host.errors import UsageError
+
+
+class Address(NamedTuple):
+    """The endpoint, id and certificate directory of a robot."""
+
+    endpoint: str
+    robot_id: str
+    tls: str
+    """Directory with the client's certificate, "" for none."""
+
+
+def address_of(
+    config: Config,
+    connect: str | None = None,
+    robot_id: str | None = None,
+    tls: str | None = None,
+) -> Address:
+    """Return the address of the configuration's robot.
+
+    A given option replaces the value of the configuration. Raises `UsageError` for an id that no
+    robot can have.
+    """
+    robot_id = config.robot.id if robot_id is None else robot_id
+    require_id(robot_id)
+    bus = config.bus
+    # The daemon listens only in peer mode. Prefer a plain endpoint, which needs no certificate.
+    known = sorted(bus.listen if bus.mode == "peer" else bus.connect, key=_is_tls)
+    endpoint = connect or reachable(known[0])
+    certificates = (tls or bus.tls) if _is_tls(endpoint) else ""
+    return Address(endpoint, robot_id, certificates)
+
+
+def address_by_environment(endpoint: str | None, robot_id: str | None, tls: str | None) -> Address:
+    """Return a robot's address for a program that uses the client library.
+
+    Arguments come first, then the file that $ACSARD_CONFIG names, then the defaults. For the
+    certificate directory $ACSARD_TLS overrides the file. Raises `UsageError` for an id that no
+    robot can have and for a file that cannot be used.
+    """
+    settled = endpoint is not None and robot_id is not None
+    if settled and (tls is not None or not _is_tls(endpoint or "")):
+        config = Config()  # the file cannot change the result
+    else:
+        config = _named_by_environment()
+    where = address_of(config, endpoint, robot_id, tls)
+    return Address(
+        where.endpoint if endpoint is None else endpoint,
+        where.robot_id,
+        where.tls if tls is None else tls,
+    )
+
+
+def _named_by_environment() -> Config:
+    named = os.environ.get("ACSARD_CONFIG")
+    tls = os.environ.get("ACSARD_TLS")
+    given: dict[str, dict[str, object]] = {} if tls is None else {"bus": {"tls": tls}}
+    try:
+        return parse(Path(named).read_bytes() if named else b"", given)
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {named}, which ACSARD_CONFIG names: {error.strerror}; name a file that "
+            "is there, or unset it"
+        ) from None
+    except ConfigError as error:
+        where = f"{named}, which ACSARD_CONFIG names" if named else "the environment"
+        raise UsageError(f"{where}: {'; '.join(error.problems)}") from None
+
+
+def require_id(robot_id: str) -> None:
+    """Raise `UsageError` for an id that no robot can have."""
+    try:
+        convert(robot_id, Name)
+    except ValidationError:
+        raise UsageError(
+            f"{robot_id!r} is not a robot's id: write 1 to 32 of A-Z a-z 0-9 _ -, as robot.id "
+            "in its acsard.toml"
+        ) from None
+
+
+def _is_tls(endpoint: str) -> bool:
+    return endpoint.startswith(TLS)

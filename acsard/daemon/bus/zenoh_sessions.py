@@ -1,0 +1,275 @@
+"""Opens the Zenoh sessions of the daemon, of the TLS gateway and of the client tools.
+
+This module holds the session settings and the reason for each. It knows no keys or messages beyond
+the rate limits.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+
+import zenoh
+
+from acsard.core.config.settings import TLS, BusConfig
+from acsard.core.messages.topics import full_key, source_keys
+from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, require_usable, trouble
+from acsard.host.errors import CertificateError, InUseError, UnreachableError, UsageError
+from acsard.host.terminal_modes import coloured
+
+COMMAND_RATE_HZ = 1000.0
+"""Commands accepted per key and second: enough for a zero 1 ms after a command, too few to cost a
+control period. The TLS gateway accepts as many stops. A stop beyond the limit repeats the one of
+the previous millisecond, so dropping it is safe."""
+
+MAX_SESSIONS = 256
+"""Clients at once, on the robot's machine and at the TLS gateway each. Idle connections of
+strangers must not keep an operator out for long."""
+
+MESSAGE_BYTES = 65536
+"""Largest message that a link accepts, bytes. The code holds commands to a far lower limit."""
+
+
+def daemon_session(
+    bus: BusConfig,
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+) -> zenoh.Session:
+    """Open the daemon's session: a peer or client without multicast discovery.
+
+    A client over TLS connects to the TLS gateway, not to this session. In client mode this call
+    blocks until the router answers, so call it in a thread.
+
+    Args:
+        sources: names of the listed command sources.
+        limited: ROS keys on which commands arrive.
+        access: the value of Zenoh's `access_control`.
+
+    Raises:
+        InUseError: the session cannot listen, for example because the address is taken.
+    """
+    settings = _base(bus.mode) | {
+        "listen/endpoints": list(bus.plain),
+        "connect/endpoints": list(bus.connect),
+        # Peers behind a router find each other by gossip only. Without a router no peers exist.
+        "scouting/gossip/enabled": bool(bus.connect),
+        "timestamping/enabled": True,
+        "queries_default_timeout": 3000,
+    }
+    settings |= _listening() | _limits(robot_id, sources, limited, access)
+    if any(endpoint.startswith(TLS) for endpoint in bus.connect):
+        settings |= _tls(bus.tls)
+    if bus.connect:
+        settings |= PATIENT
+    return _opened(settings, bus.plain)
+
+
+def door_session(
+    bus: BusConfig,
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+) -> zenoh.Session:
+    """Open the TLS gateway's session, a router.
+
+    It connects TLS clients with the daemon on this machine.
+    """
+    settings = _base("router") | PATIENT | _tls(bus.tls) | _listening()
+    # Limit puts only: a flood of DELETEs, which are not stops, must not use up the limit of the
+    # stops. The daemon's own session does not limit stops.
+    stops = _at_most("stops", ["put"], [full_key(robot_id, "stop")])
+    settings |= _limits(robot_id, sources, limited, access, stops)
+    settings |= {
+        "listen/endpoints": list(bus.outside),
+        "connect/endpoints": [reachable(bus.plain[0])],
+        "scouting/gossip/enabled": False,
+        # The gateway must not stamp samples: the daemon would take the gateway for their sender.
+        "timestamping/enabled": False,
+    }
+    return _opened(settings, bus.outside)
+
+
+def reachable(endpoint: str) -> str:
+    """Return the endpoint by which a program on this machine reaches a listen endpoint."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
+def no_endpoint(text: str) -> UsageError:
+    """Return the error for a text that is not an endpoint."""
+    return UsageError(f'{text} is not an endpoint; write it like "tcp/127.0.0.1:7448"')
+
+
+PATIENT = {"connect/timeout_ms": -1, "connect/exit_on_failure": False}
+
+
+def _listening() -> dict[str, object]:
+    """Return the limits against strangers who connect and send nothing, or too much."""
+    return {
+        "transport/link/rx/max_message_size": MESSAGE_BYTES,
+        "transport/unicast/accept_timeout": 1000,
+        # With 32, 300 idle connections keep an operator out for 2 s. With 512 they cost 3 MB.
+        "transport/unicast/accept_pending": 512,
+        "transport/unicast/max_sessions": MAX_SESSIONS,
+        "transport/link/tx/lease": 2000,
+        # A stopped subscriber must not delay a put. By default each put waits 1 ms for room.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+    }
+
+
+def _limits(
+    robot_id: str,
+    sources: tuple[str, ...],
+    limited: tuple[str, ...],
+    access: dict[str, object],
+    *more: dict[str, object],
+) -> dict[str, object]:
+    """Return the access rules and the rate limits as Zenoh settings."""
+    limits = [_command_limits(robot_id, sources, limited), *more]
+    return {"access_control": access, "downsampling": limits}
+
+
+def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Session:
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        raise InUseError(
+            f"cannot listen on {', '.join(where)}: {first_line(error)}; another daemon or router "
+            "may have it: stop that, or give this one an address of its own, by --listen or in "
+            "bus.listen",
+        ) from error
+
+
+def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
+    """Open a client session to the daemon or router at `endpoint`.
+
+    It is a client because a peer that connects to a router would reach nobody else. `tls` is the
+    directory with the certificates for an endpoint like "tls/robot.local:7449".
+
+    Raises:
+        UsageError: `endpoint` is not an endpoint.
+        NotPermittedError: a certificate file may not be read.
+        CertificateError: a certificate is missing or unusable.
+        UnreachableError: no daemon or router answers there.
+    """
+    if "/" not in endpoint:
+        raise no_endpoint(endpoint)
+    settings = _base("client") | {
+        "connect/endpoints": [endpoint],
+        # A server that accepts and then sends nothing is not a daemon, and a person waits here.
+        "transport/unicast/open_timeout": 3000,
+        "timestamping/enabled": True,
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 50_000,
+    }
+    secured = endpoint.startswith(TLS)
+    if secured and not tls:
+        raise CertificateError(
+            f"{endpoint} wants a certificate: add --tls DIRECTORY (tls= in Python), the directory "
+            "that `acsard lan init` or `lan add` made for you"
+        )
+    if secured:
+        # Zenoh reports unusable certificates as if the daemon were absent.
+        require_usable(tls)
+        settings |= _tls(tls)
+    try:
+        return zenoh.open(_config(settings))
+    except zenoh.ZError as error:
+        seen = trouble(endpoint, tls) if secured else ""
+        raise UnreachableError(
+            f"no daemon answers at {endpoint}: "
+            + (
+                seen
+                or f"is `acsard run` running, is this its bus.listen, has it room (at most "
+                f"{MAX_SESSIONS} connections)? ({first_line(error)})"
+            )
+        ) from None  # Zenoh's message names its own source files
+
+
+def _base(mode: str) -> dict[str, object]:
+    return {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        # Zenoh takes the retry settings only as a whole. With its defaults the daemon would
+        # reconnect seconds after a router comes back.
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 1.5,
+        },
+    }
+
+
+def _tls(directory: str) -> dict[str, object]:
+    """Return the TLS settings.
+
+    Both ends present a certificate of one CA, and a link ends when its certificate does.
+    """
+    certificate, key = f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}"
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": f"{directory}/{CA}",
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+        }
+    }
+
+
+def _command_limits(
+    robot_id: str, sources: tuple[str, ...], limited: tuple[str, ...]
+) -> dict[str, object]:
+    """Return the rate limits: one per listed source, so that no source uses up another's.
+
+    All unlisted sources share one limit. The certificates of a source share its limit, but each
+    connection has limits of its own.
+    """
+    listed = [*sources, "*"]
+    below = [*source_keys(listed), *source_keys(listed, "*"), "imu"]
+    keys = [full_key(robot_id, key) for key in below]
+    return _at_most("commands", ["put", "delete"], [*keys, *limited])
+
+
+def _at_most(name: str, messages: list[str], keys: list[str]) -> dict[str, object]:
+    return {
+        "id": name,
+        "messages": messages,
+        "flows": ["ingress"],
+        "rules": [{"key_expr": key, "freq": COMMAND_RATE_HZ} for key in keys],
+    }
+
+
+def _config(settings: dict[str, object]) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of a Zenoh error without the paths of its source files."""
+    text = re.sub(r"(?: at)? /\S+\.rs:\d+\.?", "", str(error)).splitlines()
+    return text[0][:200].strip() if text else type(error).__name__
+
+
+def log_from_environment() -> None:
+    """Start Zenoh's own log if RUST_LOG is set. It goes to standard output."""
+    if "RUST_LOG" not in os.environ:
+        return
+    wish = os.environ.get("NO_COLOR")
+    # Zenoh looks at NO_COLOR alone and would colour pipes and files too.
+    if not coloured(sys.stdout):
+        os.environ["NO_COLOR"] = "1"
+    zenoh.try_init_log_from_env()
+    if wish is None:
+        os.environ.pop("NO_COLOR", None)
+    else:
+        os.environ["NO_COLOR"] = wish

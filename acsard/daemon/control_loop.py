@@ -1,0 +1,370 @@
+"""Collects the inputs of `Robot.step`, calls it, and carries its outputs. It decides nothing.
+
+The control loop is synchronous, so that the daemon can call `step` from one task and the tests can
+call it in virtual time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config
+from acsard.core.config.wire_time import wire_ns
+from acsard.core.guard import Guard
+from acsard.core.incoming.bus_interface import DOOR_KEY as DOOR
+from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, DoorTold, RoutersTold
+from acsard.core.incoming.commands import Receiver, asker, parts, sender
+from acsard.core.incoming.imu import ImuTold
+from acsard.core.incoming.queries import Queries, Query, refused
+from acsard.core.link.gate import Port
+from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.report import Report
+from acsard.core.messages.schema import Info, Message
+from acsard.core.messages.topics import IMU
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.robot import Robot
+from acsard.core.values import (
+    NS_PER_S,
+    Answer,
+    Command,
+    Event,
+    GyroSample,
+    Inputs,
+    Instant,
+    Latches,
+    Outputs,
+    Recording,
+    Refusal,
+    Request,
+    Snapshot,
+)
+from acsard.daemon.kept_latches import ANSWER_NS, Handover, LatchKeeper
+from acsard.daemon.latencies import Stopwatch
+from acsard.daemon.pacing import NO_PERIOD, Pace, Period
+from acsard.recording.steps import BlackBox
+
+FEEDBACK = ("odom", "tf", "wheel_states")
+"""Keys that are published from the feedback lines."""
+
+QUERIES_PER_STEP = 8
+"""Most queries that one step answers. The others wait, so that many of them cost no period."""
+
+BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
+
+
+class ControlLoop:
+    """One robot between its port and its bus."""
+
+    def __init__(
+        self,
+        config: Config,
+        info: Info,
+        port: Port,
+        bus: Bus,
+        start: Instant,
+        log: Callable[[Event], None],
+        mono_ns: Callable[[], int],
+        certificate_ends_ns: int | None = None,
+        others: list[Event] | None = None,
+        beside: Callable[[str], Message | None] | None = None,
+        adopted: Callable[[Config], None] | None = None,
+        recorder: BlackBox | None = None,
+        latches: Latches = Latches(),  # noqa: B008
+        keeper: LatchKeeper | None = None,
+    ) -> None:
+        """Make a robot with these latches, which `keeper` keeps over a restart.
+
+        `others` are the events of the daemon's other parts. Each step takes them and empties the
+        list. `beside` returns the present value of a key that another part publishes. `adopted` is
+        called with a configuration that is in force from now on. `recorder` is the black box.
+        """
+        self.robot = Robot(config, latches)
+        self.report = Report(config, start, certificate_ends_ns)
+        self.leaving = False
+        """Set it to go down: the robot ramps to zero and stays there."""
+        self.outputs: Outputs | None = None
+        self._start_ns = start.mono_ns
+        self._others = [] if others is None else others
+        self._beside = beside
+        self._config, self._adopted = config, adopted
+        self._recorder, self._handover = recorder, Handover(latches, keeper)
+        self._answers: deque[tuple[int, Answer]] = deque()
+        """Answers that wait until the file has the latches, each with its monotonic time."""
+        self._got = NOTHING
+        """The input that this step took from the bus."""
+        stop = self.robot.session.codec.stop
+        self._guard = Guard(stop, config)
+        if recorder is not None and latches != Latches():
+            # A replay would otherwise start with a robot that nobody has stopped.
+            recorder.begins(self.robot, self._guard)
+        self._receiver = Receiver(config.joints, Kinematics(config.drive))
+        self._queries = Queries(config, info)
+        self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
+        self._routers = RoutersTold()
+        self._turn_rates: list[GyroSample] = []
+        """Samples of a gyro since the last step."""
+        self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
+        self._superseded, self._trip = False, ""
+        """The fate of the last line, for the next step: superseded, and replaced by the guard."""
+        # The longest line of either direction: answers must not queue in the MCU either.
+        period_ns = int(NS_PER_S / config.rate_hz)
+        self._pace = Pace(wire_ns(config.mcu.line_bytes, config.mcu.baud_rate), period_ns)
+        self._stopwatch = Stopwatch()
+
+    @property
+    def at_rest(self) -> bool:
+        """True if the last step commanded zero, as it does without a link."""
+        outputs = self.outputs
+        return outputs is not None and not any(outputs.speeds.as_tuple())
+
+    def totals(self, now_ns: int) -> dict[str, float]:
+        """Return the run time, s, the distance, m, and all counters, for the last log line."""
+        seconds, metres = (now_ns - self._start_ns) / NS_PER_S, self.robot.travelled
+        shot = self.robot.snapshot(now_ns)
+        return {"seconds": round(seconds, 1), "metres": round(metres, 2), **shot.counters}
+
+    @property
+    def retry_ns(self) -> int | None:
+        """Monotonic time of the next step for a command that came too soon after a line, if any."""
+        return self._pace.retry_ns(self._port.sent_ns) if self._pace.waits else None
+
+    @property
+    def listens(self) -> bool:
+        """Whether a command that arrives now gets a step of its own, before the next period."""
+        return self._pace.listens
+
+    def step(self, now: Instant, period: Period = NO_PERIOD) -> Outputs:
+        """Take one step at `now`, at the end of a period or between two."""
+        self._got = NOTHING
+        try:
+            return self._step(now, period)
+        except Exception:
+            # A stop that this step took is lost otherwise: the bug may have come before it.
+            self._handover.take_stops(self.robot.latches, _stops(self._got), now)
+            raise
+
+    def _step(self, now: Instant, period: Period) -> Outputs:
+        ended, missed = period.expired > 0, max(0, period.expired - 1)
+        if ended:
+            self._stopwatch.period(now.mono_ns, now.mono_ns - period.due_ns, missed)
+        commands, refusals, requests = self._from_bus(now)
+        self._others += self._handover.news()
+        port, pace = self._port, self._pace
+        # Take the bytes first: `take` closes the port when the computer was suspended.
+        received = port.take(now if missed else None)
+        # Pass by position: with sixteen names a struct takes three times as long.
+        inputs = Inputs(
+            now,
+            ended and pace.period_ended(missed),
+            port.is_open,
+            port.opened,
+            port.trouble,
+            received,
+            commands,
+            requests,
+            tuple(self._turn_rates),
+            refusals,
+            self._trip,
+            self._superseded,
+            missed,
+            tuple(self._others),
+            pace.at_once(now.mono_ns, port.sent_ns),
+            self.leaving,
+        )
+        if inputs.events:
+            self._others.clear()
+        if inputs.gyro:
+            self._turn_rates.clear()
+        before = self._config
+        outputs, went = self._decided(inputs)
+        heard = bool(commands or refusals or requests)
+        pace.note(inputs.tick, outputs.due, went, outputs.news, heard)
+        self._publish(outputs)
+        # Only now, after the log has the event.
+        if self._config is not before and self._adopted:
+            self._adopted(self._config)
+        self._stopwatch.step(now.mono_ns, self._mono_ns())
+        # Last, because the sending thread needs the interpreter, which is free when the loop waits.
+        self._bus.flush()
+        return outputs
+
+    def _decided(self, inputs: Inputs) -> tuple[Outputs, bool]:
+        """Return the outputs and whether their line left, and record the step in any case."""
+        try:
+            outputs = self.outputs = self.robot.step(inputs)
+            self._handover.take(outputs.latches)
+            if self.robot.config is not self._config:
+                self._adopt(self.robot.config)
+            went = self._send(outputs, inputs.now, inputs.tick)
+        except Exception:
+            if self._recorder is not None:
+                self._recorder.died(inputs)
+            raise
+        if self._recorder is not None:
+            self._recorder.step(inputs, outputs, went, self.robot, self._guard)
+        return outputs, went is not None
+
+    def finish(self, now: Instant) -> None:
+        """Keep the stops that arrived after the last step, and give the last answers."""
+        self.keep_last_stops(now)
+        self._handover.wait()
+        self._answer(now, last=True)
+        self._bus.flush()
+
+    def keep_last_stops(self, now: Instant) -> None:
+        """Keep the stops that no step will serve, because they arrived after the last one."""
+        self._handover.take_stops(self._handover.latches, _stops(self._bus.take(0)), now)
+
+    def _adopt(self, config: Config) -> None:
+        """Use the configuration that the robot has used since this step."""
+        self._config = config
+        self._guard.use(config)
+        self.report.use(config)
+        self._queries.use(config)
+
+    def _from_bus(
+        self, now: Instant
+    ) -> tuple[tuple[Command, ...], tuple[Refusal, ...], tuple[Request, ...]]:
+        # Before the first step there are no outputs to answer with.
+        got = self._got = self._bus.take(QUERIES_PER_STEP if self.outputs else 0)
+        if got is NOTHING:
+            return (), (), ()
+        commands: list[Command] = []
+        refusals: list[Refusal] = []
+        requests: list[Request] = []
+        self._note(got)
+        for arrival in got.arrivals:
+            if arrival.key == DOOR:
+                ends_ns = self._door.hear(arrival, self.robot.counters)
+                self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
+                continue
+            if arrival.key == IMU:
+                heard = self._imu.hear(arrival, self.robot.counters, self._others)
+                if heard is not None:
+                    self._turn_rates.append(heard)
+                continue
+            if arrival.key == "stop":
+                if arrival.put:
+                    by = asker(arrival.via, arrival.attachment, arrival.sender)
+                    requests.append(Request("stop", asked_ns=arrival.arrived_ns, by=by))
+                else:
+                    refusals.append(Refusal("not_a_put", "stop: a DELETE is not a stop"))
+                continue
+            try:
+                commands.append(self._receiver.command(arrival))
+            except DecodeError as error:
+                refusals.append(
+                    Refusal(
+                        error.reason,
+                        f"{arrival.key}: {error}",
+                        parts(arrival.key)[1],
+                        sender(arrival),
+                        arrival.arrived_ns,
+                    )
+                )
+        for query in got.queries:
+            served = self._served(query, now, refusals)
+            if served is not None:
+                requests.append(served)
+        return tuple(commands), tuple(refusals), tuple(requests)
+
+    def _note(self, got: BusInput) -> None:
+        """Count and report the troubles of the bus itself."""
+        if got.overrun:
+            self.robot.counters["bus_overrun"] += got.overrun
+        if got.dropped:
+            self.robot.counters["bus_dropped"] += got.dropped
+        if got.routers is not None:
+            self._routers.hear(got.routers, self.robot.counters, self._others)
+        if got.stuck:
+            self.robot.counters["bus_stuck"] += 1
+            self._others.append(BUS_STUCK)
+
+    def _served(self, query: Query, now: Instant, refusals: list[Refusal]) -> Request | None:
+        """Answer a query and return None, or return the request that the robot must decide."""
+        try:
+            served = self._queries.serve(query, self._current, self.outputs)
+        except DecodeError as error:
+            refusals.append(Refusal(error.reason, f"{query.topic}: {error}"))
+            reply = refused(query, str(error), now.wall_ns)
+            served = [] if reply is None else [reply]
+        if isinstance(served, Request):
+            return served
+        for reply in served:
+            self._bus.reply(reply)
+        self._bus.retire(query.ticket)
+        return None
+
+    def _send(self, outputs: Outputs, now: Instant, tick: bool) -> bytes | None:
+        """Offer the line, and return it if it left. The next step tells the robot its fate."""
+        line, self._trip = self._guard.check(outputs)
+        self._superseded = False
+        if line is None:
+            return None
+        before_ns = self._port.sent_ns
+        offered = self._port.offer(line, now)
+        if offered == "sent":
+            self._guard.left(line)
+            self._stopwatch.line(outputs, self._port.sent_ns, before_ns)
+            self.robot.counters["lines_sent"] += 1
+            return line
+        self._superseded = True
+        if offered == "superseded" and tick:
+            # A line that could not go at once is not counted: its period's line follows.
+            self.robot.counters["lines_superseded"] += 1
+        return None
+
+    def _publish(self, outputs: Outputs) -> None:
+        bus, told_ns = self._bus, None
+        for key, message in self.report.due(outputs, bus.wanted, self._look):
+            bus.publish(key, message)
+            if key in FEEDBACK:
+                told_ns = self._mono_ns()
+        for estimate in outputs.estimates:
+            self._stopwatch.feedback(estimate, told_ns)
+        if outputs.answers:
+            self._answers.extend((outputs.now.mono_ns, answer) for answer in outputs.answers)
+        if self._answers:
+            self._answer(outputs.now)
+        for event in outputs.events:
+            self._log(event)
+
+    def _answer(self, now: Instant, *, last: bool = False) -> None:
+        """Give each answer that has the file or has waited for its time; `last` gives them all."""
+        held, before_ns = self._handover.held, now.mono_ns - ANSWER_NS
+        trouble = "" if held else self._handover.trouble
+        while self._answers and (held or last or self._answers[0][0] < before_ns):
+            _, answer = self._answers.popleft()
+            if trouble and answer.success:
+                answer = replace(answer, message=f"{answer.message}; {trouble}")
+            reply = self._queries.answered(answer, now.wall_ns)
+            if reply is not None:
+                self._bus.reply(reply)
+                self._bus.retire(reply.ticket)
+
+    def _current(self, key: str) -> Message | None:
+        message = self.report.current(key, self._look)
+        return self._beside(key) if message is None and self._beside else message
+
+    def _look(self) -> Snapshot:
+        outputs = self.outputs
+        now_ns = 0 if outputs is None else outputs.now.mono_ns
+        return replace(
+            self.robot.snapshot(now_ns),
+            figures=self._stopwatch.measured(now_ns),
+            missed_last_minute=self._stopwatch.missed(now_ns),
+            routers=self._routers.status,
+            latch_file=self._handover.trouble,
+            recording=Recording() if self._recorder is None else self._recorder.status,
+        )
+
+
+def _stops(got: BusInput) -> list[str]:
+    """Return the names of those that stop the robot with this input."""
+    puts = [one for one in got.arrivals if one.key == "stop" and one.put]
+    calls = [query for query in got.queries if query.topic == "srv/stop"]
+    names = [asker(put.via, put.attachment, put.sender) for put in puts]
+    return names + [asker(call.via, call.attachment) for call in calls]

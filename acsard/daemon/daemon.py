@@ -1,0 +1,332 @@
+"""Runs the daemon from its start to its end; reads from top to bottom.
+
+The daemon enters the simulator, the bus, the port and the control loop in this order. Leaving them
+in reverse order is the shutdown: ramp to zero, STOP, close the port, close the bus. The first
+signal begins it, and a second one cuts the ramp short. A bug in any task ends the process in the
+same way.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Sequence
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from typing import Any
+
+from acsard import __version__
+from acsard.core.config.settings import TLS, Config
+from acsard.core.link.codec import Codec
+from acsard.core.messages.schema import Info
+from acsard.core.messages.topics import offered, published
+from acsard.core.ros.transports import left_out
+from acsard.core.values import NS_PER_S, Event, Latches
+from acsard.daemon.bus.access import access_control
+from acsard.daemon.bus.bus import ZenohBus
+from acsard.daemon.bus.tls import ends_ns as ends_ns_of
+from acsard.daemon.bus.tls import require_usable
+from acsard.daemon.bus.zenoh_sessions import log_from_environment
+from acsard.daemon.control_loop import ControlLoop
+from acsard.daemon.doorkeeper import DOOR, PAGE, Kind, keep_door
+from acsard.daemon.latch_file import LatchFile
+from acsard.daemon.serial.port import SerialPort
+from acsard.daemon.serial.simulated_board import Simulated
+from acsard.daemon.wakeup import Next, Ticker, Wakeup
+from acsard.host import clock, real_time
+from acsard.host.logs import Log
+from acsard.host.systemd import PATIENCE_S, Systemd
+from acsard.recording.recorder import Recorder
+
+EXIT_RAMP_S = 0.6
+"""Bound on the ramp to zero, s. After it the daemon sends STOP at any speed."""
+
+
+class Departure:
+    """The shutdown, begun by the first signal and hurried by the second."""
+
+    def __init__(self, log: Log, wake: Callable[[], None], manager: Systemd) -> None:
+        self._log, self._wake, self._manager = log, wake, manager
+        self._starting = asyncio.current_task()
+        self.begun_ns: int | None = None
+        self.hurried = False
+
+    def watch(self) -> None:
+        """Handle the signals.
+
+        Those of a closed terminal are included, because it must not leave the wheels turning.
+        """
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+            loop.add_signal_handler(number, self._signal, number)
+
+    def started(self) -> None:
+        """Note that the start is complete.
+
+        Before this a signal cancels the start; now it begins the ramp.
+        """
+        self._starting = None
+
+    def _signal(self, number: signal.Signals) -> None:
+        self.hurried = self.begun_ns is not None
+        if self.begun_ns is None:
+            self.begun_ns = clock.now().mono_ns
+            self._manager.stopping()
+        self._log.info("signal", signal=number.name, hurried=self.hurried)
+        if self._starting is not None:
+            self._starting.cancel()
+        self._wake()
+
+    def over(self, now_ns: int, at_rest: bool) -> bool:
+        """Return whether the ramp has ended, was cut short or has taken too long."""
+        if self.begun_ns is None:
+            return False
+        return at_rest or self.hurried or now_ns - self.begun_ns > EXIT_RAMP_S * NS_PER_S
+
+
+SWITCH_INTERVAL_S = 0.0005
+"""Longest time that another Python thread may hold the interpreter, s. The default is 5 ms, which
+is half a control period."""
+
+LATCHED_PERIOD_S = 5.0
+"""Interval at which latched messages are repeated for subscribers that cannot ask for history,
+s."""
+
+Announce = Callable[[str, str], None]
+"""A callback for the end of the start, with the serial device and its trouble, "" if it is open."""
+
+
+async def run(
+    config: Config,
+    log: Log,
+    announce: Announce,
+    door: Sequence[str] | None = None,
+    page: Sequence[str] | None = None,
+) -> None:
+    """Run until a signal; raise a `MendableError` if the daemon cannot start.
+
+    Args:
+        config: The configuration.
+        log: The log.
+        announce: Called once when everything runs.
+        door: Arguments of the `acsard door` process to run, None if it is a service of its own.
+        page: Arguments of the `acsard web` process to run, None for no page.
+    """
+    wake = Wakeup()
+    manager = Systemd(os.environ, os.getpid())
+    departure = Departure(log, wake, manager)
+    departure.watch()
+    log_from_environment()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    # Ask before the first thread starts, because the threads of the bus must not inherit the
+    # priority.
+    refused = real_time.ask() if config.control.real_time else ""
+    if refused:
+        log.info("real_time", text=refused)
+    try:
+        await _run(config, log, announce, departure, wake, manager, door, page)
+    except asyncio.CancelledError:
+        if departure.begun_ns is None:
+            raise
+    finally:
+        manager.close()
+
+
+async def _run(
+    config: Config,
+    log: Log,
+    announce: Announce,
+    departure: Departure,
+    wake: Wakeup,
+    manager: Systemd,
+    door: Sequence[str] | None,
+    page: Sequence[str] | None,
+) -> None:
+    async with AsyncExitStack() as stack:
+        totals: dict[str, object] = {}
+        stack.callback(lambda: log.info("ended", **totals))  # entered first, so it runs last
+        events, start = list[Event](), clock.now()
+        recorder = _recorder(config, events.append, start.wall_ns, stack)
+        simulated = stack.enter_context(Simulated(config)) if config.mcu.simulated else None
+        keeper = _keeper(config, stack)
+        path = config.mcu.port if simulated is None else simulated.path
+        after = stack.enter_context(ExitStack())
+        bus, port = _bus(config, wake), _port(config, path, wake, events.append)
+        ends_ns = _certificates(config, door is not None)
+        # The bus comes first: an id or address in use must end the daemon before the port opens.
+        async with _patience(config, log, manager):
+            await stack.enter_async_context(bus)
+        if simulated is not None:
+            simulated.tell(bus)
+        between = stack.enter_context(ExitStack())
+        await stack.enter_async_context(port)
+        control = ControlLoop(
+            config,
+            _info(config, path),
+            port,
+            bus,
+            start,
+            log.event,
+            clock.mono_ns,
+            ends_ns,
+            events,
+            None if simulated is None else simulated.current,
+            lambda adopted: log.use(adopted.log),
+            recorder,
+            # After the bus and the port: a second daemon must end before it touches the latches.
+            Latches() if keeper is None else await keeper.start(clock.now()),
+            keeper,
+        )
+        between.callback(lambda: control.finish(clock.now()))
+        after.callback(lambda: control.keep_last_stops(clock.now()))
+        stack.callback(lambda: totals.update(control.totals(clock.mono_ns())))
+        announce(path, port.trouble)
+        manager.ready()
+        departure.started()
+        served = ((door if config.bus.outside else None, DOOR), (page, PAGE))
+        helpers = [_keep(words, events.append, kind) for words, kind in served if words is not None]
+        async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
+            await _control(config, control, departure, wake, manager)
+
+
+def _recorder(
+    config: Config, log: Callable[[Event], None], wall_ns: int, stack: AsyncExitStack
+) -> Recorder | None:
+    """Return the black box, or None if the configuration has none. It closes with the stack."""
+    if not config.record.directory:
+        return None
+    recorder = Recorder(config, log, wall_ns)
+    stack.push(lambda kind, error, trace: recorder.close(error))
+    return recorder
+
+
+def _keeper(config: Config, stack: AsyncExitStack) -> LatchFile | None:
+    """The latch file of a real robot; with the built-in simulator nothing is kept.
+
+    It closes with the stack, after the port: a slow disk must not delay the last STOP.
+    """
+    if config.mcu.simulated:
+        return None
+    keeper = LatchFile(config, os.environ)
+    stack.callback(keeper.close)
+    return keeper
+
+
+def _bus(config: Config, wake: Wakeup) -> ZenohBus:
+    """Return the bus, not yet open."""
+    return ZenohBus(
+        config.bus,
+        config.ros,
+        left_out(config),
+        config.robot.id,
+        tuple(source.name for source in config.commands.sources),
+        access_control(config),
+        wake,
+        offered(config),
+        published(config),
+    )
+
+
+def _port(config: Config, path: str, wake: Wakeup, tell: Callable[[Event], None]) -> SerialPort:
+    """Return the port, not yet open."""
+    stop, period_ns = _stop_line(config), int(NS_PER_S / config.rate_hz)
+    return SerialPort(path, config.mcu.baud_rate, stop, period_ns, wake, tell)
+
+
+@asynccontextmanager
+async def _beside(helpers: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator[None]:
+    """Run the helpers as tasks beside the block, and cancel them when it ends."""
+    async with asyncio.TaskGroup() as group:
+        tasks = [group.create_task(helper) for helper in helpers]
+        yield
+        for task in tasks:
+            task.cancel()
+
+
+def _certificates(config: Config, ours: bool) -> int | None:
+    """Return when the certificates used by this process end, None without any.
+
+    Raises a `MendableError` if they cannot be used.
+    """
+    bus = config.bus
+    if not (any(e.startswith(TLS) for e in bus.connect) or (ours and bus.outside)):
+        return None
+    require_usable(bus.tls)
+    return ends_ns_of(bus.tls)
+
+
+async def _control(
+    config: Config,
+    control: ControlLoop,
+    departure: Departure,
+    wake: Wakeup,
+    manager: Systemd,
+) -> None:
+    """Run the control task: a step in every period, and one when feedback arrives."""
+    # Let the slow first round of the other tasks end before the first period.
+    await asyncio.sleep(0)
+    gc.collect()
+    gc.freeze()  # the present objects live to the end, so later collections skip them
+    with Ticker(int(NS_PER_S / config.rate_hz), wake) as ticker:
+
+        def step() -> Next | None:
+            now = clock.now()
+            control.leaving = departure.begun_ns is not None
+            period = ticker.take(now.mono_ns)
+            manager.step(control.step(now, period))
+            if control.leaving and departure.over(now.mono_ns, control.at_rest):
+                return None
+            return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
+
+        ticker.start(clock.now().mono_ns)
+        await wake.run(step)
+
+
+@asynccontextmanager
+async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator[None]:
+    """In client mode, report to the log and to systemd while the block waits for the router."""
+    if config.bus.mode == "peer":
+        yield
+        return
+    why = f"waits for the router at {', '.join(config.bus.connect)}"
+    log.info("connecting", text=why)
+
+    async def repeat() -> None:
+        while True:
+            manager.waiting(why)
+            await asyncio.sleep(PATIENCE_S / 3)
+
+    task = asyncio.create_task(repeat())
+    try:
+        yield
+    finally:
+        task.cancel()
+
+
+async def _keep(words: Sequence[str], log: Callable[[Event], None], kind: Kind) -> None:
+    await keep_door(words, log, kind)
+
+
+async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:
+    while True:
+        bus.publish("tf_static", control.report.tf_static())
+        await asyncio.sleep(LATCHED_PERIOD_S)
+
+
+def _stop_line(config: Config) -> bytes:
+    return Codec(config.mcu.wheels, config.mcu.trailing_comma).stop
+
+
+def _info(config: Config, path: str) -> Info:
+    return Info(
+        id=config.robot.id,
+        version=__version__,
+        pid=os.getpid(),
+        port=path,
+        simulated=config.mcu.simulated,
+        rate=config.rate_hz,
+        listen=list(config.bus.listen) if config.bus.mode == "peer" else [],
+        connect=list(config.bus.connect),
+    )

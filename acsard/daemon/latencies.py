@@ -1,0 +1,218 @@
+"""Measures the daemon's own latencies, in fixed memory and without a clock of its own.
+
+Each figure is a duration in us, published as median, 99th percentile and maximum, since the start
+and over the last minute. The messages `state` and `diagnostics` carry them. `Stopwatch` takes the
+times from the control loop.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections import deque
+from itertools import accumulate
+from operator import add
+from typing import Literal, get_args
+
+from acsard.core.values import NS_PER_S, Estimate, Measured, Outputs, Spread
+
+PER_DECADE = 20
+"""Buckets per factor of ten. A percentile is accurate to 12 %."""
+
+DECADES = 7
+"""Range from 1 to 10^7 of the unit. Values outside it fall into the end buckets."""
+
+LAST = PER_DECADE * DECADES
+"""Index of the end bucket."""
+
+
+ENDS = [math.pow(10.0, index / PER_DECADE) for index in range(LAST)]
+"""The upper end of each bucket except the last, which is open."""
+
+
+class Histogram:
+    """Percentiles of an endless stream in fixed memory, by logarithmic buckets."""
+
+    def __init__(self) -> None:
+        self._buckets = [0] * (LAST + 1)
+        self._count = 0
+        self._max = 0.0
+
+    def add(self, value: float) -> None:
+        """Count a measurement."""
+        self._buckets[bisect_left(ENDS, value)] += 1
+        self._count += 1
+        if value > self._max:
+            self._max = value
+
+    def merge(self, other: Histogram) -> None:
+        """Add all measurements of another histogram."""
+        if other._count == 0:
+            return
+        self._buckets[:] = map(add, self._buckets, other._buckets)
+        self._count += other._count
+        self._max = max(self._max, other._max)
+
+    def spread(self) -> Spread:
+        """Return median, 99th percentile and maximum.
+
+        A percentile is the upper end of its bucket.
+        """
+        return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)
+
+    def _percentile(self, share: float) -> float:
+        if self._count == 0:
+            return 0.0
+        rank = max(1.0, share * self._count)
+        index = bisect_left(list(accumulate(self._buckets)), rank)
+        return min(math.pow(10.0, index / PER_DECADE), self._max)
+
+
+Name = Literal[
+    "period_lateness",
+    "step_time",
+    "command_age",
+    "command_to_wire",
+    "feedback_to_bus",
+    "mcu_round_trip",
+]
+"""The figures, in the order in which a command passes them.
+
+- period_lateness: from the time at which a period was due to its step; of several missed periods,
+  the first one counts
+- step_time: from the start of a step to the end of its work
+- command_age: from a command's arrival to each line that carries it
+- command_to_wire: from a command's arrival to the moment when the port took the first line that
+  carries it; a command that first waited for its source's turn is not counted
+- feedback_to_bus: from the read of a feedback line's end to its messages in the queue of the bus;
+  before the read the line may have waited in the kernel while the loop stood still
+- mcu_round_trip: from a line to the end of its answer, only for checked replies, because only these
+  tell which of the pipelined lines they answer
+"""
+
+NAMES: tuple[Name, ...] = get_args(Name)
+
+SLOT_NS = 10 * NS_PER_S
+"""Length of a slot of the last minute. The newest slot replaces the oldest."""
+
+SLOTS = 6
+
+FRESH_NS = NS_PER_S
+"""Longest age of the cached values. Adding up a minute costs more than a control step."""
+
+
+class _Figure:
+    def __init__(self) -> None:
+        self._past = Histogram()
+        """All measurements older than the last minute."""
+        self._slots = [Histogram() for _ in range(SLOTS)]
+        self._number = -SLOTS
+
+    def add(self, now_ns: int, value: float) -> None:
+        number = now_ns // SLOT_NS
+        if number != self._number:
+            self._advance(number)
+        self._slots[number % SLOTS].add(value)
+
+    def measured(self, now_ns: int) -> Measured:
+        self._advance(now_ns // SLOT_NS)
+        minute = Histogram()
+        for slot in self._slots:
+            minute.merge(slot)
+        last_minute = minute.spread()
+        minute.merge(self._past)
+        return Measured(minute.spread(), last_minute)
+
+    def _advance(self, number: int) -> None:
+        for new in range(max(self._number, number - SLOTS) + 1, number + 1):
+            self._past.merge(self._slots[new % SLOTS])
+            self._slots[new % SLOTS] = Histogram()
+        self._number = number
+
+
+class LastMinute:
+    """A counter of events in the last minute, in the same slots."""
+
+    def __init__(self) -> None:
+        self._slots: deque[tuple[int, int]] = deque(maxlen=SLOTS)
+
+    def add(self, now_ns: int, count: int) -> None:
+        """Count `count` events at monotonic `now_ns`."""
+        number, before = now_ns // SLOT_NS, 0
+        if self._slots and self._slots[-1][0] == number:
+            _, before = self._slots.pop()
+        self._slots.append((number, before + count))
+
+    def count(self, now_ns: int) -> int:
+        """Return the number of events in the minute before monotonic `now_ns`."""
+        oldest = now_ns // SLOT_NS - SLOTS
+        return sum(count for number, count in self._slots if number > oldest)
+
+
+class Figures:
+    """All figures of one daemon."""
+
+    def __init__(self) -> None:
+        self._figures = {name: _Figure() for name in NAMES}
+        self._cached: dict[str, Measured] = {}
+        self._cached_ns = -FRESH_NS
+
+    def add(self, name: Name, now_ns: int, duration_ns: int) -> None:
+        """Record a duration that was measured at monotonic `now_ns`."""
+        self._figures[name].add(now_ns, duration_ns / 1000)
+
+    def measured(self, now_ns: int) -> dict[str, Measured]:
+        """Return all figures by name, at most a second old."""
+        if now_ns - self._cached_ns >= FRESH_NS:
+            self._cached_ns = now_ns
+            self._cached = {name: figure.measured(now_ns) for name, figure in self._figures.items()}
+        return self._cached
+
+
+class Stopwatch:
+    """The measurements of the control loop."""
+
+    def __init__(self) -> None:
+        self._figures = Figures()
+        self._missed = LastMinute()
+
+    def measured(self, now_ns: int) -> dict[str, Measured]:
+        """Return all figures by name."""
+        return self._figures.measured(now_ns)
+
+    def missed(self, now_ns: int) -> int:
+        """Return the number of periods in the last minute that had no step."""
+        return self._missed.count(now_ns)
+
+    def period(self, now_ns: int, late_ns: int, missed: int = 0) -> None:
+        """Record the start of a period's step, `late_ns` late.
+
+        `missed` periods before it had no step.
+        """
+        self._figures.add("period_lateness", now_ns, late_ns)
+        if missed:
+            self._missed.add(now_ns, missed)
+
+    def line(self, outputs: Outputs, sent_ns: int, before_ns: int) -> None:
+        """Record a line that left, after one at `before_ns`, by the age of its command."""
+        command_ns = outputs.command_ns
+        if command_ns is None or outputs.mode != "driving":
+            return
+        self._figures.add("command_age", sent_ns, sent_ns - command_ns)
+        if command_ns > before_ns:  # otherwise it waited for its source's turn, not for the wire
+            self._figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
+
+    def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
+        """Record a feedback line.
+
+        `told_ns` is when its messages were queued, None if nobody listens.
+        """
+        at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
+        if asked_ns is not None:
+            self._figures.add("mcu_round_trip", at_ns, at_ns - asked_ns)
+        if told_ns is not None:
+            self._figures.add("feedback_to_bus", told_ns, told_ns - at_ns)
+
+    def step(self, began_ns: int, ended_ns: int) -> None:
+        """Record the start and the end of a step."""
+        self._figures.add("step_time", began_ns, ended_ns - began_ns)

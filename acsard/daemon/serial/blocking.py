@@ -1,0 +1,124 @@
+"""The serial port of `acsard mcu check`: locked and blocking, with a bound on every wait."""
+
+from __future__ import annotations
+
+import os
+import select
+import termios
+import time
+
+import serial
+
+from acsard.checkup.findings import WireLostError
+from acsard.core.values import NS_PER_S
+from acsard.daemon.serial.device import close, draining, open_raw, refusal
+from acsard.host import clock
+from acsard.host.processes import Holder, master_of, waited_ns
+
+SEND_S = 0.5
+"""Seconds after which a driver that takes no byte has hung. A line takes 50 ms on the slowest
+wire."""
+
+DRAIN_S = 0.5
+"""Seconds that the last stop lines may take to leave."""
+
+CLOSE_S = 1.0
+"""Seconds to wait for a close. Some drivers drain for 30 s."""
+
+
+class BlockingPort:
+    """One serial device that implements `checkup.board.Wire`. The first `open` opens it."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._device: serial.Serial | None = None
+        self._program: Holder | None = None
+        """The program at the other end if the device is a pty, else None."""
+        self._waited_ns = 0
+
+    def open(self, baud_rate: int) -> None:
+        """Open and lock the port, or change the baud rate of the open port."""
+        if self._device is None:
+            try:
+                self._device = open_raw(self._path, baud_rate)
+            except OSError as error:
+                raise refusal(self._path, error) from error
+            self._program = master_of(self._path)
+            self.late_ns()
+            return
+        fd = self._device.fileno()
+        try:
+            attributes = termios.tcgetattr(fd)
+            attributes[4] = attributes[5] = getattr(termios, f"B{baud_rate}")
+            termios.tcsetattr(fd, termios.TCSADRAIN, attributes)
+            termios.tcflush(fd, termios.TCIFLUSH)
+        except (OSError, termios.error) as error:
+            raise WireLostError(f"{self._path}: {error}") from error
+
+    def close(self) -> None:
+        """Drain the last bytes, unlock and close. No driver can block this for long."""
+        device, self._device = self._device, None
+        if device is None:
+            return
+        for pause in draining(device.fileno(), clock.mono_ns() + int(DRAIN_S * NS_PER_S)):
+            time.sleep(pause)
+        close(device, wait_s=CLOSE_S)
+        device.close()
+
+    def now_ns(self) -> int:
+        """Return the monotonic clock, ns."""
+        return clock.mono_ns()
+
+    def late_ns(self) -> int:
+        """Return how long the program at the other end of a pty waited for a processor, ns.
+
+        The time counts from the last call. It is 0 for a real device.
+        """
+        if self._program is None:
+            return 0
+        before_ns, self._waited_ns = self._waited_ns, waited_ns(self._program.pid)
+        return max(0, self._waited_ns - before_ns)
+
+    def send(self, data: bytes) -> None:
+        """Write all of `data` to the driver.
+
+        Raise `WireLostError` if the driver stops taking bytes.
+        """
+        fd = self._fileno()
+        deadline_ns = clock.mono_ns() + int(SEND_S * NS_PER_S)
+        while data:
+            try:
+                data = data[os.write(fd, data) :]
+            except BlockingIOError:
+                left_s = (deadline_ns - clock.mono_ns()) / NS_PER_S
+                if left_s <= 0:
+                    raise WireLostError(f"{self._path} takes no more bytes") from None
+                select.select([], [fd], [], left_s)
+            except OSError as error:
+                raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
+
+    def listen(self, until_ns: int) -> list[tuple[int, bytes]]:
+        """Return the data received until `until_ns`, each piece with the time of its read."""
+        fd = self._fileno()
+        pieces: list[tuple[int, bytes]] = []
+        while True:
+            left_s = max(0.0, (until_ns - clock.mono_ns()) / NS_PER_S)
+            ready, _, _ = select.select([fd], [], [], left_s)
+            if not ready:
+                return pieces
+            try:
+                data = os.read(fd, 4096)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
+            if not data:
+                raise WireLostError(f"{self._path} was lost: unplugged")
+            pieces.append((clock.mono_ns(), data))
+            if left_s == 0.0:
+                return pieces
+
+    def _fileno(self) -> int:
+        if self._device is None:
+            raise WireLostError(f"{self._path} is closed")
+        return int(self._device.fileno())

@@ -1,0 +1,266 @@
+"""The daemon's serial port: opens it, reads it, reopens it, never queues a line, ends with STOP.
+
+pyserial-asyncio reads. The daemon writes lines to the descriptor directly, because that transport
+queues the bytes that the kernel does not take, and the daemon must not hold a line back (invariant
+3). Opening runs in a thread with a time limit, because drivers may block.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import itertools
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from types import TracebackType
+
+import serial
+import serial_asyncio
+
+from acsard.core.link.gate import Gate, Offered
+from acsard.core.values import Event, Instant, Received
+from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
+from acsard.host import clock
+from acsard.host.clock import Asleep
+from acsard.host.errors import InUseError, MendableError, NotPermittedError
+from acsard.host.threads import NoThreadError, in_thread
+
+OPEN_TIMEOUT_S = 5.0
+"""Seconds after which an open has hung. Until it ends, only a different device may be opened."""
+
+BACK_OFF_S = (0.05, 0.1, 0.2)
+"""Seconds between attempts to reopen. The last one repeats. They are short because udev sets groups
+late."""
+
+PERMISSION_PATIENCE_S = 2.0
+"""Seconds that a start waits for udev to grant access before it gives up."""
+
+HUNG = "the driver did not answer"
+
+FAREWELL_S = 0.15
+"""Seconds for the last STOP: twice a line's time on the slowest wire, and a margin."""
+
+
+AT_ONCE = 4096
+"""Bytes per read: as many as a driver buffers."""
+
+
+class SerialPort:
+    """The port to the board, as a context manager.
+
+    Entering opens the port, `keep_open` reopens it for ever, and leaving sends STOP.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        baud_rate: int,
+        stop: bytes,
+        period_ns: int,
+        wake: Callable[[], None],
+        log: Callable[[Event], None],
+        asleep: Asleep | None = None,
+    ) -> None:
+        self.is_open = False
+        self._asleep = asleep or Asleep()
+        self.opened = 0
+        self._path, self._baud_rate, self._stop = path, baud_rate, stop
+        self._period_ns = period_ns
+        self._wake, self._log = wake, log
+        self._received: list[Received] = []
+        self._gate = Gate(baud_rate, stop, period_ns)
+        self._transport: serial_asyncio.SerialTransport | None = None
+        self._lost = asyncio.Event()
+        self._fd = -1
+        self._opening = set[tuple[int, int]]()
+        """The devices that a thread is opening, as (st_dev, st_ino) of the path at that time."""
+        self.trouble = ""
+        """The reason why the port is closed, "" while it is open."""
+
+    # The control loop calls the methods below.
+
+    @property
+    def sent_ns(self) -> int:
+        """Monotonic time at which the kernel took the last line."""
+        return self._gate.sent_ns
+
+    def take(self, late: Instant | None = None) -> tuple[Received, ...]:
+        """Return the bytes received since the last call.
+
+        A step that comes late passes its time as `late`: then waiting bytes are read too. Otherwise
+        the step may run before the reader and take its delay for silence of the board.
+
+        After a suspend of the computer the port is reopened even if the device did not notice.
+        Everything before the suspend then belongs to another session, and every commander must
+        return to neutral.
+        """
+        if self._asleep.was():
+            self._leave(OSError(errno.EIO, "this computer was suspended"))
+        if late is not None and self._transport is not None:
+            # If the port is lost, the reader notices and reports it.
+            with suppress(serial.SerialException):
+                data = self._transport.serial.read(AT_ONCE)
+                self._received += [Received(late, data)] if data else []
+        if not self._received:
+            return ()
+        got = tuple(self._received)
+        self._received.clear()
+        return got
+
+    def offer(self, line: bytes, now: Instant) -> Offered:
+        """Send the line now or report that it did not go. The line is never kept for later."""
+        if not self.is_open:
+            return "down"
+        # Ask before the time is read, because asking the driver takes time.
+        waiting = unsent(self._fd)
+        data = self._gate.prepare(line, now.mono_ns, clock.mono_ns(), waiting)
+        if data is None:
+            return "superseded"
+        try:
+            taken = os.write(self._fd, data)
+        except BlockingIOError:
+            taken = 0
+        except OSError as error:
+            self._leave(error)
+            return "down"
+        # The wire is busy from the moment of the write, not from the start of the step.
+        return self._gate.took(line, data, taken, clock.mono_ns())
+
+    # Opening and reopening.
+
+    async def __aenter__(self) -> SerialPort:
+        deadline_ns = clock.now().mono_ns + int(PERMISSION_PATIENCE_S * 1e9)
+        while True:
+            try:
+                await self._open()
+                return self
+            except OSError as error:
+                refused = refusal(self._path, error)
+            denied = isinstance(refused, NotPermittedError)
+            if isinstance(refused, InUseError) or (denied and clock.mono_ns() > deadline_ns):
+                raise refused
+            if not denied:
+                self._complain(refused)
+                return self
+            await asyncio.sleep(BACK_OFF_S[-1])
+
+    async def keep_open(self) -> None:
+        """Reopen the port whenever it is lost, for ever."""
+        while True:
+            if self.is_open:
+                await self._lost.wait()
+            for attempt in itertools.count():
+                try:
+                    await self._open()
+                    break
+                except OSError as error:
+                    self._complain(refusal(self._path, error))
+                    await asyncio.sleep(BACK_OFF_S[min(attempt, len(BACK_OFF_S) - 1)])
+
+    async def _open(self) -> None:
+        path, baud_rate, opening = self._path, self._baud_rate, self._opening
+        at = os.stat(path)
+        which = at.st_dev, at.st_ino
+        if which in opening:
+            raise OSError(errno.EIO, HUNG)
+        opening.add(which)
+
+        def open_port() -> serial.Serial:
+            try:
+                return open_raw(path, baud_rate)
+            finally:
+                opening.discard(which)
+
+        try:
+            device = await in_thread(open_port, OPEN_TIMEOUT_S, late=close)
+        except NoThreadError as error:
+            opening.discard(which)
+            raise OSError(errno.EIO, str(error)) from None
+        except TimeoutError:
+            raise OSError(errno.EIO, HUNG) from None
+        self._lost.clear()
+        self._fd = device.fileno()
+        self._gate = Gate(baud_rate, self._stop, self._period_ns)
+        self._received.clear()
+        loop = asyncio.get_running_loop()
+        try:
+            self._transport, _ = await serial_asyncio.connection_for_serial(
+                loop, lambda: _Reader(self), device
+            )
+        except OSError:  # setting up the port again may fail
+            close(device, lost=True)
+            raise
+        self.is_open, self.trouble = True, ""
+        self.opened += 1
+        self._log(Event("port_open", f"{path} at {baud_rate} baud"))
+
+    def _complain(self, refused: MendableError) -> None:
+        """Log once why the port cannot be opened, not at every attempt."""
+        text = f"{refused}; retrying"
+        if text != self.trouble:
+            self.trouble = text
+            self._log(Event("port_waiting", text, "warning"))
+
+    # The reader calls the methods below.
+
+    def _data(self, data: bytes) -> None:
+        self._received.append(Received(clock.now(), data))
+        self._wake()
+
+    def _leave(self, error: BaseException | None) -> None:
+        """Close the port. Bytes that the kernel still holds must not go out later."""
+        if not self.is_open:
+            return
+        self.is_open = False
+        transport, self._transport = self._transport, None
+        if transport is not None and transport.serial is not None:
+            # The transport would drain and close the device on the event loop, so it gets /dev/null
+            # instead.
+            transport.pause_reading()
+            close(transport.serial, lost=error is not None)
+            transport.abort()
+        if error is not None:
+            self.trouble = f"the serial port {self._path} was lost ({error}); reopening it"
+            self._log(Event("port_lost", self.trouble, "warning"))
+        self._lost.set()
+        self._wake()
+
+    # Closing.
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Send STOP as the last line, whatever ended the block. It takes at most `FAREWELL_S`."""
+        deadline_ns = clock.now().mono_ns + int(FAREWELL_S * 1e9)
+        while self.is_open and self.offer(self._stop, clock.now()) == "superseded":
+            if clock.now().mono_ns > deadline_ns:
+                break
+            await asyncio.sleep(0.001)
+        for pause in draining(self._fd, deadline_ns) if self.is_open else ():
+            await asyncio.sleep(pause)
+        self._leave(None)
+
+
+class _Reader(asyncio.Protocol):
+    """The protocol that passes bytes and losses from the transport to its port."""
+
+    def __init__(self, port: SerialPort) -> None:
+        self._port = port
+        self._transport: asyncio.BaseTransport | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        self._port._data(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        # The port may have been reopened meanwhile. The end of an old transport does not concern
+        # it.
+        if self._port._transport is self._transport:
+            self._port._transport = None
+            self._port._leave(exc or OSError(errno.EIO, "closed"))

@@ -1,0 +1,194 @@
+"""The simulated board in real time behind a pty, so that the real serial code runs.
+
+A pty carries any baud rate. Here a host that sets another rate than the board's gets garbage, and
+so does the board, as on a real wire. `PtyEnd` is the board's end of any serial line that is a pty.
+Beside the daemon, `Simulated` also publishes the board's true state on the bus; the control loop
+reads the device like any other and knows nothing about the rest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import pty
+import termios
+import tty
+from types import TracebackType
+from typing import get_args
+
+from acsard.core.config.settings import Baud, Config
+from acsard.core.incoming.bus_interface import Bus
+from acsard.core.messages.schema import Message
+from acsard.core.messages.topics import IMU
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.garble import garbled
+from acsard.core.simulator.told import true_pose, turn_rate
+from acsard.core.simulator.watched import Sight, WatchedMcu
+from acsard.core.values import NS_PER_S
+from acsard.daemon.serial.device import unlock
+from acsard.host import clock
+from acsard.host.timerfd import TimerFd
+
+
+class PtyEnd:
+    """The pty's end of the board.
+
+    It never blocks, and `fileno` is readable when the host has written.
+    """
+
+    def __init__(self) -> None:
+        self._master, self.slave = pty.openpty()
+        # Keep the slave open, or the master would see a hang-up whenever no host is connected.
+        tty.setraw(self.slave)
+        os.set_blocking(self._master, False)
+        self.path = os.ttyname(self.slave)
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return self._master
+
+    def read(self) -> bytes:
+        """Return the bytes that the host has written, b"" if none."""
+        try:
+            data = os.read(self._master, 4096)
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EIO):
+                return b""
+            raise
+        # A killed host leaves its exclusive mark on the pty. A real port would not keep it.
+        unlock(self.slave)
+        return data
+
+    def write(self, data: bytes) -> bool:
+        """Write to the host; return False if nobody reads. A real wire would lose the bytes too."""
+        try:
+            os.write(self._master, data)
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close both ends, as if the device were unplugged."""
+        os.close(self._master)
+        os.close(self.slave)
+
+
+_RATES: dict[int, int] = {getattr(termios, f"B{rate}"): rate for rate in get_args(Baud)}
+
+
+class SimPty:
+    """The simulated board behind a pty. Entering it creates a serial device at `path`."""
+
+    def __init__(self, mcu: FakeMcu) -> None:
+        self.mcu = mcu
+        self.path = ""
+        self._timer = TimerFd()
+
+    def __enter__(self) -> SimPty:
+        self._end = PtyEnd()
+        self.path = self._end.path
+        self._set_speed()
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._end.fileno(), self._read)
+        loop.add_reader(self._timer.fileno(), self._advance)
+        self._arm()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._end.fileno())
+        loop.remove_reader(self._timer.fileno())
+        self._timer.close()
+        self._end.close()
+
+    def _read(self) -> None:
+        data = self._end.read()
+        if data:
+            now_ns = clock.now().mono_ns
+            self.mcu.receive(now_ns, garbled(data, self._speed(), self.mcu.baud_rate))
+            self._arm()
+
+    def _set_speed(self) -> None:
+        """Set the board's baud rate, for a host that sets none."""
+        attributes = termios.tcgetattr(self._end.slave)
+        attributes[4] = attributes[5] = getattr(termios, f"B{self.mcu.baud_rate}")
+        termios.tcsetattr(self._end.slave, termios.TCSANOW, attributes)
+
+    def _speed(self) -> int:
+        """Return the host's baud rate, or the board's if the host's is not one of a board."""
+        return _RATES.get(termios.tcgetattr(self._end.slave)[5], self.mcu.baud_rate)
+
+    def _advance(self) -> None:
+        self._timer.expirations()
+        data = self.mcu.advance(clock.now().mono_ns)
+        if data:
+            self._end.write(garbled(data, self.mcu.baud_rate, self._speed()))
+        self._arm()
+
+    def _arm(self) -> None:
+        due_ns = self.mcu.next_ns()
+        if due_ns is not None:
+            self._timer.set(due_ns)
+
+
+POSE = "sim/pose"
+
+
+class Simulated:
+    """The simulator.
+
+    Entering it creates the device at `path`; `tell` sets the bus to publish on.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._pty = SimPty(WatchedMcu(config, clock.mono_ns(), self._see))
+        self._frame, self._noise = config.odometry.base_frame, config.sim.gyro_noise
+        self._gyro = config.odometry.gyro
+        self._delay_ns = int(config.sim.gyro_delay * NS_PER_S)
+        self._bus: Bus | None = None
+        self._last: tuple[Sight, int] | None = None
+
+    @property
+    def path(self) -> str:
+        """The path of the serial device."""
+        return self._pty.path
+
+    def tell(self, bus: Bus) -> None:
+        """Publish on this bus from now on."""
+        self._bus = bus
+
+    def current(self, key: str) -> Message | None:
+        """Return the present value of a key that the simulator publishes, else None."""
+        return true_pose(*self._last) if key == POSE and self._last is not None else None
+
+    def __enter__(self) -> Simulated:
+        self._pty.__enter__()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._pty.__exit__(kind, error, trace)
+
+    def _see(self, sight: Sight) -> None:
+        now, bus = clock.now(), self._bus
+        wall_ns = now.wall_ns - (now.mono_ns - sight.at_ns)
+        self._last = sight, wall_ns
+        if bus is None:
+            return
+        if POSE in bus.wanted:
+            bus.publish(POSE, true_pose(sight, wall_ns))
+        # The daemon receives its own sample from the bus, like one of a gyro on a real robot.
+        if self._gyro:
+            measured_ns = wall_ns - self._delay_ns
+            bus.publish(IMU, turn_rate(sight, self._frame, self._noise, measured_ns))
+        bus.flush()

@@ -1,0 +1,199 @@
+"""Runs a control step for each of these events, directly where the event loop learns of it.
+
+- period: a period has ended. Missed periods are counted and never run in a burst.
+- bytes: the port has read data or was lost.
+- retry: a line with a new command may go now (`pacing.py`).
+- command: the bus has a sample that may be a command, and its line could go at once (`pacing.py`).
+  Otherwise the next period takes it.
+- stop: the bus has a stop. It gets a step whatever the pace, but a flood of stops does not get a
+  step for each.
+- signal: the shutdown begins.
+
+Waking a task instead would cost another round of the event loop each time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from msgspec import Struct
+
+from acsard.daemon.pacing import Period
+from acsard.host.timerfd import TimerFd
+
+
+class _Timer:
+    """A kernel timer that the event loop waits on while the context is entered."""
+
+    def __init__(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
+        self._timer = TimerFd()
+
+    def __enter__(self) -> Self:
+        asyncio.get_running_loop().add_reader(self._timer.fileno(), self._expire)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        asyncio.get_running_loop().remove_reader(self._timer.fileno())
+        self._timer.close()
+
+    def _expire(self) -> None:
+        # Without an expiration the timer was set again after it went off.
+        if self._timer.expirations():
+            self._ring()
+
+    def _ring(self) -> None:
+        self._wake()
+
+
+class Alarm(_Timer):
+    """A timer that calls `wake` once, at a time that may be set again and again."""
+
+    def __init__(self, wake: Callable[[], None]) -> None:
+        super().__init__(wake)
+        self._at_ns: int | None = None
+
+    def set(self, at_ns: int | None) -> None:
+        """Wake at monotonic `at_ns`.
+
+        With None nothing is set, but an earlier setting still goes off.
+        """
+        if at_ns is not None and at_ns != self._at_ns:
+            self._timer.set(at_ns)
+        self._at_ns = at_ns
+
+    def _ring(self) -> None:
+        self._at_ns = None  # it may have gone off early and be set again for the same time
+        super()._ring()
+
+
+class Ticker(_Timer):
+    """A timer that calls `wake` every period while entered.
+
+    `take` tells which periods have ended.
+    """
+
+    def __init__(self, period_ns: int, wake: Callable[[], None]) -> None:
+        super().__init__(wake)
+        self._period_ns = period_ns
+        self._rang = False
+        self._due_ns = 0
+
+    def start(self, now_ns: int) -> None:
+        """Start; the first period ends one period from now."""
+        self._due_ns = now_ns + self._period_ns
+        self._timer.set(self._due_ns)
+
+    def take(self, now_ns: int) -> Period:
+        """Return the periods that have ended by `now_ns` since the last call."""
+        # This uses the daemon's clock. While NTP slews the timer's clock, the timer goes off up to
+        # a tenth of a period early.
+        early_ns = self._period_ns // 10 if self._rang else 0
+        expired = max(0, (now_ns - self._due_ns + early_ns) // self._period_ns + 1)
+        due_ns = self._due_ns
+        self._due_ns += expired * self._period_ns
+        if expired or self._rang:
+            self._timer.set(self._due_ns)
+        self._rang = False
+        return Period(expired, due_ns)
+
+    def _ring(self) -> None:
+        self._rang = True
+        super()._ring()
+
+
+class Next(Struct, frozen=True):
+    """The events to wait for after a step, besides period, bytes, stop and signal."""
+
+    listens: bool
+    """Whether a command is worth a step of its own."""
+    retry_ns: int | None
+    """Monotonic time of the next step for a waiting command, None if none waits."""
+    period_ended: bool = True
+    """Whether a stop may cause a step again."""
+
+
+class Wakeup:
+    """The wake-up of the control loop.
+
+    A call runs a step; a call during a step runs one afterwards.
+    """
+
+    def __init__(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._step: Callable[[], Next | None] | None = None
+        self._over: asyncio.Future[None] | None = None
+        self._alarm = Alarm(self)
+        self._stepping = self._again = False
+        self._listens = self._heard = self._stop_told = False
+
+    def __call__(self) -> None:
+        if self._stepping:
+            self._again = True
+        elif self._step is not None and self._over is not None and not self._over.done():
+            self._run(self._step, self._over)
+
+    def command(self) -> None:
+        """Report a possible command, from any thread.
+
+        It wakes the loop once until a step listens again.
+        """
+        self._heard = True
+        if self._listens:
+            self._listens = False
+            self._from_thread()
+
+    def stop(self) -> None:
+        """Report a stop, from any thread."""
+        if not self._stop_told:
+            self._stop_told = True
+            self._from_thread()
+
+    def _from_thread(self) -> None:
+        try:
+            self._loop.call_soon_threadsafe(self)
+        except RuntimeError:
+            pass  # the event loop has closed, so nothing is left to wake
+
+    async def run(self, step: Callable[[], Next | None]) -> None:
+        """Run `step` on every event until it returns None; raise the exceptions that it raises."""
+        self._over = self._loop.create_future()
+        with self._alarm:
+            self._step = step
+            try:
+                await self._over
+            finally:
+                self._step = None
+
+    def _run(self, step: Callable[[], Next | None], over: asyncio.Future[None]) -> None:
+        self._stepping, self._again, self._heard = True, False, False
+        try:
+            then = step()
+            if then is None:
+                over.set_result(None)
+            else:
+                self._arm(then)
+        except BaseException as error:  # noqa: BLE001
+            # The event loop would log the exception and go on, but a bug in a step must end the
+            # process.
+            over.set_exception(error)
+        finally:
+            self._stepping = False
+        if self._again:
+            self._loop.call_soon(self)
+
+    def _arm(self, then: Next) -> None:
+        self._alarm.set(then.retry_ns)
+        self._listens = then.listens
+        if then.listens or then.period_ended:
+            self._stop_told = False
+        if then.listens and self._heard:  # a command came during the step, perhaps too late for it
+            self._listens, self._again = False, True

@@ -1,0 +1,93 @@
+"""Writes the `metadata.yaml` beside an MCAP file, which makes a ROS bag of the directory.
+
+The metadata has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
+reads. The file itself holds the same QoS text for each channel, where `ros2 bag play FILE` finds
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+from msgspec import Struct
+
+from acsard.core.ros.names import Qos
+
+VERSION = 5
+
+_RELIABLE, _BEST_EFFORT = 1, 2
+_TRANSIENT_LOCAL, _VOLATILE = 1, 2
+
+_ENDLESS = "{sec: 9223372036, nsec: 854775807}"
+
+
+class Topic(Struct, frozen=True):
+    """Topic of the bag, with its ROS type, its QoS and its number of messages."""
+
+    name: str
+    type: str
+    qos: Qos
+    count: int
+
+
+def offered(qos: Qos) -> str:
+    """Return the QoS profile as a YAML list with one entry."""
+    return "\n".join(
+        [
+            "- history: 1",
+            f"  depth: {qos.depth}",
+            f"  reliability: {_BEST_EFFORT if qos.best_effort else _RELIABLE}",
+            f"  durability: {_TRANSIENT_LOCAL if qos.transient else _VOLATILE}",
+            f"  deadline: {_ENDLESS}",
+            f"  lifespan: {_ENDLESS}",
+            "  liveliness: 1",
+            f"  liveliness_lease_duration: {_ENDLESS}",
+            "  avoid_ros_namespace_conventions: false",
+            "",
+        ]
+    )
+
+
+def metadata(file: str, topics: Sequence[Topic], first_ns: int, last_ns: int) -> str:
+    """Return the `metadata.yaml` of a bag that consists of this one MCAP file.
+
+    `first_ns` and `last_ns` are the wall-clock times of the first and the last message.
+    """
+    count = sum(topic.count for topic in topics)
+    begins = f"nanoseconds_since_epoch: {first_ns}"
+    lasts = f"nanoseconds: {last_ns - first_ns}"
+    lines = [
+        "rosbag2_bagfile_information:",
+        f"  version: {VERSION}",
+        "  storage_identifier: mcap",
+        f"  duration: {{{lasts}}}",
+        f"  starting_time: {{{begins}}}",
+        f"  message_count: {count}",
+        "  topics_with_message_count:",
+    ]
+    for topic in topics:
+        lines += [
+            "    - topic_metadata:",
+            f"        name: {_quoted(topic.name)}",
+            f"        type: {_quoted(topic.type)}",
+            "        serialization_format: cdr",
+            f"        offered_qos_profiles: {_quoted(offered(topic.qos))}",
+            f"      message_count: {topic.count}",
+        ]
+    lines += [
+        '  compression_format: ""',
+        '  compression_mode: ""',
+        f"  relative_file_paths: [{_quoted(file)}]",
+        "  files:",
+        f"    - path: {_quoted(file)}",
+        f"      starting_time: {{{begins}}}",
+        f"      duration: {{{lasts}}}",
+        f"      message_count: {count}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """Quote a YAML string: a name from a configuration or a path may contain YAML syntax."""
+    return msgspec.json.encode(text).decode()

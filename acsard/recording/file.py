@@ -1,0 +1,383 @@
+"""One recording as an MCAP file: written second by second, and readable if cut off or damaged.
+
+A file has four channels:
+- `steps`: batches of steps, as `rows.py` encodes them.
+- `events`: one event per message, in JSON.
+- `state`: a robot, as `state.py` writes it. It comes first if the file begins after the daemon.
+- `unfinished`: the inputs of the step in which the daemon failed.
+
+A metadata record says which robot and which version recorded it, and an attachment holds its
+`acsard.toml`. The messages are in chunks of about ten seconds, which grow as `chunks.py` says. A
+file that was cut off has no end. Everything that was synced can still be read, and `rewrite` makes
+a finished file of it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+from mcap.data_stream import RecordBuilder
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from msgspec import Struct
+
+from acsard.core.values import NS_PER_S
+from acsard.host.errors import RecordingError
+from acsard.recording.chunks import GROWING, Growing, Message
+from acsard.recording.closing import END, Closing, Ns, fields
+from acsard.recording.rows import FORMAT, first_of
+from acsard.recording.steps import UnfinishedError, unfinished
+from acsard.recording.story import NEWS, Told, summary
+from acsard.recording.walk import MAGIC, walk
+
+CHUNK_NS = 10 * NS_PER_S
+"""Longest time that a chunk covers. More saves little space, and damage costs more."""
+
+CHUNK_BYTES = 1 << 20
+"""Uncompressed size at which a chunk ends. Ten seconds of driving have 160 000 bytes."""
+
+MODE = 0o640
+"""Mode of a recording: the service's group may read it."""
+
+Topic = Literal["steps", "events", "state", "unfinished"]
+
+CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
+"""Channels in the order of their numbers, from 1. The records that define the channels may be
+damaged, so the reader relies on this order.
+"""
+
+NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
+
+EVENTS_SCHEMA = 1
+"""Number of the schema of the events. The other channels have none."""
+
+
+class About(Struct, frozen=True):
+    """Metadata of a recording: which robot, program and configuration made it."""
+
+    robot: str
+    version: str
+    """Version of acsard."""
+    python: str
+    mono_ns: Ns
+    wall_ns: Ns
+    """Wall-clock time at which the recording began, ns since 1970; `mono_ns` is the same instant
+    by the monotonic clock.
+    """
+    config: str = ""
+    """The `acsard.toml` in force, with every key."""
+    format: str = FORMAT
+    started_ns: Ns = 0
+    """Wall-clock time of the daemon's start, ns since 1970, perhaps hours before; 0 if unknown."""
+
+
+class Gist:
+    """Summary of a recording, collected from its messages."""
+
+    def __init__(self, about: About) -> None:
+        self._wall_ns = self._last_ns = about.wall_ns
+        self._news: list[Told] = []
+        self._starts = False
+
+    def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
+        """Take a message of any channel. The content of an event comes through `event`."""
+        self._last_ns = max(self._last_ns, wall_ns)
+        if topic == "steps":
+            self._starts = self._starts or first_of(data) == 0
+        elif topic == "unfinished":
+            with suppress(UnfinishedError):
+                self._starts = self._starts or unfinished(data).number == 0
+
+    def event(self, told: Told) -> None:
+        """Take an event for the summary."""
+        if told.name in NEWS:
+            self._news.append(told)
+
+    def closing(self, cut: str = "", why: str = "") -> Closing:
+        """Return the closing of the file.
+
+        `cut` is a key of `CUTS` and `why` its explanation if the daemon did not end in the ordinary
+        way.
+        """
+        said = summary(self._news, self._starts)
+        return Closing(self._wall_ns, self._last_ns, said, cut, why)
+
+
+class Writing:
+    """A recording that is being written.
+
+    Every method may raise `OSError`, and after that the object must not be written to.
+    """
+
+    def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
+        self.path, self._mode = path, mode
+        self._gist = Gist(about)
+        self._indexes: list[McapRecord] = []
+        self._totals = Statistics(
+            attachment_count=1,
+            channel_count=len(CHANNELS),
+            channel_message_counts=dict.fromkeys(NUMBERS.values(), 0),
+            chunk_count=0,
+            message_count=0,
+            message_start_time=0,
+            message_end_time=0,
+            metadata_count=2,
+            schema_count=1,
+        )
+        self._chunk: Growing | None = None
+        self._chunk_at: int | None = None
+        """Offset of the chunk's head in the file; None if nothing of it is written yet."""
+        self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
+        try:
+            self._open(about)
+        except OSError:
+            self.close()
+            raise
+
+    def _open(self, about: About) -> None:
+        # The umask may have removed bits of the mode.
+        os.fchmod(self._file.fileno(), self._mode)
+        self._file.write(MAGIC)
+        self._write(Header("acsard", f"acsard {about.version}"))
+        meta = msgspec.to_builtins(about)
+        del meta["config"]
+        self._add_metadata("acsard", {key: str(value) for key, value in meta.items()})
+        self._add_attachment("acsard.toml", about.wall_ns, about.config.encode())
+        for record in _definitions():
+            self._write(record)
+        self.flush()
+
+    def _write(self, record: McapRecord) -> tuple[int, int]:
+        """Write a record, and return its offset and its length."""
+        builder = RecordBuilder()
+        record.write(builder)
+        at = self._file.tell()
+        return at, self._file.write(builder.end())
+
+    def _add_metadata(self, name: str, content: dict[str, str]) -> None:
+        at, length = self._write(Metadata(name, content))
+        self._indexes.append(MetadataIndex(at, length, name))
+
+    def _add_attachment(self, name: str, wall_ns: int, data: bytes) -> None:
+        kind = "text/plain"
+        at, length = self._write(Attachment(wall_ns, wall_ns, name, kind, data))
+        self._indexes.append(AttachmentIndex(at, length, wall_ns, wall_ns, len(data), name, kind))
+
+    @property
+    def size(self) -> int:
+        """Number of bytes written so far."""
+        return self._file.tell()
+
+    def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
+        """Add a message. It reaches the file by `flush`, or when its chunk ends."""
+        self._gist.message(topic, wall_ns, data)
+        wall_ns = max(0, wall_ns)
+        chunk = self._chunk
+        if chunk is not None and (
+            chunk.size >= CHUNK_BYTES or abs(wall_ns - chunk.first_ns) >= CHUNK_NS
+        ):
+            self.end_chunk()
+        self._chunk = self._chunk or Growing()
+        self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
+        totals = self._totals
+        first_ns = totals.message_start_time if totals.message_count else wall_ns
+        totals.message_start_time = min(first_ns, wall_ns)
+        totals.message_end_time = max(totals.message_end_time, wall_ns)
+        totals.message_count += 1
+        totals.channel_message_counts[NUMBERS[topic]] += 1
+
+    def event(self, told: Told) -> None:
+        """Add an event, and take it for the summary."""
+        wall_ns = int(told.seconds * NS_PER_S)
+        self.add("events", wall_ns, msgspec.json.encode(told))
+        self._gist.event(told)
+
+    def flush(self) -> None:
+        """Write the messages added so far, so that each can be read, and sync them to the disk."""
+        if self._chunk is not None and self._chunk.waits:
+            self._put(self._chunk.take())
+        self._sync()
+        # The disk accepts the data, but nobody can find a file without a name.
+        if not os.fstat(self._file.fileno()).st_nlink:
+            raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
+
+    def _put(self, data: bytes) -> None:
+        """Write compressed bytes of the chunk, after its head if they are the first."""
+        if self._chunk_at is None:
+            self._chunk_at = self._file.tell()
+            self._file.write(GROWING)
+        self._file.write(data)
+
+    def _sync(self) -> None:
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def end_chunk(self) -> None:
+        """End the chunk, if there is one. The next message begins another."""
+        if self._chunk is None:
+            return
+        last, head = self._chunk.end()
+        self._put(last)
+        end = self._file.tell()
+        assert self._chunk_at is not None
+        self._file.seek(self._chunk_at)
+        self._file.write(head)
+        self._file.seek(end)
+        self._chunk = self._chunk_at = None
+        self._totals.chunk_count += 1
+
+    def finish(self, cut: str = "", why: str = "") -> None:
+        """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
+        self.end_chunk()
+        self._add_metadata(END, fields(self._gist.closing(cut, why)))
+        self._write(DataEnd(0))
+        summary_at = self._file.tell()
+        for record in (*_definitions(), self._totals, *self._indexes):
+            self._write(record)
+        # A checksum of 0 says that there is none.
+        self._write(Footer(summary_at, 0, 0))
+        self._file.write(MAGIC)
+        self._sync()
+        self._file.close()
+
+    def close(self) -> None:
+        """Close the file without writing an end."""
+        try:
+            self._file.close()
+        except OSError:
+            # A disk that refuses to write does not take the rest of a buffer either.
+            pass
+
+
+def _definitions() -> Iterator[McapRecord]:
+    """Yield the schema and the channels, as they are at the beginning and in the summary."""
+    schema = msgspec.json.encode(msgspec.json.schema(Told))
+    yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.Told")
+    for topic, number in NUMBERS.items():
+        encoding, of = ("json", EVENTS_SCHEMA) if topic == "events" else (f"acsard-{topic}", 0)
+        yield Channel(number, topic, encoding, {}, of)
+
+
+class Recording:
+    """A recording read from a file, as far as the file is whole."""
+
+    def __init__(self, path: Path) -> None:
+        """Read the file.
+
+        Raises `RecordingError` if it cannot be read or is not a recording of acsard.
+        """
+        self.path = path
+        try:
+            self._data = path.read_bytes()
+        except OSError as error:
+            raise RecordingError(f"cannot read {path}: {error.strerror}") from None
+        self.ended = False
+        """True once the file was read to its end, and it has an end record."""
+        self.damaged = 0
+        """Number of damaged places, mostly chunks, between readable ones."""
+        self.cut = ""
+        """Key of `CUTS` if the daemon did not end in the ordinary way, else ""."""
+        self.why = ""
+        """For the cause `bug`: the step in which the daemon failed, and the exception."""
+        self.unfinished: bytes | None = None
+        """Encoded inputs of the step in which the daemon failed."""
+        self.about = self._about()
+
+    @property
+    def whole(self) -> bool:
+        """True if the file has an end and nothing before it is damaged."""
+        return self.ended and not self.damaged
+
+    def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
+        """Yield the topic, the wall-clock time in ns and the bytes of each message.
+
+        Reading also sets `ended`, `damaged`, `cut`, `why` and `unfinished`.
+        """
+        self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
+        self.unfinished = None
+        topics = {number: topic for topic, number in NUMBERS.items()}
+        for found in walk(self._data):
+            record = found.record
+            if isinstance(record, Footer):
+                self.ended = True
+            elif isinstance(record, Metadata) and record.name == END:
+                self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
+            self.damaged += found.damaged
+            for channel, wall_ns, data in found.messages:
+                if channel in topics:
+                    topic = topics[channel]
+                    if topic == "unfinished":
+                        self.unfinished = data
+                    yield topic, wall_ns, data
+
+    def _about(self) -> About:
+        found: dict[str, str] = {}
+        config = None
+        for place in walk(self._data):
+            record = place.record
+            if isinstance(record, Metadata) and record.name == "acsard":
+                found = record.metadata
+            elif isinstance(record, Attachment) and record.name == "acsard.toml":
+                config = record.data.decode(errors="replace")
+            elif place.messages:
+                break
+        try:
+            if config is None:
+                raise ValueError("its beginning is missing, or it is another program's MCAP")
+            about = msgspec.convert({**found, "config": config}, About, strict=False)
+        except (ValueError, msgspec.ValidationError) as error:
+            raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None
+        if about.format != FORMAT:
+            raise RecordingError(
+                f"{self.path} has the format {about.format}, this acsard reads "
+                f"{FORMAT}: it was written by acsard {about.version}"
+            )
+        return about
+
+
+def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
+    """Write all readable messages to a new, finished file at `path`, and return their number.
+
+    `cut` is the cause to store if the recording lacks its end. Raises `OSError`, or
+    `RecordingError` for an event that cannot be decoded; then no file is left at `path`.
+    """
+    writing = Writing(path, recording.about)
+    try:
+        count = 0
+        for topic, wall_ns, data in recording.messages():
+            if topic == "events":
+                writing.event(event_of(recording, data))
+            else:
+                writing.add(topic, wall_ns, data)
+            count += 1
+        writing.finish(recording.cut or ("" if recording.ended else cut), recording.why)
+    except (OSError, RecordingError):
+        writing.close()
+        path.unlink()
+        raise
+    return count
+
+
+def event_of(recording: Recording, data: bytes) -> Told:
+    """Decode an event; raise `RecordingError` if the bytes are not an event."""
+    try:
+        return msgspec.json.decode(data, type=Told)
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"{recording.path} has an event that is none: {error}") from None

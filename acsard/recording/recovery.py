@@ -1,0 +1,144 @@
+"""Finishes a recording that was cut off: as a copy, or in place if the disk has no room.
+
+No readable data is thrown away. A file that this version cannot read stays as it is, and so does a
+file whose end the disk has no room for.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from contextlib import suppress
+from io import FileIO
+from pathlib import Path
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import Attachment, DataEnd, Footer, Metadata
+
+from acsard.host.errors import RecordingError
+from acsard.recording.chunks import LAST_BLOCK
+from acsard.recording.closing import END, Closing, fields
+from acsard.recording.file import Gist, Recording, event_of, rewrite
+from acsard.recording.walk import MAGIC, walk
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Error numbers of a disk without room."""
+
+NOTHING_BYTES = 64 << 10
+"""A file above this size is more than a header and one second, so it held data, even if this
+version cannot read it.
+"""
+
+
+def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
+    """Make a finished file `whole` of `part`.
+
+    Returns a message for the log, or "" without trouble. `cut` is a key of `CUTS`; `room` says that
+    the disk has room for a copy. A file without content is deleted. A file that cannot be read or
+    ended is only renamed. Raises `OSError`.
+    """
+    seen, told = part.stat(), ""
+    try:
+        if not _begins(part):
+            if seen.st_size > NOTHING_BYTES or _has_chunks(part):
+                raise RecordingError(f"{part} has no beginning that can be read")
+            part.unlink()
+            return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
+        recording = Recording(part)
+        if not any(True for _ in recording.messages()):
+            if recording.damaged or seen.st_size > NOTHING_BYTES:
+                raise RecordingError(f"{part} has nothing whole in it")
+            part.unlink()
+            return ""
+        if not room or not _beside(recording, part, whole, cut):
+            if not _in_place(recording, part, cut):
+                told = f"{whole.name} was cut and has no end, for want of room; all else is in it"
+            part.rename(whole)
+    except RecordingError as error:
+        part.rename(whole)
+        return f"it was cut and stays so, as {whole.name}: {error}"
+    # The file time must be the time of the recording's end, not of its recovery.
+    os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))
+    return told
+
+
+def _begins(part: Path) -> bool:
+    """Return whether the file has its configuration. Without it, none of the file can be read."""
+    records = (found.record for found in walk(part.read_bytes()))
+    return any(isinstance(record, Attachment) for record in records)
+
+
+def _has_chunks(part: Path) -> bool:
+    return any(found.messages for found in walk(part.read_bytes()))
+
+
+def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
+    """Write a copy without the damaged parts; return False if the disk is full."""
+    written = part.with_name(f".{part.name}.new")
+    written.unlink(missing_ok=True)
+    try:
+        rewrite(recording, written, cut)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        return False
+    written.rename(whole)
+    part.unlink()
+    return True
+
+
+def _in_place(recording: Recording, part: Path, cut: str) -> bool:
+    """Write the end behind the last whole second, over the torn part.
+
+    A chunk that was cut gets its true head. Returns False if the disk has no room; then the file is
+    as it was. No second is given up to gain room: some disks give none back, and then all would be
+    lost.
+    """
+    gist = Gist(recording.about)
+    for topic, wall_ns, data in recording.messages():
+        gist.message(topic, wall_ns, data)
+        if topic == "events":
+            gist.event(event_of(recording, data))
+    if recording.ended:
+        return True
+    before, end = part.read_bytes(), _end(gist.closing(cut))
+    *_, chunk = (None, *[found.chunk for found in walk(before) if found.chunk and found.messages])
+    # Another process has changed the file since it was read.
+    if chunk is None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+    puts = [(chunk.end, end)]
+    if not chunk.complete:
+        puts = [(chunk.end, LAST_BLOCK + end), (chunk.begin, chunk.head(before))]
+    with part.open("r+b", buffering=0) as stream:
+        try:
+            for at, data in puts:
+                _put(stream, at, data)
+        except OSError as error:
+            with suppress(OSError):
+                stream.truncate(len(before))
+                for at, data in puts:
+                    _put(stream, at, before[at : at + len(data)])
+            if error.errno not in FULL:
+                raise
+            return False
+        at, data = puts[0]
+        stream.truncate(at + len(data))
+        os.fsync(stream.fileno())
+    return True
+
+
+def _put(stream: FileIO, at: int, data: bytes) -> None:
+    """Write `data` at a position and sync it; after an `OSError` a part may have been written."""
+    stream.seek(at)
+    while data:
+        data = data[stream.write(data) :]
+    os.fsync(stream.fileno())
+
+
+def _end(last: Closing) -> bytes:
+    """Return the smallest end of a valid MCAP file, without an index. Readers do not need one."""
+    builder = RecordBuilder()
+    Metadata(END, fields(last)).write(builder)
+    DataEnd(0).write(builder)
+    Footer(0, 0, 0).write(builder)
+    return bytes(builder.end()) + MAGIC

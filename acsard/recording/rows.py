@@ -1,0 +1,309 @@
+"""Encodes steps as rows, in batches of at most about one second, and decodes them.
+
+A row is one step. Its numbers are differences from the row or the tick before, so that equal steps
+give equal bytes, which the compression of a chunk then removes. Each batch can be decoded alone,
+and decoding returns every `Step` exactly as it was encoded. A file may come from a stranger, so a
+batch with values that no daemon records is refused.
+
+A change of these structs is a new `FORMAT`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import Annotated, NamedTuple
+
+import msgspec
+from msgspec import Meta, Struct
+
+from acsard.core.values import (
+    AcsardError,
+    Command,
+    Event,
+    GyroSample,
+    Inputs,
+    Instant,
+    Received,
+    Refusal,
+    Request,
+)
+from acsard.recording.steps import (
+    Micropose,
+    Said,
+    Status,
+    Step,
+    Taken,
+    checksum,
+    micropose,
+    status_of,
+)
+
+FORMAT = "3"
+"""Format of the messages in a recording. A new number means a new encoding."""
+
+MOST_ROWS = 4096
+"""Largest number of rows that is read from a batch. The recorder's queue has no more steps."""
+
+LONGEST_NS = 1 << 61
+"""Bound of the time since the computer's start and of the age of a read: 73 years."""
+
+LATEST_NS = 1 << 62
+"""Bound of the offset between the monotonic and the wall clock, which the wall clock reaches in
+the year 2116. The sum of all three fits in 64 bits.
+"""
+
+
+class BatchError(AcsardError):
+    """Bytes that are not a valid batch of steps."""
+
+
+class Rare(Struct, frozen=True, omit_defaults=True):
+    """Values that most steps do not have. An absent value is as in the row before, or empty."""
+
+    opened: int | None = None
+    trouble: str | None = None
+    status: Status | None = None
+    missed: int = 0
+    guard_trip: str = ""
+    commands: tuple[Command, ...] = ()
+    requests: tuple[Request, ...] = ()
+    refusals: tuple[Refusal, ...] = ()
+    gyro: tuple[GyroSample, ...] = ()
+    events_in: tuple[Event, ...] = ()
+    events_out: tuple[Event, ...] = ()
+
+
+NOTHING = Rare()
+
+
+class Read(NamedTuple):
+    """One read of the port. Its times are in units of `Batch.unit`."""
+
+    age: int
+    """Time from the read to its step."""
+    offset: int
+    """Offset of the wall clock at the read, as in `Row.offset`."""
+    data: bytes
+
+
+class Row(Struct, frozen=True, array_like=True):
+    """One step. Its times are in units of `Batch.unit`."""
+
+    tick: bool
+    port_open: bool
+    at_once: bool
+    leaving: bool
+    superseded: bool
+    now: int
+    """Time since the last tick before this step, or since `Batch.mono_ns` if there is none."""
+    offset: int
+    """Offset of the wall clock from the monotonic clock, beyond `Batch.offset_ns`."""
+    reads: tuple[Read, ...]
+    line: bytes | None
+    left: bytes | bool
+    """True if `line` was sent, False if no line was, or the bytes that were sent in its place."""
+    poses: tuple[Micropose, ...]
+    """Poses, each as the difference from the pose before; the first of a batch as it is."""
+    rare: Rare | None
+
+
+class Batch(Struct, frozen=True, array_like=True):
+    """A batch of steps as it is written."""
+
+    first: int
+    mono_ns: int
+    offset_ns: int
+    """Offset of the wall clock from the monotonic clock at the first step, ns."""
+    unit: Annotated[int, Meta(ge=1)]
+    """Common divisor of all times, ns. Many clocks count in us."""
+    rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MOST_ROWS)]
+    checksum: int
+    """CRC-32 of all estimates of the batch."""
+
+
+class _First(Struct, frozen=True, array_like=True):
+    """The part of a batch that `first_of` decodes."""
+
+    number: int
+
+
+_decoder = msgspec.msgpack.Decoder(Batch)
+_decoder_of_first = msgspec.msgpack.Decoder(_First)
+
+
+# Encoding
+
+
+def encode(first: int, taken: Sequence[Taken]) -> bytes:
+    """Encode 1 to `MOST_ROWS` steps; the first of them has the number `first`."""
+    start = taken[0].inputs.now
+    offset_ns = start.wall_ns - start.mono_ns
+    times = list(_times(taken, start.mono_ns, offset_ns))
+    unit = math.gcd(*chain.from_iterable(times)) or 1
+    rares, pose, rows = _rares(taken), (0, 0, 0), []
+    for (inputs, outputs, left), ns, rare in zip(taken, times, rares, strict=True):
+        now, offset, *reads = [n // unit for n in ns]
+        poses = []
+        for estimate in outputs.estimates:
+            there = micropose(estimate)
+            poses.append((there[0] - pose[0], there[1] - pose[1], there[2] - pose[2]))
+            pose = there
+        rows.append(
+            Row(
+                tick=inputs.tick,
+                port_open=inputs.port_open,
+                at_once=inputs.at_once,
+                leaving=inputs.leaving,
+                superseded=inputs.superseded,
+                now=now,
+                offset=offset,
+                reads=tuple(map(Read, reads[::2], reads[1::2], [r.data for r in inputs.received])),
+                line=outputs.line,
+                left=False if left is None else (left == outputs.line or left),
+                poses=tuple(poses),
+                rare=None if rare == NOTHING else rare,
+            )
+        )
+    crc = checksum([e for t in taken for e in t.outputs.estimates], 0)
+    return msgspec.msgpack.encode(Batch(first, start.mono_ns, offset_ns, unit, tuple(rows), crc))
+
+
+def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
+    """Yield the times of each step in ns: of itself, then of each of its reads."""
+    tick_ns = mono_ns
+    for inputs, _, _ in taken:
+        now = inputs.now
+        times = [now.mono_ns - tick_ns, now.wall_ns - now.mono_ns - offset_ns]
+        for read in inputs.received:
+            at = read.at
+            times += (now.mono_ns - at.mono_ns, at.wall_ns - at.mono_ns - offset_ns)
+        if inputs.tick:
+            tick_ns = now.mono_ns
+        yield times
+
+
+def _rares(taken: Sequence[Taken]) -> Iterator[Rare]:
+    opened: int | None = None
+    trouble: str | None = None
+    status: Status | None = None
+    for inputs, outputs, _ in taken:
+        now = status_of(outputs)
+        yield Rare(
+            opened=inputs.opened if inputs.opened != opened else None,
+            trouble=inputs.port_trouble if inputs.port_trouble != trouble else None,
+            status=now if now != status else None,
+            missed=inputs.missed,
+            guard_trip=inputs.guard_trip,
+            commands=inputs.commands,
+            requests=inputs.requests,
+            refusals=inputs.refusals,
+            gyro=inputs.gyro,
+            events_in=inputs.events,
+            events_out=outputs.events,
+        )
+        opened, trouble, status = inputs.opened, inputs.port_trouble, now
+
+
+# Decoding
+
+
+def decode(data: bytes) -> list[Step]:
+    """Decode a batch.
+
+    Raises:
+        BatchError: the bytes are not a valid batch.
+    """
+    try:
+        return list(_steps(_decoder.decode(data)))
+    except (msgspec.DecodeError, ValueError) as error:
+        raise BatchError(f"not a batch of steps: {error}") from None
+
+
+def first_of(data: bytes) -> int | None:
+    """Return the number of the first step of a batch, or None for other bytes."""
+    try:
+        return _decoder_of_first.decode(data).number
+    except msgspec.MsgspecError:
+        return None
+
+
+def _steps(batch: Batch) -> Iterator[Step]:
+    standing = batch.rows[0].rare or NOTHING
+    opened, trouble, status = standing.opened, standing.trouble, standing.status
+    tick_ns, pose, last = batch.mono_ns, (0, 0, 0), len(batch.rows) - 1
+    for index, row in enumerate(batch.rows):
+        rare = row.rare or NOTHING
+        _require_finite(rare)
+        opened = opened if rare.opened is None else rare.opened
+        trouble = trouble if rare.trouble is None else rare.trouble
+        status = rare.status or status
+        if opened is None or trouble is None or status is None:
+            raise ValueError("its first step lacks what every first step has")
+        now = _instant(batch, tick_ns + row.now * batch.unit, row.offset)
+        received = []
+        for read in row.reads:
+            age_ns = read.age * batch.unit
+            if abs(age_ns) >= LONGEST_NS:
+                raise ValueError("a time that no clock shows")
+            at = _instant(batch, now.mono_ns - age_ns, read.offset)
+            received.append(Received(at, read.data))
+        poses = []
+        for step in row.poses:
+            pose = (pose[0] + step[0], pose[1] + step[1], pose[2] + step[2])
+            poses.append(pose)
+        inputs = Inputs(
+            now=now,
+            tick=row.tick,
+            at_once=row.at_once,
+            port_open=row.port_open,
+            opened=opened,
+            port_trouble=trouble,
+            received=tuple(received),
+            commands=rare.commands,
+            requests=rare.requests,
+            refusals=rare.refusals,
+            gyro=rare.gyro,
+            guard_trip=rare.guard_trip,
+            superseded=row.superseded,
+            missed=rare.missed,
+            events=rare.events_in,
+            leaving=row.leaving,
+        )
+        said = Said(
+            line=row.line,
+            left=_left(row),
+            status=status,
+            poses=tuple(poses),
+            events=rare.events_out,
+            checksum=batch.checksum if index == last else None,
+        )
+        if row.tick:
+            tick_ns = now.mono_ns
+        yield Step(batch.first + index, inputs, said, begins=index == 0)
+
+
+def _left(row: Row) -> bytes | None:
+    if row.left is True:
+        return row.line
+    return None if row.left is False else row.left
+
+
+def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
+    """Return the instant; raise `ValueError` if no clock shows it."""
+    ahead_ns = batch.offset_ns + offset * batch.unit
+    if abs(mono_ns) >= 2 * LONGEST_NS or abs(ahead_ns) >= LATEST_NS:
+        raise ValueError("a time that no clock shows")
+    return Instant(mono_ns, mono_ns + ahead_ns)
+
+
+def _require_finite(rare: Rare) -> None:
+    """Raise `ValueError` for a NaN or an infinity. The robot itself checks those of commands."""
+    for request in rare.requests:
+        pose = request.pose
+        if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):
+            raise ValueError("a pose that is no number")
+    for sample in rare.gyro:
+        if not (math.isfinite(sample.rate) and math.isfinite(sample.variance)):
+            raise ValueError("a gyro sample that is no number")

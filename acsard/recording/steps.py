@@ -1,0 +1,157 @@
+"""One control step as a recording stores it: all of its inputs, and its outputs.
+
+Poses are stored in um and urad. A checksum covers every bit of all estimates. `rows.py` encodes
+many steps.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, Protocol
+
+import msgspec
+from msgspec import Struct
+
+from acsard.core.config.settings import Config
+from acsard.core.guard import Guard
+from acsard.core.robot import Robot
+from acsard.core.values import AcsardError, Estimate, Event, Inputs, Outputs, Recording
+
+MICRO = 1e6
+
+Status = tuple[str, str, str, str]
+"""Mode, reason, link and source, as in `Outputs`."""
+
+Micropose = tuple[int, int, int]
+"""Pose as integers: x and y in um, yaw in urad."""
+
+_DOUBLES = struct.Struct("<9d")
+
+
+class Taken(NamedTuple):
+    """A step as the control loop hands it over, by reference."""
+
+    inputs: Inputs
+    outputs: Outputs
+    left: bytes | None
+    """Line that was handed to the port, or None if none was."""
+
+
+class Start(NamedTuple):
+    """Beginning of a file: the robot as it is before step `number`."""
+
+    number: int
+    state: bytes
+    config: Config
+    """Configuration in force then. Settings may have changed since the daemon's start."""
+
+
+def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
+    """Split the queue's items at each `Start`, and yield each start with the steps that follow it.
+
+    The first group comes with None: its steps continue the current file.
+    """
+    start: Start | None = None
+    steps: list[Taken] = []
+    for item in items:
+        if isinstance(item, Taken):
+            steps.append(item)
+            continue
+        yield start, steps
+        start, steps = item, []
+    yield start, steps
+
+
+class BlackBox(Protocol):
+    """Interface of the recorder for the control loop. No method waits."""
+
+    def begins(self, robot: Robot, guard: Guard) -> None:
+        """Record the robot and its guard before the first step."""
+
+    def step(
+        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
+    ) -> None:
+        """Take a finished step; `left` is the line that was sent to the board, or None."""
+
+    def died(self, inputs: Inputs) -> None:
+        """Take the inputs of a step in which the daemon failed. The daemon ends because of it."""
+
+    @property
+    def status(self) -> Recording:
+        """Status of the recording."""
+
+
+class Said(Struct, frozen=True):
+    """Outputs of a step."""
+
+    line: bytes | None
+    left: bytes | None
+    status: Status
+    poses: tuple[Micropose, ...]
+    """One pose for each feedback line that odometry accepted."""
+    events: tuple[Event, ...] = ()
+    checksum: int | None = None
+    """CRC-32 of all estimates since the first step of the batch; only in the batch's last step."""
+
+
+class Step(Struct, frozen=True):
+    """A decoded step. `number` counts the steps since the daemon's start."""
+
+    number: int
+    inputs: Inputs
+    said: Said
+    begins: bool = False
+    """True for the first step of a batch, at which the checksum restarts."""
+
+
+class UnfinishedError(AcsardError):
+    """Bytes that are not an unfinished step."""
+
+
+class Unfinished(Struct, frozen=True):
+    """Inputs of the step in which the daemon failed. The step did not produce outputs."""
+
+    number: int
+    inputs: Inputs
+
+    def encode(self) -> bytes:
+        """Encode the step with field names, because a later version may add fields."""
+        return msgspec.msgpack.encode(self)
+
+
+_unfinished = msgspec.msgpack.Decoder(Unfinished)
+
+
+def unfinished(data: bytes) -> Unfinished:
+    """Decode an unfinished step; raise `UnfinishedError` for other bytes."""
+    try:
+        return _unfinished.decode(data)
+    except msgspec.MsgspecError as error:
+        raise UnfinishedError(f"not a step that was not finished: {error}") from None
+
+
+def checksum(estimates: Sequence[Estimate], before: int) -> int:
+    """Continue the CRC-32 `before` over every bit of the poses, speeds and wheel angles."""
+    for e in estimates:
+        pose, twist = e.pose, e.twist
+        data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
+        before = zlib.crc32(data, before)
+    return before
+
+
+def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:
+    """Return the rounded poses of all estimates."""
+    return tuple([micropose(estimate) for estimate in estimates])
+
+
+def status_of(outputs: Outputs) -> Status:
+    """Return the mode, reason, link and source of a step."""
+    return outputs.mode, outputs.reason, outputs.link, outputs.source
+
+
+def micropose(estimate: Estimate) -> Micropose:
+    """Return the pose of an estimate, rounded to um and urad."""
+    pose = estimate.pose
+    return round(pose.x * MICRO), round(pose.y * MICRO), round(pose.yaw * MICRO)

@@ -1,0 +1,195 @@
+"""Tests of contradictions in the bus, access and ROS tables, each with its correction."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.contradictions import contradictions, warnings
+from acsard.core.config.parsing import parse
+from acsard.core.config.settings import (
+    AccessConfig,
+    BusConfig,
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    McuConfig,
+    OdometryConfig,
+    RosConfig,
+    SimConfig,
+)
+
+
+def problems(**tables: object) -> list[str]:
+    return contradictions(Config(**tables))  # type: ignore[arg-type]
+
+
+def test_the_defaults_contradict_nothing_and_surprise_nobody() -> None:
+    assert contradictions(Config()) == []
+    assert warnings(Config()) == []
+
+
+HERE = "tcp/127.0.0.1:7448"
+
+
+@pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7449", "tls/127.0.0.1:7449"])
+def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
+    listen = (HERE, endpoint)
+    (line,) = problems(bus=BusConfig(listen=listen))
+    assert "acsard lan init" in line
+    assert problems(bus=BusConfig(listen=listen, tls="/etc/acsard/tls")) == []
+    assert problems(bus=BusConfig(connect=(endpoint,), tls="/etc/acsard/tls")) == []
+
+
+def test_the_door_needs_a_way_to_the_daemon() -> None:
+    (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
+    assert line == (
+        'bus.listen = ["tls/0.0.0.0:7449"]: who comes by TLS reaches the daemon through its '
+        f'address on this machine; add "{HERE}"'
+    )
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7448", "tcp/[::]:7448", "tcp/robot:7448"])
+def test_a_plain_endpoint_stays_on_this_machine_even_with_certificates(endpoint: str) -> None:
+    (line,) = problems(bus=BusConfig(listen=(endpoint,), tls="/etc/acsard/tls"))
+    assert "acsard lan init" in line
+    assert "bus.insecure = true" in line
+    assert problems(bus=BusConfig(listen=(endpoint,), insecure=True)) == []
+
+
+@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
+def test_anything_else_is_no_endpoint(endpoint: str) -> None:
+    (line,) = problems(bus=BusConfig(listen=(HERE, endpoint), tls="/etc/acsard/tls"))
+    assert "not an endpoint" in line
+
+
+def test_a_client_needs_somewhere_to_connect_to() -> None:
+    (line,) = problems(bus=BusConfig(mode="client"))
+    assert 'bus.mode = "client"' in line
+    assert problems(bus=BusConfig(mode="client", connect=("tcp/127.0.0.1:7447",))) == []
+
+
+@pytest.mark.parametrize("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
+def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
+    listen: tuple[str, ...],
+) -> None:
+    here = ("tcp/127.0.0.1:7447",)
+    bus = BusConfig(mode="client", connect=here, listen=listen)
+    client = Config(bus=bus, ros=RosConfig(namespace="r1"))
+    assert contradictions(client) == warnings(client) == []
+    assert problems(bus=BusConfig(connect=here, listen=listen)) != []
+
+
+def test_a_certificate_has_one_role() -> None:
+    (line,) = problems(access=AccessConfig(viewers=("a", "b"), maintainers=("b",)))
+    assert line.startswith('access.maintainers[0] = "b": access.viewers[1] is the same')
+
+
+def test_a_namespace_may_not_begin_like_the_native_keys() -> None:
+    (line,) = problems(ros=RosConfig(namespace="acsard/acsar"))
+    assert "ros.namespace" in line
+    assert problems(ros=RosConfig(namespace="acsard", bridge=False)) == []
+    assert problems(ros=RosConfig(namespace="acsard2")) == []
+
+
+def test_a_bus_that_leaves_the_machine_wants_an_id_and_a_namespace() -> None:
+    text = b'[bus]\nlisten = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]\ntls = "/etc/acsard/tls"\n'
+    first, second = warnings(parse(text))
+    assert "robot.id" in first
+    assert "ros.namespace" in second
+    assert warnings(parse(text + b'[robot]\nid = "r1"\n[ros]\nnamespace = "r1"\n')) == []
+    assert len(warnings(parse(text + b"[ros]\nbridge = false\nrmw = false\n"))) == 1
+
+
+def test_a_router_on_the_machine_wants_a_namespace_too() -> None:
+    text = b'[bus]\nconnect = ["tcp/127.0.0.1:7447"]\n'
+    (line,) = warnings(parse(text))
+    assert line.startswith('ros.namespace = "" on a bus with a router')
+    for mend in (b'[ros]\nnamespace = "r1"\n', b"[ros]\nbridge = false\nrmw = false\n"):
+        assert warnings(parse(text + mend)) == []
+
+
+# the checked link
+
+
+def test_checked_lines_take_more_of_the_wire() -> None:
+    mcu = McuConfig(baud_rate=9600, link_check="auto")
+    (line,) = problems(mcu=mcu, control=ControlConfig(rate=25))
+    assert line == (
+        "control.rate = 25: 41 B at 9600 baud = 42.7 ms per line, at most 23 Hz, 18 Hz at 80 %; "
+        'write mcu.baud_rate = 19200 or more, or control.rate = 18 or "auto", or '
+        'mcu.link_check = "off" (lines of 33 B)'
+    )
+    assert Config(mcu=mcu, control=ControlConfig(rate="auto")).rate_hz == 18
+
+
+def test_the_sample_fields_take_more_still() -> None:
+    mcu = McuConfig(baud_rate=57600, link_check="require", encoder_counts=3200)
+    (line,) = problems(mcu=mcu)
+    assert line == (
+        "control.rate = 100: 62 B at 57600 baud = 10.8 ms per line, at most 92 Hz, 74 Hz at 80 %; "
+        'write mcu.baud_rate = 115200 or more, or control.rate = 74 or "auto", or '
+        "mcu.encoder_counts = 0 (lines of 41 B)"
+    )
+    assert problems(mcu=mcu, control=ControlConfig(rate=92)) == []
+    (warning,) = warnings(
+        Config(
+            mcu=mcu,
+            control=ControlConfig(rate=80),
+            sim=SimConfig(encoder_counts=mcu.encoder_counts),
+        )
+    )
+    assert "control.rate = 80 takes 86% of the wire at 57600 baud" in warning
+
+
+@pytest.mark.parametrize(
+    ("mcu", "count"),
+    [
+        (McuConfig(), 33),
+        (McuConfig(encoder_counts=3200), 33),
+        (McuConfig(trailing_comma=True), 34),
+        (McuConfig(link_check="auto"), 41),
+        (McuConfig(link_check="require", trailing_comma=True), 42),
+        (McuConfig(link_check="auto", encoder_counts=3200), 62),
+    ],
+)
+def test_a_line_is_as_long_as_what_may_be_asked_for(mcu: McuConfig, count: int) -> None:
+    assert mcu.line_bytes == count
+    at_9600 = McuConfig(
+        baud_rate=9600,
+        trailing_comma=mcu.trailing_comma,
+        link_check=mcu.link_check,
+        encoder_counts=mcu.encoder_counts,
+    )
+    rate = Config(mcu=at_9600, control=ControlConfig(rate="auto")).rate_hz
+    assert rate == int(0.8 * 9600 / (count * 10))
+
+
+def test_counts_without_the_check_are_a_surprise() -> None:
+    (warning,) = warnings(Config(mcu=McuConfig(encoder_counts=3200)))
+    assert 'mcu.link_check = "off"; write "auto"' in warning
+
+
+def test_counts_that_are_not_the_simulators_are_a_surprise() -> None:
+    mcu = McuConfig(link_check="auto", encoder_counts=1600)
+    (warning,) = warnings(Config(mcu=mcu))
+    assert "sim.encoder_counts = 3200" in warning
+    assert warnings(Config(mcu=mcu, sim=SimConfig(encoder_counts=1600))) == []
+
+
+def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_not() -> None:
+    control = ControlConfig(rate=10)
+    (line,) = problems(mcu=McuConfig(encoder_counts=20_000), control=control)
+    assert line.startswith("mcu.encoder_counts = 20000: at feedback.wheel_speed = 80 rad/s they ")
+    assert "could wrap in 129 ms, and must last 2 control periods (200 ms)" in line
+    assert "write 12867 at most" in line
+    assert problems(mcu=McuConfig(encoder_counts=12_867), control=control) == []
+    assert problems(mcu=McuConfig(encoder_counts=12_868), control=control) != []
+    slower = FeedbackConfig(wheel_speed=50.0)
+    assert problems(mcu=McuConfig(encoder_counts=20_000), control=control, feedback=slower) == []
+
+
+def test_a_track_is_learned_only_where_there_is_a_gyro() -> None:
+    (line,) = problems(odometry=OdometryConfig(learned_track=True))
+    assert line.startswith("odometry.learned_track = true: ")
+    assert "odometry.gyro = true" in line
+    assert problems(odometry=OdometryConfig(learned_track=True, gyro=True)) == []

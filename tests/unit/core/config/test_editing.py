@@ -1,0 +1,81 @@
+"""Tests of edits to the text of an acsard.toml: comments stay, and impossible edits are refused."""
+
+from __future__ import annotations
+
+import pytest
+from tomlkit.exceptions import NonExistentKey
+
+from acsard.core.config.editing import edited
+from acsard.core.config.parsing import ConfigError, parse
+
+KEYS: dict[str, object] = {
+    "mcu.baud_rate": 57600,
+    "mcu.trailing_comma": True,
+    "mcu.reply_period": 0.1,
+    "mcu.wheels.rear_left": "-c",
+    "control.rate": 50.0,
+}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "# mine\n",
+        "[mcu]\nport = 'sim' # here\n",
+        "[mcu.wheels]\n# none\n",
+        '[mcu]\nwheels = { front_right = "+a" }\n',
+        "mcu.port = 'sim'\nmcu.wheels.rear_left = '+c'\n",
+        "# mine\nmcu.port = 'sim'\nmcu.encoder_counts = 5\n[drive]\nwheel_radius = 0.1\n",
+        "[mcu.wheels]\n# none\n[drive]\nwheel_radius = 0.1\n[mcu]\nport = 'sim'\n",
+        "[bus]\nmode = 'peer'\n[mcu]\n\n[drive]\nwheel_radius = 0.1\n",
+    ],
+)
+def test_keys_are_set_however_the_file_is_written(text: str) -> None:
+    after = edited(text, KEYS)
+    config = parse(after.encode())
+    assert (config.mcu.baud_rate, config.mcu.trailing_comma) == (57600, True)
+    assert config.mcu.wheels.rear_left == "-c"
+    assert config.rate_hz == 50.0
+    assert all(line in after for line in text.splitlines() if line.startswith("#"))
+
+
+@pytest.mark.parametrize(
+    ("text", "keys"),
+    [
+        ("[mcu]\n", {"mcu.baud_rate": 300}),
+        ("[mcu]\n", {"mcu.baud_rate": 9600}),
+        ("[mcu]\n", {"mcu.wheels.front_right": "+b"}),
+        ("[mcu\n", {"mcu.baud_rate": 57600}),
+        ("[mcu]\nbaud = 3\n", {"mcu.baud_rate": 57600}),
+    ],
+)
+def test_what_would_not_check_is_not_written(text: str, keys: dict[str, object]) -> None:
+    with pytest.raises((ConfigError, ValueError)):
+        edited(text, keys)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n']
+)
+def test_a_list_is_set_as_any_other_value(text: str) -> None:
+    endpoints = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
+    after = edited(text, {"bus.listen": endpoints, "bus.tls": "/etc/acsard/tls"})
+    assert parse(after.encode()).bus.listen == tuple(endpoints)
+
+
+def test_windows_line_ends_stay() -> None:
+    before = "# mine\r\n[mcu]\r\nport = 'sim' # here\r\n"
+    after = edited(before, KEYS)
+    assert after.startswith(before)
+    assert after.count("\r\n") == after.count("\n") > 8
+    assert "\r\r" not in after
+
+
+def test_what_the_library_cannot_do_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(text: str) -> None:
+        raise NonExistentKey("mcu")
+
+    monkeypatch.setattr("tomlkit.parse", fails)
+    with pytest.raises(ValueError, match="mcu"):
+        edited("# mine\n", KEYS)

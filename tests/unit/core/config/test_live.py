@@ -1,0 +1,207 @@
+"""Tests of the settings that can change while the daemon runs.
+
+A change is checked by the same rules as the file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.live import LIVE, changed, flat, live
+from acsard.core.config.parsing import ConfigError, effective, parse
+from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
+from acsard.core.config.writing import document
+
+CONFIG = Config(robot=RobotConfig("r7"))
+KEYS = dict(flat(effective(CONFIG)))
+
+
+def problems(
+    wishes: Mapping[str, object], at_rest: bool = True, config: Config = CONFIG
+) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        changed(config, wishes, at_rest)
+    return caught.value.problems
+
+
+def by_file(wishes: dict[str, object]) -> Config | list[str]:
+    """Return the configuration that a file with these settings gives, or its problems."""
+    tables: dict[str, Any] = effective(CONFIG)
+    tables["commands"]["sources"] = list(tables["commands"]["sources"])
+    for key, value in wishes.items():
+        *path, name = key.split(".")
+        inner: Any = tables
+        for part in path:
+            named = (one for one in inner if one["name"] == part) if isinstance(inner, list) else ()
+            inner = next(iter(named)) if isinstance(inner, list) else inner[part]
+        inner[name] = value
+    try:
+        return parse("\n".join(document(tables)).encode())
+    except ConfigError as error:
+        return error.problems
+
+
+def test_every_row_is_a_key_and_every_source_has_its_own() -> None:
+    found = {key for key in KEYS if live(key)}
+    sources = {f"commands.sources.{one.name}.timeout" for one in CONFIG.commands.sources}
+    assert found == {key for key in LIVE if "*" not in key} | sources
+    assert all(row.what for row in LIVE.values())
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["mcu.port", "drive.wheel_radius", "feedback.fault_time", "commands.neutral_first",
+     "commands.sources.nav.priority", "bus.listen", "access.maintainers", "robot.id",
+     "odometry.gyro", "odometry.distance_scale_std", "log.format", "commands.sources.nav"],
+)  # fmt: skip
+def test_what_shapes_the_wire_the_base_or_who_may_drive_takes_a_start(key: str) -> None:
+    assert live(key) is None
+
+
+def test_what_is_set_is_in_the_configuration_and_nothing_else_is() -> None:
+    made, news = changed(CONFIG, {"limits.linear_speed": 0.8, "log.level": "debug"}, False)
+    after = dict(flat(effective(made)))
+    assert {key for key in KEYS if KEYS[key] != after[key]} == {"limits.linear_speed", "log.level"}
+    assert (made.limits.linear_speed, made.log.level) == (0.8, "debug")
+    assert news == 'limits.linear_speed = 0.8 (was 1.0), log.level = "debug" (was "info")'
+
+
+def test_a_source_is_set_by_its_name() -> None:
+    made, _ = changed(CONFIG, {"commands.sources.app.timeout": 0.5}, True)
+    timeouts = {source.name: source.timeout for source in made.commands.sources}
+    assert timeouts == {"teleop": 0.25, "app": 0.5, "ros2_control": 0.25, "nav": 0.25}
+
+
+def test_a_whole_number_is_a_number_and_a_list_is_one() -> None:
+    made, _ = changed(
+        CONFIG, {"rates.state": 5, "odometry.twist_covariance_diagonal": [1, 2, 3, 4, 5, 6]}, True
+    )
+    assert made.rates.state == 5.0
+    assert made.odometry.twist_covariance_diagonal == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    "wishes",
+    [
+        {"limits.linear_speed": 1.0},
+        {"mcu.port": "sim", "robot.id": "r7"},
+        dict(KEYS),
+        {},
+    ],
+    ids=["one", "fixed ones", "all, as `ros2 param load` has them", "none"],
+)
+def test_what_is_so_already_is_no_change_whatever_it_is(wishes: dict[str, object]) -> None:
+    assert changed(CONFIG, wishes, False) == (CONFIG, "")
+
+
+VALUES: dict[str, list[object]] = {
+    "limits.linear_speed": [0.0, 0.8, 4, 5.1, 10.0, 11.0, -1.0, math.nan, math.inf, "0.8", True],
+    "limits.linear_deceleration": [0.1, 0.2, 3.0, 4.0, 100.0],
+    "limits.linear_stop_deceleration": [0.4, 0.5, 1.0, 2.0],
+    "limits.angular_jerk": [0.0, 0.001, 0.01, 10.0],
+    "limits.wheel_speed": [0.1, 72.0, 73.0, 99.0, 100.0],
+    "commands.sources.nav.timeout": [0.01, 0.02, 0.03, 10.0],
+    "odometry.pose_covariance_diagonal": [[1.0] * 6, [1.0] * 5, [1.0] * 5 + [-1.0], 1.0],
+    "odometry.covariance": ["constant", "none", 1],
+    "rates.state": [0.0, 0.1, 100.0, 101.0],
+    "log.level": ["error", "loud", ""],
+}
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [(key, value) for key, values in VALUES.items() for value in values]
+)
+@pytest.mark.parametrize("beside", [{}, {"limits.angular_speed": 20.0, "limits.linear_speed": 4.5}])
+def test_a_change_is_judged_as_the_file_is(
+    key: str, value: object, beside: dict[str, object]
+) -> None:
+    wishes = beside | {key: value}
+    judged = by_file(wishes)
+    if isinstance(judged, Config):
+        assert changed(CONFIG, wishes, True)[0] == judged
+    else:
+        assert problems(wishes) == judged
+
+
+def test_one_that_cannot_be_refuses_all() -> None:
+    (line,) = problems({"limits.angular_speed": 2.0, "limits.linear_speed": 20.0})
+    assert "limits.linear_speed = 20.0: expected a number from 0 to 10 m/s" in line
+
+
+def test_a_rule_between_keys_refuses_what_breaks_it_and_takes_both_together() -> None:
+    softer: dict[str, object] = {"limits.linear_deceleration": 0.15}
+    assert "would take 6.7 s from full speed" in problems(softer)[0]
+    made, _ = changed(CONFIG, softer | {"limits.linear_speed": 0.5}, True)
+    assert made.limits.linear_deceleration == 0.15
+
+
+def test_limits_beyond_what_feedback_may_say_are_refused() -> None:
+    (line,) = problems({"limits.wheel_speed": 79.0, "limits.linear_speed": 4.0})
+    assert "feedback.wheel_speed = 80: the limits let a wheel be asked 79.0 rad/s" in line
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        ("limits.linear_sped", 1.0, "did you mean limits.linear_speed?"),
+        ("nonsense", 1.0, "`acsard set` lists"),
+        ("limits", {"linear_speed": 1.0}, "unknown key"),
+        ("commands.sources.ghost.timeout", 0.5, "did you mean commands.sources."),
+        ("x" * 4000, 1.0, "unknown key"),
+        ("mcu.port", "/dev/x", "takes a start: change it in acsard.toml"),
+    ],
+)
+def test_what_cannot_be_set_is_said_with_what_to_do(key: str, value: object, words: str) -> None:
+    (line,) = problems({key: value})
+    assert words in line
+    assert len(line) < 300
+
+
+def test_of_many_that_cannot_be_set_one_is_explained() -> None:
+    first, more = problems({f"limits.no{n}": 1.0 for n in range(100)})
+    assert "limits.no0" in first
+    assert more == "and 99 more that cannot be set"
+
+
+# while it drives
+
+SOFTER = [key for key, row in LIVE.items() if row.when == "raised"]
+
+
+@pytest.mark.parametrize("key", SOFTER)
+def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> None:
+    config = replace(CONFIG, limits=LimitsConfig(linear_speed=0.2, angular_speed=0.2))
+    now = dict(flat(effective(config)))[key]
+    assert isinstance(now, float)
+    harder, softer = {key: now * 1.1}, {key: now * 0.9}
+    assert changed(config, harder, False)[1]
+    assert changed(config, softer, True)[1]
+    (line,) = problems(softer, False, config)
+    assert "only while the robot stands; stop it first" in line
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.pause", 2.0),
+     ("commands.sources.nav.timeout", 0.5)],
+)  # fmt: skip
+def test_what_would_jump_or_forget_who_drives_waits_for_rest(key: str, value: float) -> None:
+    (line,) = problems({key: value}, at_rest=False)
+    assert "may be set only while the robot stands" in line
+    assert changed(CONFIG, {key: value}, at_rest=True)[1]
+
+
+@pytest.mark.parametrize("key", [key for key, row in LIVE.items() if row.when == "always"])
+def test_the_others_may_be_set_at_any_time(key: str) -> None:
+    now = KEYS[key]
+    other: object = {"model": "constant", "info": "debug"}.get(str(now))
+    if isinstance(now, tuple | list):
+        other = [1.0] * 6
+    elif isinstance(now, float):
+        other = now + 0.5
+    assert changed(CONFIG, {key: other}, at_rest=False)[1]

@@ -1,0 +1,174 @@
+"""A configuration with dangerous limits is refused with a correction.
+
+The robot could not stop in time, or would fault in normal driving.
+"""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.motion_rules import LONGEST_RAMP_S, LONGEST_STOP_S, problems
+from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig, LimitsConfig, McuConfig
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.limits import Limiter
+from acsard.core.values import REST, Twist
+
+DT = 0.01
+
+
+def thousandths(low: float, high: float) -> st.SearchStrategy[float]:
+    """Return a strategy for numbers with three decimals, as people write them."""
+    return st.integers(round(low * 1000), round(high * 1000)).map(lambda number: number / 1000)
+
+
+drives = st.builds(
+    DriveConfig,
+    wheel_radius=thousandths(0.02, 0.3),
+    wheel_separation=thousandths(0.1, 1.0),
+    wheel_separation_multiplier=thousandths(0.5, 2.0),
+    left_wheel_radius_multiplier=thousandths(0.8, 1.2),
+    right_wheel_radius_multiplier=thousandths(0.8, 1.2),
+)
+limits = st.builds(
+    LimitsConfig,
+    linear_speed=thousandths(0.0, 10.0),
+    angular_speed=thousandths(0.0, 50.0),
+    linear_deceleration=thousandths(0.01, 5.0),
+    angular_deceleration=thousandths(0.01, 20.0),
+    linear_stop_deceleration=thousandths(0.01, 20.0),
+    angular_stop_deceleration=thousandths(0.01, 50.0),
+    wheel_speed=thousandths(0.1, 99.99),
+)
+
+
+def mended(config: Config, line: str) -> Config:
+    """Return the configuration with the number that the error message proposes."""
+    found = re.match(r"(\w+)\.(\w+) = .*?write ([0-9.]+)", line)
+    assert found is not None
+    table, key, number = found.groups()
+    changed = replace(getattr(config, table), **{key: float(number)})
+    return replace(config, **{table: changed})
+
+
+def test_the_defaults_are_in_order() -> None:
+    assert problems(Config()) == []
+
+
+@given(
+    drives,
+    limits,
+    thousandths(0.1, 99.99),
+    thousandths(0.0, 2.0),
+    st.just(0.0) | thousandths(0.01, 3.0),
+)
+def test_what_each_line_says_to_write_is_enough(
+    drive: DriveConfig, limit: LimitsConfig, wheel_speed: float, period: float, fault_s: float
+) -> None:
+    config = Config(
+        drive=drive,
+        limits=limit,
+        feedback=FeedbackConfig(wheel_speed=wheel_speed, fault_time=fault_s),
+        mcu=McuConfig(reply_period=period),
+    )
+    for _ in range(12):
+        lines = problems(config)
+        if not lines:
+            return
+        config = mended(config, lines[0])
+    pytest.fail(f"it still says {lines}")
+
+
+LOPSIDED = DriveConfig(
+    wheel_radius=0.119,
+    wheel_separation=0.703,
+    wheel_separation_multiplier=1.83,
+    left_wheel_radius_multiplier=0.8,
+    right_wheel_radius_multiplier=1.051,
+)
+SOFT = LimitsConfig(
+    linear_speed=0.065,
+    angular_speed=0.321,
+    linear_deceleration=0.01,
+    angular_deceleration=0.01,
+    linear_stop_deceleration=0.01,
+    angular_stop_deceleration=0.01,
+    wheel_speed=2.162,
+)
+
+
+@given(drives, limits, st.booleans(), st.sampled_from([(1, 0), (0, 1), (1, 1), (-1, 1)]))
+@example(LOPSIDED, SOFT, False, (1, 1))
+def test_whatever_is_accepted_comes_to_rest_in_time_from_any_speed_it_can_reach(
+    drive: DriveConfig, limit: LimitsConfig, stop: bool, way: tuple[int, int]
+) -> None:
+    config = Config(drive=drive, limits=replace(limit, linear_acceleration=100.0))
+    for _ in range(12):
+        lines = problems(config)
+        config = mended(config, lines[0]) if lines else config
+    limiter = Limiter(config.limits, Kinematics(config.drive))
+    for _ in range(20):
+        limiter.follow(Twist(way[0] * 10.0, way[1] * 50.0), 10.0)
+    longest = LONGEST_STOP_S if stop else LONGEST_RAMP_S
+    for _ in range(round(longest / DT) + 1):
+        limiter.coast(DT, stop)
+    assert limiter.twist == REST
+
+
+def test_a_stop_of_exactly_the_longest_is_accepted_and_a_softer_one_is_not() -> None:
+    def stops_by(stop: float) -> list[str]:
+        soft = LimitsConfig(linear_deceleration=0.2, linear_stop_deceleration=stop)
+        return problems(Config(limits=soft))
+
+    assert stops_by(0.5) == []
+    (line,) = stops_by(0.49)
+    assert line.startswith("limits.linear_stop_deceleration = 0.49: would take 2.0 s")
+
+
+def test_a_stop_that_is_both_too_soft_and_softer_than_the_ramp_is_told_once() -> None:
+    soft = LimitsConfig(linear_deceleration=0.2, linear_stop_deceleration=0.1)
+    (line,) = problems(Config(limits=soft))
+    assert line.endswith("write 0.5 or more")
+
+
+def test_what_the_wheels_cannot_reach_needs_no_braking() -> None:
+    # 10 rad/s on a radius of 0.05 m are 0.5 m/s.
+    slow = LimitsConfig(linear_speed=10.0, wheel_speed=10.0, linear_deceleration=0.1)
+    assert problems(Config(limits=slow)) == []
+
+
+@pytest.mark.parametrize(("wheel_speed", "good"), [(35.2, True), (35.1, False), (20.0, False)])
+def test_feedback_must_leave_room_for_what_the_limits_ask(wheel_speed: float, good: bool) -> None:
+    # The limits ask for (1.0 m/s + 4.0 rad/s x 0.15 m) / 0.05 m = 32 rad/s, and a tenth is added.
+    found = problems(Config(feedback=FeedbackConfig(wheel_speed=wheel_speed)))
+    assert (found == []) is good
+
+
+def test_the_most_that_a_line_can_say_is_room_enough() -> None:
+    fast = LimitsConfig(linear_speed=10.0, wheel_speed=99.99, linear_deceleration=3.0)
+    top = FeedbackConfig(wheel_speed=99.99)
+    assert problems(Config(limits=fast, feedback=top)) == []
+
+
+def test_a_smaller_wheel_has_to_turn_faster() -> None:
+    drive = DriveConfig(left_wheel_radius_multiplier=0.5)
+    (line,) = problems(Config(drive=drive, feedback=FeedbackConfig(wheel_speed=43.0)))
+    assert "asked 40.0 rad/s" in line
+
+
+@pytest.mark.parametrize(
+    ("period", "fault_s", "most"),
+    [(0.25, 0.5, None), (0.25, 0.49, 0.245), (0.26, 0.5, 0.25), (0.25, 0.0, None),
+     (0.26, 0.0, 0.25), (2.0, 10.0, 0.25), (0.0, 0.01, None)],
+)  # fmt: skip
+def test_a_fault_rests_on_two_lines_and_a_lost_line_is_no_new_start(
+    period: float, fault_s: float, most: float | None
+) -> None:
+    found = problems(
+        Config(mcu=McuConfig(reply_period=period), feedback=FeedbackConfig(fault_time=fault_s))
+    )
+    assert [f"write {most} at most" in line for line in found] == [True] * (most is not None)

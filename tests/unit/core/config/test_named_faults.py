@@ -1,0 +1,113 @@
+"""Tests of faults written by name in the configuration."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.named_faults import NamedFault, forms, named
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.settings import Config, McuConfig, SimConfig
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("mute", ()),
+        ("stuck_encoder=a", (0,)),
+        ("swapped_wheels=b:d", (1, 3)),
+        ("bias=c:1.2", (2, 1.2)),
+        ("other_baud=57600", (57600,)),
+        ("pushed=0.12", (0.12,)),
+        ("stalls=5:0.15", (5, 0.15)),
+        ("reset=0.5", (0.5,)),
+        ("reset=5", (5,)),
+    ],
+)
+def test_a_fault_is_read_with_its_numbers(text: str, values: tuple[float, ...]) -> None:
+    assert named(text) == NamedFault(text.partition("=")[0], values)
+
+
+REFUSED = [
+    ("x", "not a fault; there are mute, noise, "),
+    ("mut", "not a fault; did you mean mute?"),
+    ("stall=5:0.15", "not a fault; did you mean stalls=NUMBER:NUMBER?"),
+    ("mute=1", "it is written mute"),
+    ("bias", "it is written bias=MOTOR:NUMBER"),
+    ("bias=a", "it is written bias=MOTOR:NUMBER"),
+    ("swapped_wheels=a:b:c", "it is written swapped_wheels=MOTOR:MOTOR"),
+    ("stalls=5", "it is written stalls=NUMBER:NUMBER"),
+    ("stuck_encoder=e", "motors are a, b, c and d"),
+    ("stuck_encoder=ab", "motors are a, b, c and d"),
+    ("bias=a:much", "numbers are written like 5 or 0.15, up to 1e+06"),
+    ("pushed=nan", "numbers are written like"),
+    ("pushed=-inf", "numbers are written like"),
+    ("pushed=1000001", "up to 1e+06"),
+    ("other_baud=300", "rates are 9600"),
+    ("stalls=0.1:0.2", "fewer for each"),
+    ("stalls=0.2:0.2", "fewer for each"),
+    ("stalls=5:0", "0.001 at least"),
+    ("stalls=5:0.0009", "0.001 at least"),
+]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [*REFUSED, ("", "not a fault"), ("reset=0", "above 0"), ("reset=-1", "above")],
+)
+def test_what_is_no_fault_is_refused_in_words(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(words)):
+        named(text)
+
+
+def test_the_help_shows_how_arguments_are_written() -> None:
+    assert "bias=MOTOR:NUMBER" in forms()
+    assert "stuck_encoder=MOTOR" in forms()
+
+
+# in a file
+
+
+def problems(faults: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse(f"[sim]\nfaults = {faults}".encode())
+    return caught.value.problems
+
+
+def test_a_file_may_have_any_of_them() -> None:
+    config = parse(b'[sim]\nfaults = ["ftdi", "stalls=5:0.15", "stuck_encoder=b"]')
+    assert config.sim.faults == ("ftdi", "stalls=5:0.15", "stuck_encoder=b")
+
+
+@pytest.mark.parametrize(("text", "words"), REFUSED)
+def test_what_is_no_fault_is_told_with_its_key_and_place(text: str, words: str) -> None:
+    (told,) = problems(f'["ftdi", "{text}"]')
+    assert told.startswith(f'sim.faults[1] = "{text}": ')
+    assert words in told
+
+
+def test_every_mistake_is_told() -> None:
+    told = problems('["mut", "ftdi", "stalls=5"]')
+    assert [line.partition(" ")[0] for line in told] == ["sim.faults[0]", "sim.faults[2]"]
+
+
+def test_what_needs_a_timer_is_told_where_it_goes() -> None:
+    assert problems('["reset=5"]') == [
+        'sim.faults[0] = "reset=5": needs `acsard sim --fault reset=5`; take it out here'
+    ]
+
+
+@pytest.mark.parametrize("faults", ['"ftdi"', "[1]", '[""]', r'["mute\n"]', f'["{"x" * 65}"]'])
+def test_what_is_no_list_of_short_texts_is_told_as_of_any_key(faults: str) -> None:
+    (told,) = problems(faults)
+    assert told.startswith("sim.faults = ")
+    assert "expected a list, each a fault of `acsard sim --fault` in quotes" in told
+
+
+def test_a_simulator_with_faults_is_a_surprise_and_a_device_has_none() -> None:
+    sim = SimConfig(faults=("ftdi",))
+    (warning,) = warnings(Config(sim=sim))
+    assert warning == 'sim.faults = ["ftdi"]: the simulator misbehaves as told; [] ends it'
+    assert warnings(Config(sim=sim, mcu=McuConfig(port="/dev/x"))) == []

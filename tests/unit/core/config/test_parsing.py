@@ -1,0 +1,732 @@
+"""All mistakes in a configuration are reported at once.
+
+Each has a line with key, value and correction.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from msgspec import inspect
+
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import ConfigError, effective, from_builtins, parse
+from acsard.core.config.settings import Config, Source
+from tests.each import each
+from tests.unit.keys import KEYS, Key
+
+REFERENCE = Path(__file__).parents[4] / "acsard.toml"
+
+FLOATS = [key for key in KEYS if any(isinstance(kind, inspect.FloatType) for kind in key.numbers())]
+
+
+def problems_of(
+    text: str | bytes, overrides: dict[str, dict[str, object]] | None = None
+) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse(text if isinstance(text, bytes) else text.encode(), overrides)
+    return caught.value.problems
+
+
+def accepted(text: str) -> Config:
+    return parse(text.encode())
+
+
+# the file as a whole
+
+
+def test_an_empty_file_is_the_defaults() -> None:
+    assert parse(b"") == Config()
+
+
+def test_the_reference_file_decodes_to_exactly_the_defaults() -> None:
+    assert parse(REFERENCE.read_bytes()) == Config()
+
+
+def test_the_reference_file_has_every_key_of_every_table_and_no_other() -> None:
+    table = tomllib.loads(REFERENCE.read_text(encoding="utf-8"))
+    assert table == msgspec.json.decode(msgspec.json.encode(effective(Config())))
+
+
+@each("key", KEYS)
+def test_the_reference_file_gives_each_key_its_default(key: Key) -> None:
+    place = tomllib.loads(REFERENCE.read_text(encoding="utf-8"))
+    *tables, name = key.path.replace("[0]", "").split(".")
+    for table in tables:
+        place = place[table]
+    if isinstance(place, list):
+        assert all(name in one for one in place)
+    else:
+        assert msgspec.convert(place[name], key.field.type) == key.field.default
+
+
+def test_the_reference_file_explains_each_table_in_a_comment() -> None:
+    lines = REFERENCE.read_text(encoding="utf-8").splitlines()
+    heads = [i for i, line in enumerate(lines) if line.startswith("[")]
+    silent = [
+        lines[head]
+        for head, end in zip(heads, [*heads[1:], len(lines)], strict=True)
+        if not any(line.startswith("#") for line in lines[head:end])
+        and not lines[head].startswith("[[")
+    ]
+    assert silent == []
+
+
+def test_what_is_in_force_reads_back_as_the_same_configuration() -> None:
+    config = accepted('[robot]\nid = "x"\n[control]\nrate = "auto"\n[commands]\nsources = []')
+    assert from_builtins(effective(config)) == config
+    assert from_builtins(msgspec.json.decode(msgspec.json.encode(effective(config)))) == config
+
+
+def test_every_value_of_a_file_is_taken_over() -> None:
+    config = accepted(
+        """
+        [mcu]
+        port = "/dev/ttyUSB0"
+        baud_rate = 57600
+        wheels.front_left = "-b"
+        [control]
+        rate = 50
+        [[commands.sources]]
+        name = "only"
+        priority = 1
+        timeout = 0.5
+        [odometry]
+        pose_covariance_diagonal = [1, 2, 3, 4, 5, 6]
+        """
+    )
+    assert config.mcu.port == "/dev/ttyUSB0"
+    assert config.mcu.baud_rate == 57600
+    assert config.mcu.wheels.front_left == "-b"
+    assert config.rate_hz == 50.0
+    assert config.commands.sources == (Source("only", 1, 0.5),)
+    assert config.odometry.pose_covariance_diagonal == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    assert config.drive == Config().drive
+
+
+# the command line
+
+
+def test_the_command_line_wins_over_the_file() -> None:
+    config = parse(b'[mcu]\nport = "/dev/a"\nbaud_rate = 9600\n[control]\nrate = 20', {
+        "mcu": {"port": "/dev/b"}, "robot": {"id": "r2"},
+    })  # fmt: skip
+    assert config.mcu.port == "/dev/b"
+    assert config.mcu.baud_rate == 9600
+    assert config.robot.id == "r2"
+
+
+def test_a_mistake_on_the_command_line_is_told_like_one_in_the_file() -> None:
+    (line,) = problems_of(b"", {"mcu": {"baud_rate": 1200}})
+    assert line.startswith("mcu.baud_rate = 1200: expected one of 9600, 19200")
+
+
+def test_the_command_line_cannot_repair_a_table_that_is_none() -> None:
+    (line,) = problems_of(b"mcu = 5", {"mcu": {"port": "/dev/b"}})
+    assert line.startswith("mcu = 5: expected a table")
+
+
+# planted mistakes
+
+PLANTED = [
+    # wrong kinds
+    ("[robot]\nid = 7", "robot.id", "7", "1 to 32 of A-Z a-z 0-9 _ -"),
+    ("[robot]\nid = 2020-01-01", "robot.id", "2020-01-01", 'the default is id = "acsar"'),
+    ('[mcu]\nbaud_rate = "9600"', "mcu.baud_rate", '"9600"', "one of 9600, 19200"),
+    ("[mcu]\nport = false", "mcu.port", "false", "a text of 1 to 256 characters"),
+    ("[mcu]\ntrailing_comma = 1", "mcu.trailing_comma", "1", "true or false"),
+    ('[drive]\nwheel_radius = "0.05"', "drive.wheel_radius", '"0.05"', "0.001 to 10 m"),
+    ("[drive]\nwheel_radius = true", "drive.wheel_radius", "true", "0.001 to 10 m"),
+    ("[lidar]\npublish_tf = 'yes'", "lidar.publish_tf", '"yes"', "true or false"),
+    ('[bus]\nlisten = "tcp/127.0.0.1:1"', "bus.listen", '"tcp/127.0.0.1:1"', "expected a list"),
+    ("[bus]\nconnect = [1]", "bus.connect", "[1]", "the default is connect = []"),
+    ("robot = 5", "robot", "5", "write it as [robot]"),
+    ("[[drive]]", "drive", "[{}]", "write it as [drive]"),
+    ("[commands.sources]\nx = 1", "commands.sources", "{x = 1}", "[[commands.sources]]"),
+    # out of range
+    ('[robot]\nid = "a/b"', "robot.id", '"a/b"', "A-Z a-z 0-9 _ -"),
+    ('[robot]\nid = ""', "robot.id", '""', "1 to 32"),
+    ('[mcu]\nport = ""', "mcu.port", '""', "1 to 256 characters"),
+    ("[mcu]\nbaud_rate = 14400", "mcu.baud_rate", "14400", "115200"),
+    ("[mcu]\nreply_period = -0.1", "mcu.reply_period", "-0.1", "from 0 to 2 s"),
+    ('[mcu.wheels]\nrear_left = "c"', "mcu.wheels.rear_left", '"c"', '"+c"'),
+    ("[control]\nrate = 0", "control.rate", "0", 'from 10 to 1000 Hz or one of "auto"'),
+    ('[control]\nrate = "fast"', "control.rate", '"fast"', "the default is rate = 100.0"),
+    ("[drive]\nwheel_radius = 0.0", "drive.wheel_radius", "0.0", "from 0.001 to 10 m"),
+    ("[drive]\nwheel_separation = -0.3", "drive.wheel_separation", "-0.3", "from 0.001 to 10 m"),
+    ("[limits]\nlinear_speed = 11", "limits.linear_speed", "11", "from 0 to 10 m/s"),
+    ("[limits]\nwheel_speed = 100.0", "limits.wheel_speed", "100.0", "0.1 to 99.99 rad/s"),
+    ("[limits]\nlinear_jerk = -1", "limits.linear_jerk", "-1", "(0 = no limit)"),
+    ('[joints]\nrear_left = "/x"', "joints.rear_left", '"/x"', "no leading slash"),
+    ("[lidar]\nlidar_yaw = 180", "lidar.lidar_yaw", "180", "from -6.2832 to 6.2832 rad"),
+    ("[rates]\nstate = 0", "rates.state", "0", "from 0.1 to 100 Hz"),
+    ("[rates]\nodom = 2000", "rates.odom", "2000", "(0 = every sample)"),
+    ('[log]\nlevel = "loud"', "log.level", '"loud"', '"debug"'),
+    ("[sim]\nencoder_counts = 3200.5", "sim.encoder_counts", "3200.5", "a whole number from 16"),
+    (
+        "[odometry]\ntwist_covariance_diagonal = [1.0, 2.0]",
+        "odometry.twist_covariance_diagonal",
+        "[1.0, 2.0]",
+        "a list of 6",
+    ),
+    (
+        "[odometry]\npose_covariance_diagonal = [1, 1, 1, 1, 1, -1]",
+        "odometry.pose_covariance_diagonal",
+        "[1, 1, 1, 1, 1, -1]",
+        "each a number from 0",
+    ),
+    # sources
+    (
+        '[[commands.sources]]\nname = "x"',
+        "commands.sources[0].priority",
+        "",
+        "missing; write priority = 50",
+    ),
+    (
+        '[[commands.sources]]\nname = "x"\npriority = 1\n[[commands.sources]]\npriority = 1',
+        "commands.sources[1].name",
+        "",
+        'missing; write name = "app"',
+    ),
+    (
+        '[[commands.sources]]\nname = "x"\npriority = 1001',
+        "commands.sources[0].priority",
+        "1001",
+        "from 0 to 1000",
+    ),
+    (
+        '[[commands.sources]]\nname = "a/b"\npriority = 1',
+        "commands.sources[0].name",
+        '"a/b"',
+        'for example "app"',
+    ),
+    ("[commands]\nsources = [1]", "commands.sources[0]", "1", "expected a table"),
+    # misspelt
+    ('[robto]\nid = "x"', "robto", '{id = "x"}', "did you mean robot?"),
+    ("[mcu]\nbaudrate = 9600", "mcu.baudrate", "9600", "did you mean baud_rate?"),
+    ("[drive]\nwheel_seperation = 1", "drive.wheel_seperation", "1", "mean wheel_separation?"),
+    ('[mcu.wheels]\nfront_rigth = "+a"', "mcu.wheels.front_rigth", '"+a"', "front_right?"),
+    ("[limits]\nlinear_accel = 1", "limits.linear_accel", "1", "linear_acceleration?"),
+    ("[odometry]\npublish_tff = true", "odometry.publish_tff", "true", "did you mean publish_tf?"),
+    ("colour = 3", "colour", "3", "known here: robot, mcu, control, drive"),
+    (
+        '[[commands.sources]]\nname = "x"\npriority = 1\ntimeuot = 1',
+        "commands.sources[0].timeuot",
+        "1",
+        "did you mean timeout?",
+    ),
+    # contradictory keys
+    ("[mcu]\nbaud_rate = 9600", "control.rate", "100", "mcu.baud_rate = 38400 or more"),
+    ('[mcu.wheels]\nfront_right = "-b"', "mcu.wheels.front_left", '"b"', "write another"),
+    ('[joints]\nfront_left = "x"\nrear_left = "x"', "joints.rear_left", '"x"', "write another"),
+    (
+        "[limits]\nlinear_stop_deceleration = 0.5",
+        "limits.linear_stop_deceleration",
+        "0.5",
+        "write 1 or more",
+    ),
+    (
+        "[limits]\nangular_deceleration = 20",
+        "limits.angular_stop_deceleration",
+        "12",
+        "write 20 or more",
+    ),
+    (
+        '[control]\nrate = 10\n[[commands.sources]]\nname = "x"\npriority = 1\ntimeout = 0.15',
+        "commands.sources[0].timeout",
+        "0.15",
+        "write 0.2 or more",
+    ),
+    (
+        '[[commands.sources]]\nname = "x"\npriority = 1\n'
+        '[[commands.sources]]\nname = "x"\npriority = 2',
+        "commands.sources[1].name",
+        '"x"',
+        "write another",
+    ),
+    # robots that would not stop in time, or would fault in normal driving
+    (
+        "[limits]\nlinear_deceleration = 0.19",
+        "limits.linear_deceleration",
+        "0.19",
+        "would take 5.3 s from full speed (1 m/s) to rest, and may take 5; write 0.2 or more",
+    ),
+    (
+        "[limits]\nangular_deceleration = 0.1",
+        "limits.angular_deceleration",
+        "0.1",
+        "would take 40.0 s from full speed (4 rad/s) to rest, and may take 5; write 0.8 or more",
+    ),
+    (
+        "[limits]\nangular_deceleration = 1\nangular_stop_deceleration = 1.5",
+        "limits.angular_stop_deceleration",
+        "1.5",
+        "may take 2; write 2 or more",
+    ),
+    ("[feedback]\nwheel_speed = 30", "feedback.wheel_speed", "30", "write 35.2 or more"),
+    ("[mcu]\nreply_period = 1.0", "mcu.reply_period", "1", "write 0.25 at most"),
+    ("[mcu]\nreply_period = 0.3", "mcu.reply_period", "0.3", "write 0.25 at most"),
+    (
+        "[mcu]\nreply_period = 0.15\n[feedback]\nfault_time = 0.2",
+        "mcu.reply_period",
+        "0.15",
+        "write 0.1 at most (the firmware must report more often), or feedback.fault_time = 0.3",
+    ),
+    ("[bus]\nlisten = []", "bus.listen", "[]", 'write ["tcp/127.0.0.1:7448"]'),
+    ('[bus]\nlisten = ["7448"]', "bus.listen", '"7448"', 'like "tcp/127.0.0.1:7448"'),
+    ('[bus]\nconnect = ["tcp/10.0.0.2:1"]', "bus.connect", '"tcp/10.0.0.2:1"', "insecure = true"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "key", "value", "mend"), PLANTED)
+def test_a_mistake_gives_exactly_one_line_with_key_value_and_mend(
+    text: str, key: str, value: str, mend: str
+) -> None:
+    (line,) = problems_of(text)
+    assert line.startswith(f"{key} = {value}: " if value else f"{key}: ")
+    assert mend in line
+    assert "\n" not in line
+
+
+def test_many_mistakes_at_once_give_a_line_each() -> None:
+    found = problems_of(
+        """
+        colour = 1
+        [robot]
+        id = ""
+        [mcu]
+        baudrate = 9600
+        port = 1
+        [drive]
+        wheel_radius = inf
+        wheel_separation = 0
+        [[commands.sources]]
+        name = "x"
+        [bus]
+        insecure = 1
+        """
+    )
+    starts = ["colour", "robot.id", "mcu.baudrate", "mcu.port", "drive.wheel_radius"]
+    starts += ["drive.wheel_separation", "commands.sources[0].priority", "bus.insecure"]
+    assert len(found) == len(starts)
+    assert all(sum(line.startswith(start) for line in found) == 1 for start in starts)
+
+
+def test_all_contradictions_are_told_at_once() -> None:
+    found = problems_of(
+        """
+        [mcu]
+        baud_rate = 9600
+        [mcu.wheels]
+        front_left = "+a"
+        [limits]
+        linear_stop_deceleration = 0.5
+        angular_stop_deceleration = 0.5
+        [bus]
+        listen = ["nonsense", "tcp/0.0.0.0:7448"]
+        """
+    )
+    assert len(found) == 6
+
+
+def test_rules_between_keys_are_told_with_the_mistakes_of_other_keys() -> None:
+    found = problems_of(
+        """
+        colour = 1
+        [drive]
+        wheel_radius = "big"
+        [mcu]
+        baud_rate = 9600
+        [control]
+        rate = 100.0
+        [mcu.wheels]
+        front_left = "+a"
+        front_right = "+z"
+        [joints]
+        front_left = "wheel"
+        rear_left = "wheel"
+        [limits]
+        linear_jerk = 0.001
+        angular_jerk = "soft"
+        [bus]
+        mode = "peer"
+        listen = ["tcp/0.0.0.0:7448"]
+        """
+    )
+    starts = ["colour", "drive.wheel_radius", "control.rate", "mcu.wheels.front_right"]
+    starts += ["joints.rear_left", "limits.linear_jerk", "limits.angular_jerk", "bus.listen"]
+    assert [next(s for s in starts if line.startswith(s)) for line in found]
+    assert sorted(line.split(" = ")[0] for line in found) == sorted(starts)
+
+
+def test_a_rule_says_nothing_of_a_key_whose_value_is_not_known() -> None:
+    """The rules must not complain about keys whose values are unknown.
+
+    These are 100 Hz at the default baud rate, and endpoints whose `insecure` was misspelt.
+    """
+    text = """
+        [mcu]
+        baudrate = 9600
+        [control]
+        rate = 400.0
+        [bus]
+        insecur = true
+        listen = ["tcp/0.0.0.0:7448"]
+        """
+    assert [line.split(" = ")[0] for line in problems_of(text)] == ["mcu.baudrate", "bus.insecur"]
+
+
+def test_the_error_says_all_its_problems() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(b"a = 1\nb = 2")
+    assert str(caught.value) == "\n".join(caught.value.problems)
+
+
+# numbers
+
+
+@each("text", ["inf", "-inf", "nan"])
+@each("key", FLOATS)
+def test_a_number_that_is_not_finite_is_refused_at_every_key(key: Key, text: str) -> None:
+    items = len(key.field.default) if isinstance(key.field.default, tuple) else 0
+    for place in range(max(1, items)):
+        value = (
+            f"[{', '.join(text if i == place else '1' for i in range(items))}]" if items else text
+        )
+        (line,) = problems_of(key.document(value))
+        assert line.startswith(f"{key.path} = {value}: expected a ")
+
+
+# text that is not a configuration
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[mcu", "mcu", "[mcu]\nport = /dev/ttyUSB0", "a = 1\na = 2", "[a]\n[a]", "a = 1 = 2", "\x00",
+     "a = True", 'a = "\\q"', "a = 2020-13-01", '"', "a.b = 1\na = 2", "[[a]]\n[a]\n[a]"],
+)  # fmt: skip
+def test_what_is_not_toml_gives_one_line_with_the_place(text: str) -> None:
+    (line,) = problems_of(text)
+    assert line.startswith("not TOML: ")
+    assert "line" in line or "end of document" in line
+    assert "\n" not in line
+
+
+@pytest.mark.parametrize(
+    "text", [b"\xff", "[robot]".encode("utf-16"), b'id = "\xe9"', b"\x80" * 99]
+)
+def test_what_is_not_utf8_gives_one_line(text: bytes) -> None:
+    (line,) = problems_of(text)
+    assert line.startswith("not UTF-8 text: ")
+    assert line.endswith("; save the file as UTF-8")
+    assert "\n" not in line
+
+
+# the wire (MCU.md section 2)
+
+
+def wire(baud: int, rate: object, comma: bool = False) -> str:
+    shown = str(comma).lower()
+    return f"[mcu]\nbaud_rate = {baud}\ntrailing_comma = {shown}\n[control]\nrate = {rate}\n"
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate", "comma"),
+    [(9600, 23, False), (9600, 22, True), (19200, 46, False), (38400, 93, False),
+     (57600, 139, False), (115200, 279, False), (115200, 271, True)],
+)  # fmt: skip
+def test_up_to_eighty_percent_of_the_wire_passes_without_a_word(
+    baud: int, rate: int, comma: bool
+) -> None:
+    assert warnings(accepted(wire(baud, rate, comma))) == []
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate", "comma", "comfortable"),
+    [(9600, 24, False, 23), (9600, 29, False, 23), (9600, 23, True, 22), (38400, 94, False, 93),
+     (38400, 116, False, 93), (115200, 280, False, 279), (115200, 349, False, 279)],
+)  # fmt: skip
+def test_up_to_the_whole_wire_passes_with_a_warning(
+    baud: int, rate: int, comma: bool, comfortable: int
+) -> None:
+    (text,) = warnings(accepted(wire(baud, rate, comma)))
+    assert text.startswith(f"control.rate = {rate} takes ")
+    assert f"{comfortable} Hz is comfortable" in text
+
+
+@pytest.mark.parametrize(
+    ("baud", "rate", "comma", "numbers", "faster"),
+    [
+        (9600, 30, False, "33 B at 9600 baud = 34.4 ms per line, at most 29 Hz, 23 Hz", 19200),
+        (9600, 100, False, "33 B at 9600 baud = 34.4 ms per line, at most 29 Hz, 23 Hz", 38400),
+        (9600, 29, True, "34 B at 9600 baud = 35.4 ms per line, at most 28 Hz, 22 Hz", 19200),
+        (19200, 59, False, "33 B at 19200 baud = 17.2 ms per line, at most 58 Hz, 46 Hz", 38400),
+        (38400, 117, False, "33 B at 38400 baud = 8.6 ms per line, at most 116 Hz, 93 Hz", 57600),
+        (57600, 175, False, "33 B at 57600 baud = 5.7 ms per line, at most 174 Hz, 139 Hz", 115200),
+        (115200, 350, False, "33 B at 115200 baud = 2.9 ms per line, at most 349 Hz, 279 Hz", None),
+    ],
+)  # fmt: skip
+def test_more_than_the_wire_is_refused_with_the_numbers_and_both_ways_out(
+    baud: int, rate: int, comma: bool, numbers: str, faster: int | None
+) -> None:
+    (line,) = problems_of(wire(baud, rate, comma))
+    assert line.startswith(f"control.rate = {rate}: {numbers} at 80 %; write ")
+    assert ("mcu.baud_rate" in line) == (faster is not None)
+    if faster is not None:
+        assert f"write mcu.baud_rate = {faster} or more" in line
+        accepted(wire(faster, rate, comma))
+    slower = int(numbers.split(", ")[-1].split()[0])
+    assert f'control.rate = {slower} or "auto"' in line
+    accepted(wire(baud, slower, comma))
+    accepted(wire(baud, '"auto"', comma))
+
+
+@pytest.mark.parametrize("baud", [9600, 19200, 38400, 57600, 115200])
+@pytest.mark.parametrize("comma", [False, True])
+def test_an_automatic_rate_is_always_comfortable(baud: int, comma: bool) -> None:
+    config = accepted(wire(baud, '"auto"', comma))
+    assert warnings(config) == []
+    assert config.rate_hz * (34 if comma else 33) * 10 <= 0.8 * baud
+
+
+# clients that can reach the bus (SAFETY section 3)
+
+
+@pytest.mark.parametrize("key", ["listen", "connect"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.8.9.1", "[::1]", "localhost"])
+def test_this_machine_may_be_named(key: str, host: str) -> None:
+    config = accepted(f'[bus]\n{key} = ["tcp/{host}:7448"]')
+    assert getattr(config.bus, key) == (f"tcp/{host}:7448",)
+
+
+@pytest.mark.parametrize("key", ["listen", "connect"])
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "[::]", "192.168.1.2", "[fe80::1]", "robot.local", "*", "128.0.0.1",
+             "localhost.evil.org", "127.0.0.1.evil.org", "1"],
+)  # fmt: skip
+def test_what_leaves_this_machine_is_refused_unless_insecure_is_said(key: str, host: str) -> None:
+    text = f'[bus]\n{key} = ["tcp/{host}:7448"]\n'
+    (line,) = problems_of(text)
+    assert line.startswith(f'bus.{key} = "tcp/{host}:7448": leaves this machine')
+    assert line.endswith("bus.insecure = true")
+    config = accepted(text + "insecure = true")
+    assert any("everyone who reaches the bus can drive" in text for text in warnings(config))
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["", "tcp", "tcp/", "tcp/127.0.0.1", "tcp/127.0.0.1:", "tcp/:7448", "tcp/127.0.0.1:65536",
+     "tcp/127.0.0.1:-1", "tcp/127.0.0.1:x", "udp/127.0.0.1:7448", "127.0.0.1:7448",
+     "tcp/127.0.0.1:7448#iface=eth0", "tcp/127.0.0.1:٧", " tcp/127.0.0.1:7448"],
+)  # fmt: skip
+def test_what_is_not_an_endpoint_is_refused_even_when_insecure(endpoint: str) -> None:
+    (line,) = problems_of(f'[bus]\nlisten = ["{endpoint}"]\ninsecure = true')
+    assert line.startswith("bus.listen = ")
+    assert "tcp/127.0.0.1:7448" in line
+
+
+def test_one_bad_endpoint_among_good_ones_is_found() -> None:
+    (line,) = problems_of('[bus]\nlisten = ["tcp/[::1]:1", "tcp/10.0.0.1:2", "tcp/localhost:3"]')
+    assert line.startswith('bus.listen = "tcp/10.0.0.1:2"')
+
+
+# contradictions at their limits
+
+
+def test_a_stop_may_brake_exactly_as_hard_as_a_timeout() -> None:
+    accepted("[limits]\nlinear_stop_deceleration = 1.0\nangular_stop_deceleration = 4.0")
+
+
+def test_a_timeout_may_be_exactly_two_control_periods() -> None:
+    source = '[[commands.sources]]\nname = "x"\npriority = 1\ntimeout = 0.2'
+    accepted(f"[control]\nrate = 10\n{source}")
+
+
+def test_wheels_may_be_wired_in_any_order_and_sense() -> None:
+    accepted(
+        '[mcu.wheels]\nfront_right = "-d"\nfront_left = "+c"\nrear_left = "-b"\nrear_right = "+a"'
+    )
+
+
+@pytest.mark.parametrize("table", ["lidar", "footprint"])
+def test_a_frame_that_is_not_published_may_have_any_name(table: str) -> None:
+    text = f'[{table}]\n{table}_frame = "base_link"\npublish_tf = '
+    accepted(text + "false")
+    (line,) = problems_of(text + "true")
+    assert line.startswith(f'{table}.{table}_frame = "base_link"')
+    assert "odometry.base_frame is the same frame" in line
+
+
+def test_a_speed_the_wheels_cannot_reach_is_a_warning() -> None:
+    (text,) = warnings(accepted("[limits]\nlinear_speed = 3.0"))
+    assert text.startswith("limits.linear_speed = 3 m/s needs 60.0 rad/s")
+    assert "limits.wheel_speed = 40" in text
+
+
+def test_the_defaults_give_no_warning() -> None:
+    assert warnings(Config()) == []
+
+
+# random input
+
+NAMES = sorted({key.path.rpartition(".")[2] for key in KEYS} | {"id_", "x", "prot"})
+TABLES = sorted({key.path.rpartition(".")[0] for key in KEYS} - {"commands.sources[0]"})
+VALUES = st.one_of(
+    st.integers().map(str),
+    st.floats().map(str),
+    st.sampled_from(
+        ["true", "false", '"sim"', '"auto"', '"+a"', '"-d"', "[]", "{}", "{a = 1}", "[{}]", "''",
+         "1979-05-27", "07:32:00", "1979-05-27T07:32:00Z", "0x10", "1_000", "[1, [2, 'x']]", "-0.0",
+         '["tcp/127.0.0.1:7448"]', "[1, 1, 1, 1, 1, 1]", '"\\u0000"', '"""a\nb"""', "9600"],
+    ),
+)  # fmt: skip
+DOTTED = [key.path for key in KEYS if key.table is not Source]
+LINES = st.one_of(
+    st.builds("{} = {}".format, st.sampled_from(DOTTED), VALUES),
+    st.builds("{} = {}".format, st.sampled_from(NAMES), VALUES),
+    st.sampled_from(
+        [f"[{table}]" for table in TABLES] + ["[[commands.sources]]", "# x", "[[mcu]]"]
+    ),
+)
+
+
+def outcome(data: bytes) -> Config | list[str]:
+    """Return the configuration or its problems. Any other error from `parse` fails the test."""
+    try:
+        return parse(data)
+    except ConfigError as error:
+        return error.problems
+
+
+def is_config_or_lines(found: Config | list[str]) -> bool:
+    if isinstance(found, Config):
+        return from_builtins(effective(found)) == found
+    return bool(found) and not any("\n" in line for line in found)
+
+
+@given(st.lists(LINES, max_size=12).map("\n".join))
+@settings(max_examples=400)
+def test_any_toml_like_text_is_a_configuration_or_a_list_of_lines(text: str) -> None:
+    assert is_config_or_lines(outcome(text.encode()))
+
+
+@given(st.binary(max_size=60) | st.text(max_size=60).map(lambda text: text.encode("utf-8")))
+@settings(max_examples=300)
+@example(b"\xef\xbb\xbf[robot]")
+def test_any_bytes_are_a_configuration_or_a_list_of_lines(data: bytes) -> None:
+    assert is_config_or_lines(outcome(data))
+
+
+@given(data=st.data())
+@settings(max_examples=150)
+def test_the_reference_file_with_a_piece_changed_is_a_configuration_or_a_list_of_lines(
+    data: st.DataObject,
+) -> None:
+    good = REFERENCE.read_bytes()
+    start = data.draw(st.integers(0, len(good)))
+    end = data.draw(st.integers(start, min(len(good), start + 30)))
+    damaged = good[:start] + data.draw(st.binary(max_size=8)) + good[end:]
+    assert is_config_or_lines(outcome(damaged))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"a = 1" + b"0" * 5000,
+        b"[drive]\nwheel_radius = 0x1" + b"0" * 5000,
+        b"a = 0x1" + b"0" * 5000,
+        b"a = " + b"[" * 5000,
+        b"a = " + b"[" * 600 + b"]" * 600,
+        b"a" + b".a" * 3000 + b" = 1",
+    ],
+    ids=["decimal", "hex-known", "hex-unknown", "open", "nested", "dotted"],
+)
+def test_no_number_is_too_long_and_no_nesting_too_deep_to_be_a_line(text: bytes) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(text)
+    assert len(caught.value.problems) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[robot]\nid = "acsar\\n"',
+        '[odometry]\nodom_frame = "odom\\n"',
+        '[joints]\nrear_left = "x\\n"',
+    ],
+)
+def test_a_name_may_not_end_with_a_line_feed(text: str) -> None:
+    with pytest.raises(ConfigError):
+        parse(text.encode())
+
+
+@pytest.mark.parametrize("text", ['"a\\nb" = 1', '[robot]\n"a\\nb" = 1', '"\\u001b[2J" = 1'])
+def test_a_key_with_control_characters_is_still_one_printable_line(text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(text.encode())
+    (line,) = caught.value.problems
+    assert line.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ('[odometry]\nbase_frame = "odom"', "odometry."),
+        ('[lidar]\nlidar_frame = "base_link"', "lidar.lidar_frame"),
+    ],
+)
+def test_two_frames_of_one_name_are_refused_by_key(text: str, key: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(text.encode())
+    (line,) = caught.value.problems
+    assert line.startswith(key)
+
+
+def test_the_mend_of_a_source_that_is_no_table_is_toml() -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse(b"[commands]\nsources = [1]")
+    assert "[[commands.sources]]" in caught.value.problems[0]
+
+
+def test_leaving_this_machine_with_the_default_id_is_a_warning() -> None:
+    found = warnings(parse(b'[bus]\nlisten = ["tcp/0.0.0.0:7448"]\ninsecure = true'))
+    assert any("robot.id" in text for text in found)
+
+
+def test_a_rate_slower_than_the_mcu_waits_for_is_refused() -> None:
+    (line,) = problems_of("[control]\nrate = 4")
+    assert line.startswith("control.rate = 4: ")
+
+
+# names of certificates
+
+
+@pytest.mark.parametrize("name", ["anna", "laptop anna", "a_b.c:d@e+f-g", "J\u00fcrgen", "x" * 64])
+def test_a_certificate_may_have_any_name_that_fits_into_a_key(name: str) -> None:
+    assert accepted(f'[access]\noperators = ["{name}"]').access.operators == (name,)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "a/b", "a*", "a$b", "a#b", "a?b", "@a", "a[b]", "two\\nlines", "x" * 65]
+)
+def test_a_certificate_whose_name_fits_into_no_key_is_refused_with_what_would(name: str) -> None:
+    (problem,) = problems_of(f'[access]\noperators = ["{name}"]')
+    assert problem.startswith("access.operators = ")
+    assert "letters, digits" in problem
+
+
+@pytest.mark.parametrize("directory", ["states", "./states", "~joe/states"])
+def test_a_state_directory_that_depends_on_the_working_directory_is_refused(directory: str) -> None:
+    with pytest.raises(ConfigError, match=r"control\.state_directory = .*begins with / or ~/"):
+        parse(f'[control]\nstate_directory = "{directory}"'.encode())
+
+
+@pytest.mark.parametrize("directory", ["", "/states", "~/states"])
+def test_a_state_directory_is_absolute_or_in_the_home_directory(directory: str) -> None:
+    config = parse(f'[control]\nstate_directory = "{directory}"'.encode())
+    assert config.control.state_directory == directory

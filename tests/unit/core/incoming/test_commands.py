@@ -1,0 +1,924 @@
+"""A sample becomes a command or is refused whole, and `DecodeError` is the only error."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import CommandsConfig, DriveConfig, JointsConfig
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, sender
+from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode
+from acsard.core.messages.schema import JointState, TwistStamped
+from acsard.core.messages.schema import Twist as TwistMessage
+from acsard.core.messages.signature import public_name
+from acsard.core.motion.arbiter import Arbiter
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.ros.attachments import Attachment
+from acsard.core.values import Command, Pose, Request, Twist, Verb, WheelSpeeds
+from tests.each import each
+
+KINEMATICS = Kinematics(DriveConfig())
+RECEIVER = Receiver(JointsConfig(), KINEMATICS)
+JOINTS = list(JointsConfig().as_tuple())
+
+ARRIVED_NS = 77_000_000_000
+AXES = [("linear", "x"), ("linear", "y"), ("linear", "z"),
+        ("angular", "x"), ("angular", "y"), ("angular", "z")]  # fmt: skip
+HEADER_S = "native/app, header on native/cmd/app"
+"""Name of the clock behind a header stamp when nothing else identifies the sender."""
+
+NOT_FINITE = [math.nan, math.inf, -math.inf]
+
+
+def arrival(payload: bytes, key: str = "cmd/app", **changes: Any) -> Arrival:
+    given: dict[str, Any] = {"put": True, "encoding": "", "stamp_ns": None, "sender": ""} | changes
+    return Arrival(key=key, payload=payload, arrived_ns=ARRIVED_NS, **given)
+
+
+def written(body: dict[str, Any], form: Format) -> bytes:
+    """Return a body as bytes.
+
+    CDR carries no names, so it needs the message's type and not its fields.
+    """
+    if form != "cdr":
+        return encode(body, form)
+    cls = TwistStamped if "twist" in body else JointState if "name" in body else TwistMessage
+    return encode(msgspec.convert(body, cls), form)
+
+
+def command(body: dict[str, Any], form: Format = "msgpack", **changes: Any) -> Command:
+    return RECEIVER.command(arrival(written(body, form), **changes))
+
+
+def wheels(body: dict[str, Any], form: Format = "msgpack", **changes: Any) -> Command:
+    return command(body, form, key="wheel_cmd/app", **changes)
+
+
+def refusal(incoming: Arrival) -> str:
+    with pytest.raises(DecodeError) as caught:
+        RECEIVER.command(incoming)
+    return caught.value.reason
+
+
+def refused(body: object, **changes: Any) -> str:
+    return refusal(arrival(msgspec.msgpack.encode(body), **changes))
+
+
+def twist(linear: float = 0.5, angular: float = 0.2) -> dict[str, Any]:
+    return {"linear": {"x": linear}, "angular": {"z": angular}}
+
+
+def stamped(sec: int, nanosec: int = 0) -> dict[str, Any]:
+    return {"header": {"stamp": {"sec": sec, "nanosec": nanosec}}, "twist": twist()}
+
+
+def joints(*velocity: float, names: list[str] | None = None) -> dict[str, Any]:
+    return {"name": names or JOINTS, "velocity": list(velocity)}
+
+
+# samples that are commands
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_twist_is_a_command_of_the_source_in_its_key(form: Format) -> None:
+    assert command(twist(), form) == Command(
+        "app", Twist(0.5, 0.2), ARRIVED_NS, None, "native/app", "native/app", shared=True
+    )
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_stamped_twist_is_the_same_command_with_a_stamp(form: Format) -> None:
+    body = {
+        "header": {"stamp": {"sec": 3, "nanosec": 4}, "frame_id": "base_link"},
+        "twist": twist(),
+    }
+    assert command(body, form) == Command(
+        "app", Twist(0.5, 0.2), ARRIVED_NS, 3_000_000_004, HEADER_S, "native/app", shared=True
+    )
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_an_encoding_may_say_what_the_first_byte_would(form: Format) -> None:
+    name = f"application/{form};acsard.Twist.v1"
+    assert command(twist(), form, encoding=name).twist == Twist(0.5, 0.2)
+
+
+def test_axes_default_to_zero() -> None:
+    assert command({"linear": {}, "angular": {}}).twist == Twist(0.0, 0.0)
+    assert command({"linear": {"x": -1.5}, "angular": {}}).twist == Twist(-1.5, 0.0)
+
+
+def test_axes_a_planar_base_cannot_follow_are_ignored() -> None:
+    body = {"linear": {"x": 1, "y": 2, "z": 3}, "angular": {"x": 4, "y": 5, "z": 6}}
+    assert command(body).twist == Twist(1.0, 6.0)
+
+
+@pytest.mark.parametrize("missing", ["linear", "angular"])
+def test_both_parts_of_a_twist_are_required(missing: str) -> None:
+    body = twist()
+    del body[missing]
+    assert refused(body) == "wrong_shape"
+    assert refused({"header": {}, "twist": body}) == "wrong_shape"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        {"header": {}},
+        {"twist": {}},
+        {"x": 1.0},
+        twist() | {"gain": 1},
+        {"linear": {"x": 1, "X": 2}, "angular": {}},
+        {"linear": {"x": "1"}, "angular": {}},
+        {"linear": {"x": None}, "angular": {}},
+        {"linear": 1.0, "angular": 1.0},
+        {"linear": [1, 0, 0], "angular": [0, 0, 0]},
+        {"twist": twist(), "linear": {"x": 1}},
+        {"twist": twist(), "linear": {"x": 1}, "angular": {}},
+        {"twist": twist(), "header": {"stamp": 5}},
+        {"twist": twist(), "header": {"seq": 1}},
+        {"twist": {"twist": twist()}},
+    ],
+)
+def test_any_other_shape_is_refused_whole(body: object) -> None:
+    assert refused(body) == "wrong_shape"
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE)
+@pytest.mark.parametrize(("part", "axis"), AXES)
+def test_one_axis_that_is_not_finite_refuses_the_command_whole(
+    part: str, axis: str, bad: float
+) -> None:
+    body = twist()
+    body[part][axis] = bad
+    assert refused(body) == "not_finite"
+    assert refused({"header": {}, "twist": body}) == "not_finite"
+
+
+# wheels
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_wheel_speeds_are_the_twist_they_give(form: Format) -> None:
+    got = wheels(joints(4.0, 2.0, 2.0, 4.0), form).twist
+    assert got.linear == pytest.approx(0.05 * 3.0)
+    assert got.angular == pytest.approx(0.05 * 2.0 / 0.30)
+
+
+def test_wheels_are_found_by_their_names_in_any_order() -> None:
+    ordered = wheels(joints(1.0, 2.0, 4.0, 8.0)).twist
+    mixed = joints(4.0, 1.0, 8.0, 2.0, names=[JOINTS[2], JOINTS[0], JOINTS[3], JOINTS[1]])
+    assert wheels(mixed).twist == ordered
+
+
+def test_wheels_that_differ_on_one_side_give_the_mean_of_the_side() -> None:
+    assert wheels(joints(5.0, 1.0, 3.0, 3.0)).twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
+
+
+def test_joint_names_are_the_configured_ones() -> None:
+    receiver = Receiver(JointsConfig("fr", "fl", "rl", "rr"), KINEMATICS)
+    body = joints(1.0, 1.0, 1.0, 1.0, names=["rl", "fr", "rr", "fl"])
+    got = receiver.command(arrival(msgspec.msgpack.encode(body), key="wheel_cmd/app"))
+    assert got.twist.linear == pytest.approx(0.05)
+    assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {},
+        joints(),
+        joints(1.0, 2.0, 3.0),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0),
+        joints(1.0, 2.0, 3.0, names=JOINTS[:3]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS[:3], JOINTS[0]]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS[:3], "arm"]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS, JOINTS[0]]),
+        joints(1.0, 2.0, 3.0, 4.0, names=[*JOINTS, "arm"]),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS[:3], "arm", "hand"]),
+        joints(1.0, 2.0, 3.0, 4.0, 5.0, names=[*JOINTS, JOINTS[0]]),
+        {"velocity": [1.0, 2.0, 3.0, 4.0]},
+        {"name": JOINTS, "position": [1.0, 2.0, 3.0, 4.0]},
+    ],
+)
+def test_all_four_wheels_or_none(body: object) -> None:
+    assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("place", range(5))
+def test_the_joints_of_an_arm_among_the_wheels_are_not_for_us(form: Format, place: int) -> None:
+    names, speeds = list(JOINTS), [1.0, 2.0, 4.0, 8.0]
+    names.insert(place, "arm")
+    for arm in (0.0, 1e308, *(NOT_FINITE if form != "json" else ())):
+        velocity = [*speeds[:place], arm, *speeds[place:]]
+        others = {"position": [0.5] * 5, "effort": [0.0] * place + [arm] + [0.0] * (4 - place)}
+        body = joints(*velocity, names=names) | others
+        assert wheels(body, form).twist == wheels(joints(*speeds)).twist
+
+
+def test_what_an_arm_does_is_no_speed_of_the_wheels() -> None:
+    got = wheels(joints(0.0, 0.0, 0.0, 0.0, 3.0, names=[*JOINTS, "arm"]))
+    assert (got.twist, got.cancelled) == (Twist(), False)
+
+
+@pytest.mark.parametrize("bad", NOT_FINITE)
+@pytest.mark.parametrize("place", range(4))
+def test_one_wheel_that_is_not_finite_refuses_all_four(place: int, bad: float) -> None:
+    velocity = [1.0] * 4
+    velocity[place] = bad
+    assert refused(joints(*velocity), key="wheel_cmd/app") == "not_finite"
+
+
+@pytest.mark.parametrize("unused", ["position", "effort"])
+def test_a_number_that_is_not_finite_in_an_unused_field_refuses_too(unused: str) -> None:
+    body = joints(1.0, 1.0, 1.0, 1.0) | {unused: [0.0, math.nan]}
+    assert refused(body, key="wheel_cmd/app") == "not_finite"
+
+
+def test_wheel_speeds_that_overflow_are_refused() -> None:
+    assert refused(joints(1e308, 1e308, 1e308, 1e308), key="wheel_cmd/app") == "not_finite"
+    assert refused(joints(1e308, -1e308, -1e308, 1e308), key="wheel_cmd/app") == "not_finite"
+
+
+def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
+    assert refused(twist(), key="wheel_cmd/app") == "wrong_shape"
+    assert refused(joints(1.0, 1.0, 1.0, 1.0), key="cmd/app") == "wrong_shape"
+
+
+# wheel speeds that cancel each other
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(
+    ("speeds", "cancelled"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), False),
+        ((-0.0, 0.0, -0.0, 0.0), False),
+        ((5.0, 5.0, -5.0, -5.0), True),  # front against rear wheels
+        ((5.0, 0.0, 0.0, -5.0), True),  # the right wheels against each other
+        ((5.0, 5.0, 5.0, 5.0), False),
+        ((5.0, -5.0, -5.0, 5.0), False),
+    ],
+)
+def test_wheel_speeds_that_cancel_out_are_no_zero_of_one_who_let_go(
+    form: Format, speeds: tuple[float, ...], cancelled: bool
+) -> None:
+    got = wheels(joints(*speeds), form)
+    assert got.cancelled is cancelled
+    assert (got.twist == Twist(0.0, 0.0)) is (cancelled or not any(speeds))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize(("part", "axis"), AXES)
+def test_a_twist_of_axes_that_the_base_cannot_follow_is_no_zero_of_one_who_let_go(
+    form: Format, part: str, axis: str
+) -> None:
+    body = twist(0.0, 0.0)
+    body[part][axis] = 0.5
+    for one in (body, {"header": {}, "twist": body}):
+        got = command(one, form)
+        assert got.cancelled is (got.twist == Twist(0.0, 0.0))
+    assert not command(twist(0.0, 0.0), form).cancelled
+
+
+# payloads as ROS 2 itself writes them
+
+ORDERS = [b"\x00\x00\x00\x00", b"\x00\x01\x00\x00"]
+"""Headers of CDR: big endian and little endian."""
+
+
+def cdr(header: bytes, layout: str, *values: object) -> bytes:
+    return header + struct.pack((">" if header == ORDERS[0] else "<") + layout, *values)
+
+
+def native_twist(header: bytes = ORDERS[1], linear: float = 0.5, angular: float = 0.2) -> bytes:
+    return cdr(header, "6d", linear, 0, 0, 0, 0, angular)
+
+
+def native_stamped(header: bytes, frame: bytes, sec: int = 3, nanosec: int = 4) -> bytes:
+    pad = -(12 + len(frame) + 1) % 8
+    layout = f"iII{len(frame) + 1}s{pad}x6d"
+    return cdr(header, layout, sec, nanosec, len(frame) + 1, frame, 0.5, 0, 0, 0, 0, 0.2)
+
+
+def native_joints(header: bytes, velocity: list[float]) -> bytes:
+    names = b""
+    for joint in JOINTS:
+        names += bytes(-len(names) % 4)
+        names += cdr(header, f"I{len(joint) + 1}s", len(joint) + 1, joint.encode())[4:]
+    body = cdr(header, "iIIB3xI", 0, 0, 1, 0, len(JOINTS)) + names + bytes(-len(names) % 4)
+    body += cdr(header, "II", 0, len(velocity))[4:]
+    body += bytes(-(len(body) - 4) % 8)
+    return body + cdr(header, f"{len(velocity)}dI", *velocity, 0)[4:]
+
+
+@pytest.mark.parametrize("header", ORDERS)
+@pytest.mark.parametrize("encoding", ["", "zenoh/bytes", "application/cdr"])
+def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -> None:
+    payload = native_twist(header)
+    assert len(payload) == 52
+    got = RECEIVER.command(arrival(payload, encoding=encoding, stamp_ns=5))
+    plain = Command("app", Twist(0.5, 0.2), ARRIVED_NS, 5, "native/app", "native/app", shared=True)
+    assert got == plain
+
+
+@pytest.mark.parametrize("header", ORDERS)
+@pytest.mark.parametrize(("frame", "size"), [(b"", 68), (b"base_link", 76)])
+def test_a_native_stamped_twist_is_a_command_with_its_stamp(
+    header: bytes, frame: bytes, size: int
+) -> None:
+    payload = native_stamped(header, frame)
+    assert len(payload) == size
+    got = RECEIVER.command(arrival(payload, stamp_ns=5))
+    assert (got.twist, got.stamp_ns, got.clock) == (Twist(0.5, 0.2), 3_000_000_004, HEADER_S)
+
+
+@pytest.mark.parametrize("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
+def test_a_native_stamped_twist_may_have_any_frame(frame: bytes) -> None:
+    assert RECEIVER.command(arrival(native_stamped(ORDERS[1], frame))).twist == Twist(0.5, 0.2)
+
+
+@pytest.mark.parametrize("surplus", range(4))
+@pytest.mark.parametrize("fill", [b"\x00", b"\xff"])
+def test_the_padding_of_dds_makes_no_other_command(surplus: int, fill: bytes) -> None:
+    more = fill * surplus
+    assert RECEIVER.command(arrival(native_twist() + more)).twist == Twist(0.5, 0.2)
+    for frame in (b"", b"base_link"):
+        got = RECEIVER.command(arrival(native_stamped(ORDERS[1], frame) + more))
+        assert (got.twist, got.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
+
+
+TOLD = {
+    "Twist": "application/cdr;geometry_msgs/msg/Twist",
+    "TwistStamped": "application/cdr;geometry_msgs/msg/TwistStamped",
+}
+"""Encodings that an rmw key states for its payload."""
+
+
+@each("surplus", [*range(9), 16, 24, 200])
+@each("fill", [b"\x00", b"\xff"])
+@each("header", ORDERS)
+def test_surplus_bytes_of_any_length_make_no_other_command_where_the_type_is_told(
+    header: bytes, fill: bytes, surplus: int
+) -> None:
+    more = fill * surplus
+    plain = arrival(native_twist(header) + more, encoding=TOLD["Twist"], stamp_ns=5)
+    assert RECEIVER.command(plain) == RECEIVER.command(
+        arrival(native_twist(header), encoding=TOLD["Twist"], stamp_ns=5)
+    )
+    for frame in (b"", b"base_link"):
+        payload = native_stamped(header, frame) + more
+        got = RECEIVER.command(arrival(payload, encoding=TOLD["TwistStamped"]))
+        assert (got.twist, got.stamp_ns) == (Twist(0.5, 0.2), 3_000_000_004)
+
+
+@each("size", range(4, 68))
+def test_where_the_type_is_told_a_twist_is_no_stamped_twist_of_that_length(size: int) -> None:
+    payload = (native_twist() + bytes(68))[:size]
+    assert refusal(arrival(payload, encoding=TOLD["TwistStamped"])) == "malformed"
+
+
+@each("size", range(4, 76))
+@each("encoding", ["", "application/cdr", TOLD["TwistStamped"]])
+def test_a_native_stamped_twist_that_is_cut_is_never_a_stamped_twist(
+    encoding: str, size: int
+) -> None:
+    payload = native_stamped(ORDERS[1], b"base_link")[:size]
+    if encoding != TOLD["TwistStamped"] and 52 <= size < 56:
+        # This size is also that of a Twist, and nothing else distinguishes them.
+        assert RECEIVER.command(arrival(payload, encoding=encoding)).stamp_ns is None
+    else:
+        between = encoding != TOLD["TwistStamped"] and 56 <= size < 68
+        reason = "wrong_shape" if between else "malformed"
+        assert refusal(arrival(payload, encoding=encoding)) == reason
+
+
+@pytest.mark.parametrize("header", ORDERS)
+def test_native_wheel_speeds_are_the_twist_they_give(header: bytes) -> None:
+    payload = native_joints(header, [4.0, 2.0, 2.0, 4.0])
+    got = RECEIVER.command(arrival(payload, key="wheel_cmd/app"))
+    assert got.twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
+
+
+@pytest.mark.parametrize("header", ORDERS)
+@pytest.mark.parametrize("bad", NOT_FINITE)
+def test_a_native_number_that_is_not_finite_is_refused(header: bytes, bad: float) -> None:
+    for place in range(6):
+        axes = [0.1 * place] * 6
+        axes[place] = bad
+        assert refusal(arrival(cdr(header, "6d", *axes))) == "not_finite"
+    for place in range(4):
+        speeds = [1.0] * 4
+        speeds[place] = bad
+        payload = native_joints(header, speeds)
+        assert refusal(arrival(payload, key="wheel_cmd/app")) == "not_finite"
+
+
+@each("size", [n for n in range(4, 68) if not 52 <= n <= 55])
+def test_no_native_twist_has_another_length(size: int) -> None:
+    payload = (native_twist() + bytes(68))[:size]
+    assert refusal(arrival(payload)) == ("malformed" if size < 52 else "wrong_shape")
+
+
+@pytest.mark.parametrize(
+    ("key", "payload"),
+    [
+        ("cmd/app", native_stamped(ORDERS[1], b"", nanosec=1_000_000_000)),
+        ("cmd/app", native_stamped(ORDERS[1], b"\xff\xfe")),
+        ("cmd/app", native_stamped(ORDERS[1], b"").replace(b"\x01\0\0\0\0", b"\x01\0\0\0x")),
+        ("cmd/app", b"\x00\x01\x00\x00" + b"\xff" * 64),
+        ("wheel_cmd/app", native_twist()),
+        ("wheel_cmd/app", native_joints(ORDERS[1], [1.0] * 4)[:-1]),
+    ],
+    ids=["nanosec", "not utf-8", "no end of string", "lengths", "another type", "cut"],
+)
+def test_a_native_payload_that_is_not_the_message_is_malformed(key: str, payload: bytes) -> None:
+    assert refusal(arrival(payload, key=key)) == "malformed"
+
+
+def empty_names(size: int) -> bytes:
+    """Return a JointState of `size` bytes with as many empty names as fit."""
+    count = (size - 24) // 4
+    return cdr(ORDERS[1], "iIIB3xI", 0, 0, 1, 0, count) + bytes(4 * count)
+
+
+def test_more_names_than_any_robot_has_are_refused_for_their_number_alone() -> None:
+    payload = empty_names(MAX_COMMAND_BYTES)
+    assert len(payload) == MAX_COMMAND_BYTES
+    # the decoder looked at no item
+    for more in (payload, payload[:24] + b"\xff" * len(payload[24:])):
+        with pytest.raises(DecodeError, match=r"1018 items where 64 may be"):
+            RECEIVER.command(arrival(more, key="wheel_cmd/app"))
+
+
+def test_native_wheel_speeds_are_all_four_or_none() -> None:
+    for count in (0, 3, 5):
+        payload = native_joints(ORDERS[1], [1.0] * count)
+        assert refusal(arrival(payload, key="wheel_cmd/app")) == "wrong_wheels"
+
+
+def test_a_native_command_has_the_same_limit_as_any_other() -> None:
+    largest = native_stamped(ORDERS[1], b"f" * 4027) + bytes(4)
+    assert len(largest) == MAX_COMMAND_BYTES
+    assert RECEIVER.command(arrival(largest)).twist == Twist(0.5, 0.2)
+    assert refusal(arrival(largest + b"\0")) == "too_big"
+
+
+# the transport of a sample
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["cmd/*", "cmd/**", "**", "*/app", "wheel_cmd/*", "wheel_cmd/**", "cmd/a$*", "*",
+     "acsard/*/cmd/app", "cmd/app/anna/more", "cmd/app/*", "acsard/**"],
+)  # fmt: skip
+def test_a_command_needs_its_exact_key(key: str) -> None:
+    assert refused(twist(), key=key) == "wildcard"
+
+
+@pytest.mark.parametrize("key", ["cmd/app", "wheel_cmd/app"])
+def test_a_delete_is_not_a_command(key: str) -> None:
+    assert refused(twist(), key=key, put=False) == "not_a_put"
+
+
+def test_a_command_may_be_as_big_as_the_limit_and_no_bigger() -> None:
+    text = encode(twist(), "json")
+    largest = text + b" " * (MAX_COMMAND_BYTES - len(text))
+    assert RECEIVER.command(arrival(largest)).twist == Twist(0.5, 0.2)
+    assert refusal(arrival(largest + b" ")) == "too_big"
+    assert refusal(arrival(largest + b" ", key="wheel_cmd/app")) == "too_big"
+
+
+def test_no_reason_outweighs_another_refusal() -> None:
+    assert refusal(arrival(b"", key="cmd/*", put=False)) == "wildcard"
+
+
+# the clock of a stamp
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 5])
+def test_the_stamp_of_the_header_counts_before_that_of_the_arrival(stamp_ns: int | None) -> None:
+    got = command(stamped(1_700_000_000, 500_000_000), stamp_ns=stamp_ns)
+    assert got.stamp_ns == 1_700_000_000_500_000_000
+
+
+@pytest.mark.parametrize("stamp_ns", [None, 5])
+def test_a_header_stamp_of_zero_is_none(stamp_ns: int | None) -> None:
+    assert command(stamped(0), stamp_ns=stamp_ns).stamp_ns == stamp_ns
+    assert command(twist(), stamp_ns=stamp_ns).stamp_ns == stamp_ns
+
+
+def test_wheel_commands_are_stamped_the_same_way() -> None:
+    body = joints(1.0, 1.0, 1.0, 1.0)
+    header = {"header": {"stamp": {"sec": 9, "nanosec": 1}}}
+    assert wheels(body | header, stamp_ns=5).stamp_ns == 9_000_000_001
+    assert wheels(body, stamp_ns=5).stamp_ns == 5
+
+
+def test_the_clock_is_the_one_of_the_arrival_s_sender_else_of_the_key() -> None:
+    assert command(twist(), sender="z1").clock == public_name("z1")
+    assert command(twist(), sender="").clock == "native/app"
+
+
+def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
+    assert command(stamped(1), stamp_ns=2).arrived_ns == ARRIVED_NS
+
+
+# services
+
+
+@pytest.mark.parametrize("verb", ["stop", "deactivate", "reset_odometry"])
+@pytest.mark.parametrize("payload", [b"", b"{}", b"\xff garbage"])
+def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes) -> None:
+    assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
+
+
+@pytest.mark.parametrize("verb", ["clear", "activate"])
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_clear_and_activate_take_the_number_of_a_latch(form: Format, verb: Verb) -> None:
+    payload = encode({"latch": 1_800_000_000_123}, form)
+    request = Receiver.request(verb, 7, "", payload, 5)
+    assert request == Request(verb, 7, asked_ns=5, latch=1_800_000_000_123)
+
+
+@pytest.mark.parametrize("verb", ["clear", "activate"])
+@pytest.mark.parametrize("payload", [b"", b"{}", b'{"latch": null}', b"\x80"])
+def test_clear_and_activate_may_come_without_a_number(payload: bytes, verb: Verb) -> None:
+    assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"\xff garbage", b'{"latch": "5"}', b'{"latch": -1}', b'{"latch": 5.5}', b'{"stop": 5}',
+     b'{"latch": 9007199254740992}', b'{"latch": true}'],
+)  # fmt: skip
+@pytest.mark.parametrize("verb", ["clear", "activate"])
+def test_clear_and_activate_refuse_any_other_payload(payload: bytes, verb: Verb) -> None:
+    with pytest.raises(DecodeError):
+        Receiver.request(verb, 7, "", payload)
+
+
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_set_pose_takes_x_y_and_yaw(form: Format) -> None:
+    payload = encode({"x": 1.5, "y": -2, "yaw": 0.5}, form)
+    assert Receiver.request("set_pose", 7, "", payload) == Request(
+        "set_pose", 7, Pose(1.5, -2.0, 0.5)
+    )
+
+
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [
+        ({}, "wrong_shape"),
+        ({"x": 1.0, "y": 2.0}, "wrong_shape"),
+        ({"x": 1.0, "y": 2.0, "yaw": "0"}, "wrong_shape"),
+        ({"x": 1.0, "y": 2.0, "yaw": 0.0, "z": 0.0}, "wrong_shape"),
+        ({"x": math.nan, "y": 0.0, "yaw": 0.0}, "not_finite"),
+        ({"x": 0.0, "y": math.inf, "yaw": 0.0}, "not_finite"),
+        ({"x": 0.0, "y": 0.0, "yaw": -math.inf}, "not_finite"),
+        ({"x": 1.1e6, "y": 0.0, "yaw": 0.0}, "not_finite"),
+        ({"x": 0.0, "y": -1.1e6, "yaw": 0.0}, "not_finite"),
+    ],
+)
+def test_set_pose_refuses_what_is_not_a_pose(body: object, reason: str) -> None:
+    with pytest.raises(DecodeError) as caught:
+        Receiver.request("set_pose", 7, "", msgspec.msgpack.encode(body))
+    assert caught.value.reason == reason
+
+
+def test_set_pose_needs_a_payload() -> None:
+    with pytest.raises(DecodeError):
+        Receiver.request("set_pose", 7, "", b"")
+
+
+# damage
+
+BODIES: list[tuple[str, dict[str, Any]]] = [
+    ("cmd/app", twist()),
+    ("cmd/app", stamped(1_700_000_000, 5)),
+    ("cmd/app", {"linear": {}, "angular": {}}),
+    ("wheel_cmd/app", joints(1.0, -2.0, 3.5, 0.0)),
+]
+VALID = [(key, written(body, form)) for key, body in BODIES for form in FORMATS]
+VALID += [
+    ("cmd/app", native_twist(ORDERS[0])),
+    ("cmd/app", native_stamped(ORDERS[0], b"base_link")),
+    ("wheel_cmd/app", native_joints(ORDERS[0], [1.0, -2.0, 3.5, 0.0])),
+]
+
+NASTY = [
+    b"\x00", b"\xff", b"\xc0", b"\xc1", b"\xed\xa0\x80", b"\xdd\xff\xff\xff\xff",
+    b"\xdb\x7f\xff\xff\xff", b"\x91" * 1500, b"[" * 1500, b'{"linear":' * 300,
+    b"\x81\xa6linear" * 400, b"NaN", b"1e999", b"-",
+    b"\xcb\x7f\xf8\x00\x00\x00\x00\x00\x00", b"\xca\xff\x80\x00\x00", b"\xcf" + b"\xff" * 8,
+    b"\xd3\x80" + b"\x00" * 7, b"9" * 60, b"\\ud800", b'"', b"}", b"\xc9\x7f\xff\xff\xff\x01",
+]  # fmt: skip
+
+
+def damage(payload: bytes, other: bytes, rnd: random.Random) -> bytes:
+    """Return a valid payload with one or two random changes.
+
+    They are bit flips, cuts, copies, splices and other numbers.
+    """
+    for _ in range(rnd.randint(1, 2)):
+        a = rnd.randrange(len(payload) + 1)
+        b = min(len(payload), a + rnd.randint(0, 12))
+        match rnd.randrange(7):
+            case 0 if payload:
+                i = rnd.randrange(len(payload))
+                payload = (
+                    payload[:i] + bytes([payload[i] ^ 1 << rnd.randrange(8)]) + payload[i + 1 :]
+                )
+            case 1:
+                payload = payload[:a]
+            case 2:
+                payload = payload[:a] + payload[b:]
+            case 3:
+                payload = payload[:b] + payload[a:]
+            case 4:
+                payload = payload[:a] + other[rnd.randrange(len(other) + 1) :]
+            case 5:
+                # The length is right but the value is not a number, which JSON cannot write.
+                number = rnd.choice([math.nan, math.inf, -math.inf, 1e308, -5e-324])
+                i = payload.find(b"\xcb", a)
+                if payload[:1] == b"\0":
+                    i = 4 + (a & ~7)
+                    payload = payload[:i] + struct.pack("<d", number) + payload[i + 8 :]
+                elif i >= 0:
+                    payload = payload[:i] + msgspec.msgpack.encode(number) + payload[i + 9 :]
+            case _:
+                payload = payload[:a] + rnd.choice(NASTY) + payload[b:]
+    return payload
+
+
+def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> None:
+    rnd = random.Random(20_000)
+    encodings = ["", "", "", "application/json", "application/msgpack", "application/cdr"]
+    reasons: dict[str, int] = {}
+    for _ in range(20_000):
+        key, payload = rnd.choice(VALID)
+        data = damage(payload, rnd.choice(VALID)[1], rnd)
+        try:
+            got = RECEIVER.command(arrival(data, key, encoding=rnd.choice(encodings)))
+        except DecodeError as error:
+            reasons[error.reason] = reasons.get(error.reason, 0) + 1
+            msgspec.json.encode(str(error))  # its text is published
+        else:
+            assert math.isfinite(got.twist.linear)
+            assert math.isfinite(got.twist.angular)
+            assert got.arrived_ns == ARRIVED_NS
+            reasons["accepted"] = reasons.get("accepted", 0) + 1
+    expected = {"accepted", "malformed", "wrong_shape", "unknown_encoding", "wrong_wheels"}
+    assert expected | {"not_finite", "too_big"} == set(reasons)
+
+
+@pytest.mark.parametrize("digits", [19, 40, 400, 4000])
+def test_a_stamp_beyond_any_clock_is_refused(digits: int) -> None:
+    body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * digits)
+    with pytest.raises(DecodeError):
+        RECEIVER.command(arrival(body.encode()))
+
+
+def test_whatever_the_receiver_lets_through_the_arbiter_survives() -> None:
+    body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * 400)
+    try:
+        got = RECEIVER.command(arrival(body.encode()))
+    except DecodeError:
+        return
+    Arbiter(CommandsConfig()).accept(got)
+
+
+def test_a_header_beside_a_bare_twist_is_neither_a_twist_nor_a_stamped_one() -> None:
+    with pytest.raises(DecodeError):
+        RECEIVER.command(arrival(b'{"header":{"stamp":{"sec":5}},"linear":{"x":1},"angular":{}}'))
+
+
+# samples on a ROS key
+
+GID = bytes(range(16))
+SENT_NS = 1_700_000_000_000_000_000
+
+
+def by_ros(via: str, body: dict[str, Any], **changes: Any) -> Arrival:
+    given: dict[str, Any] = {"key": "cmd/nav", "encoding": "application/cdr", "via": via} | changes
+    if via == "rmw":
+        given.setdefault("attachment", Attachment(1, SENT_NS, GID).pack())
+    return arrival(written(body, "cdr"), **given)
+
+
+def test_over_rmw_the_attachment_says_who_sent_it_and_when() -> None:
+    command = RECEIVER.command(by_ros("rmw", twist(), stamp_ns=5, sender="router"))
+    gid = f"gid {public_name(GID.hex())}"
+    assert command == Command(
+        "nav", Twist(0.5, 0.2), ARRIVED_NS, SENT_NS, gid, gid, sequence=1, ros=True
+    )
+
+
+def test_over_rmw_the_message_s_own_stamp_goes_before_the_attachment_s() -> None:
+    command = RECEIVER.command(by_ros("rmw", stamped(12, 34)))
+    assert (command.stamp_ns, command.clock) == (
+        12_000_000_034,
+        f"gid {public_name(GID.hex())}, header on rmw/cmd/nav",
+    )
+    assert RECEIVER.command(by_ros("rmw", stamped(0))).stamp_ns == SENT_NS
+
+
+@pytest.mark.parametrize(
+    ("attachment", "reason"),
+    [
+        (b"", "no_attachment"),
+        (b"rqh" + bytes(17), "bad_attachment"),
+        (Attachment(1, SENT_NS, GID).pack() + b"x", "bad_attachment"),
+    ],
+)
+def test_over_rmw_nothing_counts_without_its_attachment(attachment: bytes, reason: str) -> None:
+    assert refusal(by_ros("rmw", twist(), attachment=attachment)) == reason
+
+
+def test_by_a_bridge_any_attachment_is_ignored() -> None:
+    command = RECEIVER.command(by_ros("bridge", twist(), attachment=b"rqh" + bytes(17)))
+    assert command.twist == Twist(0.5, 0.2)
+    assert command.stamp_ns is None
+
+
+def test_by_a_bridge_the_clock_is_its_timestamp_s_or_else_a_name_no_native_key_has() -> None:
+    assert RECEIVER.command(by_ros("bridge", twist())).clock == "bridge/nav"
+    seen = RECEIVER.command(by_ros("bridge", twist(), stamp_ns=SENT_NS, sender="router"))
+    assert (seen.stamp_ns, seen.clock) == (SENT_NS, f"bridge/{public_name('router')}")
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_joint_commands_are_wheel_speeds_of_their_source(via: str) -> None:
+    command = RECEIVER.command(
+        by_ros(via, joints(6.0, 2.0, 2.0, 6.0), key="wheel_cmd/ros2_control")
+    )
+    assert command.source == "ros2_control"
+    assert command.twist == KINEMATICS.twist(WheelSpeeds(6.0, 2.0, 2.0, 6.0))
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_joint_commands_before_the_controller_is_active_are_refused(via: str) -> None:
+    nan = by_ros(via, joints(math.nan, 0.0, 0.0, 0.0), key="wheel_cmd/ros2_control")
+    assert refusal(nan) == "not_finite"
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_a_wildcard_put_or_a_delete_on_a_ros_key_is_no_command(via: str) -> None:
+    assert refusal(by_ros(via, twist(), key="cmd_*")) == "wildcard"
+    assert refusal(by_ros(via, twist(), put=False)) == "not_a_put"
+
+
+def test_the_clock_of_a_header_is_another_than_the_router_s_that_stamped_two_senders() -> None:
+    """A router stamps for every sender behind it. A header shows the sender's own clock."""
+    arbiter = Arbiter(CommandsConfig())
+    reasons = []
+    for step in range(20):
+        at_ns = ARRIVED_NS + step * 50_000_000
+        now_ns = SENT_NS + step * 50_000_000
+        slow = stamped(*divmod(now_ns - 10**9, 10**9))
+        for body, key in ((twist(), "cmd/nav"), (slow, "cmd/teleop")):
+            came = replace(
+                by_ros("bridge", body, key=key, stamp_ns=now_ns, sender="router"), arrived_ns=at_ns
+            )
+            reasons.append(arbiter.accept(RECEIVER.command(came)))
+    assert set(reasons[:10]) == {"unproven"}
+    assert set(reasons[12:]) == {""}
+
+
+# the sender
+
+
+def test_the_sender_over_rmw_is_the_publisher() -> None:
+    other = Attachment(1, SENT_NS, bytes(16)).pack()
+    name = f"gid {public_name(GID.hex())}"
+    assert RECEIVER.command(by_ros("rmw", twist(), sender="router")).sender == name
+    assert RECEIVER.command(by_ros("rmw", twist(), attachment=other)).sender != name
+
+
+def test_the_sender_of_a_stamped_sample_is_the_session_that_stamped_it() -> None:
+    assert command(twist(), sender="z1", stamp_ns=5).sender == public_name("z1")
+    bridged = RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5))
+    assert bridged.sender == f"bridge/{public_name('z2')}"
+
+
+def test_the_sender_of_an_unstamped_sample_is_its_source_in_its_tree() -> None:
+    assert command(twist()).sender == wheels(joints(1.0, 1.0, 1.0, 1.0)).sender == "native/app"
+    assert RECEIVER.command(by_ros("bridge", twist())).sender == "bridge/nav"
+
+
+def test_a_header_s_stamp_changes_no_sender() -> None:
+    assert command(stamped(12)).sender == "native/app"
+    assert RECEIVER.command(by_ros("rmw", stamped(12))).sender == f"gid {public_name(GID.hex())}"
+
+
+def test_one_who_sends_what_cannot_be_read_is_the_same_sender_as_before() -> None:
+    good = arrival(written(twist(), "json"), sender="z1", stamp_ns=5)
+    assert sender(replace(good, payload=b"hello")) == RECEIVER.command(good).sender
+    ros = by_ros("rmw", twist())
+    assert sender(replace(ros, payload=b"")) == RECEIVER.command(ros).sender
+
+
+def test_half_a_gid_passes_for_no_other_sender() -> None:
+    nameless = public_name("z1")
+    assert sender(by_ros("rmw", twist(), attachment=bytes.fromhex(nameless))) == ""
+
+
+# the project's own attachment
+
+
+JOYSTICK = public_name("joystick/s3cret")
+
+
+def signed(**told: Any) -> bytes:
+    return msgspec.msgpack.encode({"sender": "joystick/s3cret"} | told)
+
+
+def test_our_attachment_says_who_sent_it_when_and_as_which() -> None:
+    told = command(twist(), attachment=signed(stamp=9, sequence=3), sender="z1", stamp_ns=5)
+    assert (told.sender, told.clock, told.stamp_ns) == (JOYSTICK, JOYSTICK, 9)
+    assert (told.sequence, told.shared) == (3, False)
+
+
+def test_a_message_s_own_stamp_goes_before_our_attachment_s() -> None:
+    told = command(stamped(12), attachment=signed(stamp=9))
+    assert told.stamp_ns == 12_000_000_000
+    assert told.clock == f"{JOYSTICK}, header on native/cmd/app"
+    assert told.sender == JOYSTICK
+
+
+def test_without_a_stamp_of_its_own_our_attachment_s_sender_has_zenoh_s() -> None:
+    assert command(twist(), attachment=signed(), sender="z1", stamp_ns=5).stamp_ns == 5
+    assert command(twist(), attachment=signed()).stamp_ns is None
+
+
+def test_an_attachment_that_is_not_ours_changes_nothing() -> None:
+    for attachment in (b"trace", b"{}", b"\x80", signed()[:-1]):
+        assert command(twist(), attachment=attachment).sender == "native/app"
+
+
+def test_many_may_look_like_one_by_a_bridge_or_by_their_key_alone() -> None:
+    assert RECEIVER.command(by_ros("bridge", twist())).shared
+    assert RECEIVER.command(by_ros("bridge", twist(), sender="z2", stamp_ns=5)).shared
+    assert RECEIVER.command(by_ros("bridge", twist(), attachment=signed())).shared
+    assert command(twist()).shared
+    assert command(stamped(12)).shared
+    assert not command(twist(), sender="z2", stamp_ns=5).shared
+    assert command(twist(), stamp_ns=5).shared  # the stamp of a router
+    assert not command(twist(), attachment=signed()).shared
+
+
+@pytest.mark.parametrize(
+    ("ahead_ns", "replaced"), [(0, False), (500_000_000, False), (500_000_001, True)]
+)
+def test_a_stamp_that_zenoh_replaced_is_known_by_how_far_ahead_the_sender_s_own_is(
+    ahead_ns: int, replaced: bool
+) -> None:
+    attachment = signed(stamp=SENT_NS + ahead_ns)
+    told = command(twist(), attachment=attachment, received_ns=SENT_NS)
+    assert told.stamp_replaced == replaced
+    assert told.stamp_ns == SENT_NS + ahead_ns
+    assert not command(twist(), attachment=attachment).stamp_replaced
+    assert not command(twist(), received_ns=SENT_NS).stamp_replaced
+
+
+# certificates
+
+
+def test_the_certificate_in_the_key_is_part_of_the_sender_s_name() -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS)
+    came = arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed(stamp=9))
+    told = receiver.command(came)
+    assert (told.source, told.sender, told.clock) == ("app", *[f"{JOYSTICK} [anna]"] * 2)
+    assert sender(came) == told.sender
+    by_zenoh = receiver.command(replace(came, attachment=b"", sender="z1", stamp_ns=5))
+    assert by_zenoh.sender == f"{public_name('z1')} [anna]"
+    by_key = receiver.command(replace(came, attachment=b""))
+    assert (by_key.sender, by_key.shared) == ("native/app/anna", True)
+
+
+@pytest.mark.parametrize(("first", "second"), [("", "/anna"), ("/anna", ""), ("/anna", "/ben")])
+def test_a_sender_id_under_a_second_certificate_is_refused(first: str, second: str) -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS)
+    came = arrival(written(twist(), "json"), key=f"cmd/app{first}", attachment=signed())
+    receiver.command(came)
+    with pytest.raises(DecodeError, match="first seen under") as raised:
+        receiver.command(replace(came, key=f"cmd/app{second}"))
+    assert raised.value.reason == "other_certificate"
+    assert receiver.command(came).sender == sender(came)
+
+
+def test_what_many_share_and_what_comes_by_ros_is_bound_to_no_certificate() -> None:
+    receiver = Receiver(JointsConfig(), KINEMATICS)
+    receiver.command(arrival(written(twist(), "json"), key="cmd/app/anna", attachment=signed()))
+    bridged = by_ros("bridge", twist(), key="cmd/app", attachment=signed())
+    assert receiver.command(bridged).sender == "bridge/app"
+    for key in ("cmd/app", "cmd/app/anna", "cmd/app/ben"):
+        assert receiver.command(arrival(written(twist(), "json"), key=key)).shared

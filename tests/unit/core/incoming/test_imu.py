@@ -1,0 +1,158 @@
+"""A gyro's sample on the bus is read in every encoding, or refused whole with the reason."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, ImuTold, reading
+from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
+from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
+from acsard.core.values import Event, GyroSample
+
+ZEROS = [0.0] * 9
+FULL = Imu(
+    Header(Time(12, 5), "imu_link"),
+    Quaternion(0.1, 0.2, 0.3, 0.9),
+    [-1.0, *ZEROS[1:]],
+    Vector3(0.01, -0.02, 0.75),
+    [1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 4e-4],
+    Vector3(0.1, 0.0, 9.81),
+    ZEROS,
+)
+
+
+def arrival(
+    payload: bytes, encoding: str = "", at_ns: int = 7, who: str = "imu", put: bool = True
+) -> Arrival:
+    return Arrival("imu", put, payload, encoding, at_ns, None, who)
+
+
+def said(at_ns: int = 7, who: str = "imu", **fields: Any) -> Arrival:
+    """Return a sample in hand-written JSON."""
+    return arrival(json.dumps(fields).encode(), at_ns=at_ns, who=who)
+
+
+def turning(rate: float, at_ns: int = 7, who: str = "imu") -> Arrival:
+    return said(at_ns, who, angular_velocity={"z": rate})
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("form", FORMATS)
+def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
+    encoding = encoding_name(form, "Imu") if named else ""
+    got = reading(arrival(encode(FULL, form), encoding))
+    assert got == GyroSample(7, 12_000_000_005, 0.75, 4e-4)
+
+
+def test_of_json_only_the_angular_velocity_is_required() -> None:
+    assert reading(turning(-0.5)) == GyroSample(7, None, -0.5, 0.0)
+
+
+@given(st.binary(max_size=400))
+def test_whatever_comes_is_a_sample_or_refused(payload: bytes) -> None:
+    counters = Counter[str]()
+    sample = ImuTold().hear(arrival(payload), counters, [])
+    assert counters.total() == (sample is None)
+
+
+@given(st.floats(allow_nan=True, allow_infinity=True))
+def test_no_rate_is_let_in_that_no_base_has(rate: float) -> None:
+    imu = Imu(Header(), Quaternion(), ZEROS, Vector3(z=rate), ZEROS, Vector3(), ZEROS)
+    if abs(rate) <= MAX_RATE:
+        assert reading(arrival(encode(imu, "cdr"))).rate == rate
+        return
+    with pytest.raises(DecodeError) as refused:
+        reading(arrival(encode(imu, "cdr")))
+    assert refused.value.reason == ("absurd" if math.isfinite(rate) else "not_finite")
+
+
+REFUSED: dict[str, Arrival] = {
+    "wrong_shape": said(linear_acceleration={"z": 9.81}),
+    "malformed": arrival(encode(FULL, "cdr")[:100]),
+    "unknown_encoding": arrival(b"0.5"),
+    "not_finite": arrival(
+        encode(
+            Imu(Header(), Quaternion(), ZEROS, Vector3(x=math.nan), ZEROS, Vector3(), ZEROS), "cdr"
+        )
+    ),
+    "absurd": turning(50.1),
+    "no_rate": said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[-1.0, *ZEROS[1:]]),
+    "too_big": arrival(b"{" + b" " * 5000),
+    "not_a_put": arrival(encode(FULL, "json"), put=False),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSED)
+def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
+    counters, events = Counter[str](), list[Event]()
+    assert ImuTold().hear(REFUSED[reason], counters, events) is None
+    assert counters == {f"imu_{reason}": 1}
+    (event,) = events
+    assert (event.name, event.kind, event.level) == ("imu_refused", reason, "warning")
+
+
+def test_a_negative_variance_is_none() -> None:
+    with pytest.raises(DecodeError, match="a variance of -1"):
+        reading(said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[0.0] * 8 + [-1.0]))
+
+
+class Daemon:
+    def __init__(self) -> None:
+        self.told, self.counters, self.events = ImuTold(), Counter[str](), list[Event]()
+
+    def hears(self, rate: float, at_ns: int, who: str) -> bool:
+        got = self.told.hear(turning(rate, at_ns, who), self.counters, self.events)
+        assert got is None or got.rate == rate
+        return got is not None
+
+
+def test_of_two_gyros_the_first_is_followed_until_it_is_silent() -> None:
+    daemon = Daemon()
+    assert daemon.hears(0.1, 0, "one")
+    assert not daemon.hears(0.2, FOLLOWED_NS // 2, "other")
+    assert daemon.hears(0.1, FOLLOWED_NS - 1, "one")
+    assert not daemon.hears(0.2, 2 * FOLLOWED_NS - 2, "other")
+    assert daemon.counters == {"imu_second_sender": 2}
+    assert daemon.hears(0.2, 2 * FOLLOWED_NS, "other")
+    assert not daemon.hears(0.1, 2 * FOLLOWED_NS + 1, "one")
+
+
+def test_the_first_sample_of_another_gyro_says_that_it_is_one() -> None:
+    told, anew = ImuTold(), []
+    heard = [(0, "one"), (1, "one"), (FOLLOWED_NS + 1, "other"), (FOLLOWED_NS + 2, "other")]
+    for at_ns, who in heard:
+        sample = told.hear(turning(0.1, at_ns, who), Counter(), [])
+        assert sample is not None
+        anew.append(sample.anew)
+    assert anew == [False, False, True, False]
+
+
+def test_who_comes_back_after_a_silence_is_no_other() -> None:
+    told = ImuTold()
+    for at_ns in (0, 10 * FOLLOWED_NS):
+        sample = told.hear(turning(0.1, at_ns, "one"), Counter(), [])
+        assert sample == GyroSample(at_ns, None, 0.1)
+
+
+def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_silent() -> None:
+    counters, events = Counter[str](), list[Event]()
+    told = ImuTold(own=True)
+    assert told.hear(turning(0.2, 0, "other"), counters, events) is None
+    assert told.hear(turning(0.1, 10 * FOLLOWED_NS, OWN), counters, events) is not None
+    assert told.hear(turning(0.2, 20 * FOLLOWED_NS, "other"), counters, events) is None
+    assert counters == {"imu_second_sender": 2}
+    assert "simulat" in events[0].text
+
+
+def test_what_is_refused_keeps_nobody_out() -> None:
+    daemon = Daemon()
+    daemon.told.hear(REFUSED["absurd"], daemon.counters, daemon.events)
+    assert daemon.hears(0.1, 8, "other")

@@ -1,0 +1,645 @@
+"""Every row of the table answers as designed, and a service runs only under its exact key."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.parsing import effective, from_builtins
+from acsard.core.config.settings import Config, JointsConfig, LimitsConfig, RobotConfig, RosConfig
+from acsard.core.incoming.commands import EXAMPLES
+from acsard.core.incoming.queries import BUSY, Queries, Query, Reply, most_bytes, refused
+from acsard.core.messages.cdr import Cdr
+from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.report import Report
+from acsard.core.messages.schema import MESSAGES, Info, Interfaces, Message, ServiceReply, Topics
+from acsard.core.messages.signature import public_name
+from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, offered
+from acsard.core.ros import parameters as rcl
+from acsard.core.ros.attachments import Attachment, unpack
+from acsard.core.ros.transports import PARAMETER_SERVICES, TRIGGERS
+from acsard.core.values import ROLES, Answer, Outputs, Plain, Pose, Request
+from tests.each import each
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
+
+NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics")
+"""Published keys whose types are ROS messages and therefore have a CDR form."""
+
+CONFIG = Config(robot=RobotConfig("r7"))
+WALL_NS = 1_700_000_000_000_000_000
+NO = rcl.SetParametersResult(False, "needs the header of plain CDR, has 00")
+INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
+
+WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
+"""Key expressions with which a client may query more than one key.
+
+The prefix is removed only from those that contain it.
+"""
+
+
+def queries(config: Config = CONFIG) -> Queries:
+    return Queries(config, INFO)
+
+
+def report() -> Report:
+    made = Report(CONFIG, START)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    return made
+
+
+def nothing(_: str) -> Message | None:
+    return None
+
+
+def query(topic: str, asked: str | None = None, fmt: str = "", **changes: Any) -> Query:
+    given: dict[str, Any] = {"ticket": 7, "payload": b"", "encoding": ""} | changes
+    return Query(topic=topic, asked=topic if asked is None else asked, fmt=fmt, **given)
+
+
+def answers(asked: Query, outputs: Outputs | None = OUTPUTS) -> list[Reply]:
+    made = report()
+    got = queries().serve(asked, lambda key: made.current(key, lambda: SNAPSHOT), outputs)
+    assert isinstance(got, list)
+    return got
+
+
+def answer(asked: Query, outputs: Outputs | None = OUTPUTS) -> Reply:
+    (reply,) = answers(asked, outputs)
+    return reply
+
+
+# readable keys
+
+
+@pytest.mark.parametrize("topic", [t for t in PUBLISHED if not t.simulated], ids=lambda t: t.key)
+@pytest.mark.parametrize("form", ["msgpack", "json"])
+def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -> None:
+    reply = answer(query(topic.key, fmt=form))
+    assert reply == Reply(
+        7,
+        topic.key,
+        encode(report().current(topic.key, lambda: SNAPSHOT), form),
+        encoding_name(form, topic.type),
+    )
+
+
+@pytest.mark.parametrize("key", ["odom", "state"])
+def test_a_key_of_the_json_tree_answers_as_the_plain_one(key: str) -> None:
+    plain = answer(query(key))
+    assert answer(query(f"json/{key}")) == replace(plain, key=f"json/{key}")
+
+
+@pytest.mark.parametrize("topic", [t for t in PUBLISHED if t.key in NATIVE], ids=lambda t: t.key)
+def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
+    reply = answer(query(topic.key, fmt="cdr"))
+    assert (reply.ticket, reply.key, reply.ok) == (7, topic.key, True)
+    assert reply.encoding == f"application/cdr;acsard.{topic.type}.v1"
+    assert reply.payload[:4] == b"\x00\x01\x00\x00"
+    told = Cdr(MESSAGES[topic.type]).decode(reply.payload)
+    assert told == report().current(topic.key, lambda: SNAPSHOT)
+
+
+@pytest.mark.parametrize(
+    ("topic", "asked", "kind"),
+    [
+        ("state", "state", "RobotState"),
+        ("state", "**", "RobotState"),
+        ("info", "info", "Info"),
+        ("config", "config", "dict"),
+        ("schema/<Type>", "schema/Odometry", "dict"),
+    ],
+)
+def test_what_is_no_ros_message_is_refused_as_cdr_in_words(
+    topic: str, asked: str, kind: str
+) -> None:
+    assert answer(query(topic, asked, fmt="cdr")) == Reply(
+        7,
+        topic,
+        f"{kind} is no ROS message and has no CDR form: use JSON".encode(),
+        "text/plain",
+        ok=False,
+    )
+
+
+@pytest.mark.parametrize("topic", PUBLISHED, ids=lambda t: t.key)
+@pytest.mark.parametrize("fmt", ["", "cdr"])
+def test_a_published_key_without_a_value_yet_has_no_answer(topic: Any, fmt: str) -> None:
+    assert queries().serve(query(topic.key, fmt=fmt), nothing, None) == []
+
+
+@pytest.mark.parametrize("asked", ["odom", "**", "*", "acsard/*/odom"])
+def test_a_last_value_may_be_asked_by_wildcard_and_has_its_own_key(asked: str) -> None:
+    assert answer(query("odom", asked)).key == "odom"
+
+
+@pytest.mark.parametrize("form", ["msgpack", "json"])
+def test_info_says_who_the_daemon_is(form: Format) -> None:
+    assert answer(query("info", fmt=form)) == Reply(
+        7, "info", encode(INFO, form), encoding_name(form, "Info")
+    )
+
+
+@pytest.mark.parametrize("form", ["msgpack", "json"])
+def test_config_is_the_configuration_in_force(form: Format) -> None:
+    reply = answer(query("config", fmt=form))
+    codec = msgspec.json if form == "json" else msgspec.msgpack
+    assert from_builtins(codec.decode(reply.payload)) == CONFIG
+    assert codec.decode(reply.payload) == msgspec.json.decode(
+        msgspec.json.encode(effective(CONFIG))
+    )
+    assert reply.encoding == encoding_name(form)
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_whoami_says_the_role_that_was_asked_as_and_who_asks(role: str) -> None:
+    sender = msgspec.msgpack.encode({"sender": "joe@laptop/s3cret"})
+    asked = f"whoami/{role}"
+    reply = answer(query("whoami/<role>", asked, attachment=sender))
+    assert reply.key == asked
+    assert msgspec.json.decode(reply.payload) == {
+        "role": role,
+        "sender": f"{public_name('joe@laptop/s3cret')} (native)",
+    }
+
+
+@pytest.mark.parametrize("asked", ["whoami/*", "whoami/**", "**", "whoami/admin"])
+def test_nobody_is_told_a_role_that_was_not_asked_for_by_its_name(asked: str) -> None:
+    assert answers(query("whoami/<role>", asked)) == []
+
+
+def test_topics_is_the_whole_table_with_full_keys() -> None:
+    reply = answer(query("topics"))
+    table = msgspec.json.decode(reply.payload, type=Topics).topics
+    assert [row.key for row in table] == [f"acsard/r7/{topic.key}" for topic in offered(CONFIG)]
+    assert [(row.direction, row.type, row.note) for row in table] == [
+        (topic.direction, topic.type, topic.note) for topic in offered(CONFIG)
+    ]
+    assert reply.encoding == encoding_name("json", "Topics")
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_each_type_has_its_schema(name: str) -> None:
+    reply = answer(query("schema/<Type>", f"schema/{name}"))
+    assert reply.key == f"schema/{name}"
+    assert msgspec.json.decode(reply.payload) == SCHEMAS[name]
+    assert reply.encoding == "application/json"
+
+
+@pytest.mark.parametrize("asked", ["schema/*", "schema/**", "**", "acsard/*/schema/*"])
+def test_a_wildcard_gives_the_schema_of_every_type(asked: str) -> None:
+    assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
+        f"schema/{name}" for name in SCHEMAS
+    ]
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ("schema/Odo$*", ["Odometry"]),
+        ("schema/Twist$*", [name for name in SCHEMAS if name.startswith("Twist")]),
+        ("schema/$*met$*", [name for name in SCHEMAS if "met" in name[1:-1]]),
+        ("schema/O$*m$*t$*y", ["Odometry"]),
+        ("schema/Odometry$*y", []),
+        ("schema/*/Odometry", []),
+        ("schema/Odometry/**", ["Odometry"]),
+        ("*/Odometry", ["Odometry"]),
+        ("**/Odometry", ["Odometry"]),
+        ("acsard/*/schema/Odometry", ["Odometry"]),
+        ("acsard/*/state/*", []),
+        ("**/" + "$*a" * 10_000, []),
+    ],
+)
+def test_a_wildcard_gives_the_schemas_whose_key_it_includes(asked: str, found: list[str]) -> None:
+    assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
+        f"schema/{name}" for name in found
+    ]
+
+
+@pytest.mark.parametrize("name", ["", "Nothing", "odometry", "Odometry/x", "<Type>"])
+def test_there_is_no_schema_of_what_is_no_type(name: str) -> None:
+    assert answers(query("schema/<Type>", f"schema/{name}")) == []
+
+
+def test_a_key_that_is_not_in_the_table_has_no_answer() -> None:
+    assert answers(query("nonsense")) == []
+
+
+@each("key", [t.key for t in TOPICS if t.direction != "in" and t.key != "alive"])
+@each("fmt", ["xml", "JSON", "CDR", " json"])
+def test_an_unknown_format_is_answered_with_an_error_in_words(key: str, fmt: str) -> None:
+    reply = answer(query(key, fmt=fmt))
+    assert not reply.ok
+    assert reply.ticket == 7
+    assert reply.payload.decode().startswith(f"fmt={fmt}: ")
+    assert reply.encoding == "text/plain"
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_the_error_for_an_unknown_format_says_which_there_are(form: Format) -> None:
+    assert f"fmt={form}" in answer(query("odom", fmt="xml")).payload.decode()
+
+
+@pytest.mark.parametrize("key", ["odom", "info", "config", "topics", "interfaces"])
+def test_without_a_format_the_answer_is_json_for_people(key: str) -> None:
+    reply = answer(query(key))
+    assert reply.ok
+    assert reply.encoding.startswith("application/json")
+    assert reply.payload.startswith(b"{")
+
+
+# interfaces
+
+
+def interfaces(config: Config, outputs: Outputs | None) -> list[dict[str, Any]]:
+    got = queries(config).serve(query("interfaces"), nothing, outputs)
+    assert isinstance(got, list)
+    assert got[0].encoding == encoding_name("json", "Interfaces")
+    return [
+        msgspec.to_builtins(one)
+        for one in msgspec.json.decode(got[0].payload, type=Interfaces).interfaces
+    ]
+
+
+def test_the_base_has_four_command_and_eight_state_interfaces() -> None:
+    joints = ("a", "b", "c", "d")
+    rows = interfaces(Config(joints=JointsConfig(*joints)), OUTPUTS)
+    assert [(row["name"], row["kind"], row["unit"]) for row in rows] == [
+        *((f"{j}/velocity", "command", "rad/s") for j in joints),
+        *(
+            (f"{j}/{name}", "state", unit)
+            for j in joints
+            for name, unit in (("position", "rad"), ("velocity", "rad/s"))
+        ),
+    ]
+
+
+def test_the_interfaces_are_available_while_the_link_is_up() -> None:
+    assert all(row["available"] for row in interfaces(CONFIG, OUTPUTS))
+    assert not any(row["available"] for row in interfaces(CONFIG, replace(OUTPUTS, linked=False)))
+    assert not any(row["available"] for row in interfaces(CONFIG, None))
+
+
+def test_only_command_interfaces_are_claimed_and_only_while_driving() -> None:
+    claimed = [row["name"] for row in interfaces(CONFIG, OUTPUTS) if row["claimed"]]
+    assert claimed == [f"{joint}/velocity" for joint in CONFIG.joints.as_tuple()]
+    assert not any(row["claimed"] for row in interfaces(CONFIG, replace(OUTPUTS, mode="ready")))
+    assert not any(row["claimed"] for row in interfaces(CONFIG, None))
+
+
+# services
+
+POSE = encode({"x": 1.0, "y": 2.0, "yaw": 3.0}, "json")
+CLEAR = encode({"latch": 5}, "json")
+SETTINGS = encode({"settings": {"limits.linear_speed": 0.8, "log.level": "debug"}}, "json")
+
+
+def payload_for(verb: str) -> bytes:
+    return {"set_pose": POSE, "set": SETTINGS, "clear": CLEAR}.get(verb, b"")
+
+
+@pytest.mark.parametrize("verb", SERVICES)
+def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -> None:
+    got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
+    pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
+    told: dict[str, Plain] = {"limits.linear_speed": 0.8, "log.level": "debug"}
+    settings = told if verb == "set" else {}
+    latch = 5 if verb == "clear" else None
+    assert got == Request(verb, 7, pose, by="unnamed (native)", settings=settings, latch=latch)
+
+
+@each("asked", WILDCARDS)
+@each("verb", SERVICES)
+def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
+    made = queries()
+    assert made.serve(query(f"srv/{verb}", asked, payload=payload_for(verb)), nothing, None) == []
+    assert made.answered(Answer(7, True, "done"), WALL_NS) is None
+
+
+@pytest.mark.parametrize("asked", ["srv/stop/", "srv", "/srv/stop", "srv/clear", "SRV/STOP", ""])
+def test_a_service_does_not_run_by_a_key_that_is_only_like_its_own(asked: str) -> None:
+    assert queries().serve(query("srv/stop", asked), nothing, None) == []
+
+
+def test_a_service_that_does_not_exist_does_nothing() -> None:
+    assert queries().serve(query("srv/explode"), nothing, None) == []
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_the_robots_answer_goes_back_to_who_asked(success: bool) -> None:
+    made = queries()
+    made.serve(query("srv/clear", ticket=12), nothing, None)
+    made.serve(query("srv/stop", ticket=13), nothing, None)
+    reply = made.answered(Answer(13, success, "because"), WALL_NS)
+    assert reply == Reply(
+        13,
+        "srv/stop",
+        encode(ServiceReply(success, "because"), "json"),
+        encoding_name("json", "ServiceReply"),
+    )
+
+
+def test_an_answer_goes_back_once() -> None:
+    made = queries()
+    made.serve(query("srv/stop"), nothing, None)
+    assert made.answered(Answer(7, True, ""), WALL_NS) is not None
+    assert made.answered(Answer(7, True, ""), WALL_NS) is None
+
+
+def test_an_answer_nobody_waits_for_goes_nowhere() -> None:
+    assert queries().answered(Answer(0, True, "stopped"), WALL_NS) is None
+
+
+@pytest.mark.parametrize(
+    ("fmt", "payload", "encoding", "form"),
+    [
+        ("", b"", "", "json"),
+        ("", POSE, "", "json"),
+        ("", encode({"x": 1, "y": 2, "yaw": 3}, "msgpack"), "", "msgpack"),
+        ("", encode({"x": 1, "y": 2, "yaw": 3}, "msgpack"), "application/msgpack", "msgpack"),
+        ("json", encode({"x": 1, "y": 2, "yaw": 3}, "msgpack"), "", "json"),
+        ("msgpack", POSE, "", "msgpack"),
+        ("cdr", b"", "", "cdr"),
+        ("cdr", POSE, "", "cdr"),
+        ("", b"\x00\x01\x00\x00\x00", "", "cdr"),
+        ("", b"\x00\x01\x00\x00", "", "cdr"),
+        ("", b"\x00\x00\x00\x03\x00\x00\x00\x00", "", "cdr"),
+        ("json", b"\x00\x01\x00\x00\x00", "", "json"),
+    ],
+)
+def test_a_service_answers_in_the_format_asked_for_else_in_the_payloads(
+    fmt: str, payload: bytes, encoding: str, form: Format
+) -> None:
+    made = queries()
+    asked = query("srv/reset_odometry", fmt=fmt, payload=payload, encoding=encoding)
+    assert isinstance(made.serve(asked, nothing, None), Request)
+    reply = made.answered(Answer(7, True, "done"), WALL_NS)
+    assert reply is not None
+    assert reply.payload == encode(ServiceReply(True, "done"), form)
+    assert reply.encoding == encoding_name(form, "ServiceReply")
+
+
+def test_a_service_asked_in_cdr_answers_as_a_ros_trigger_does() -> None:
+    made = queries()
+    made.serve(query("srv/stop", payload=b"\x00\x01\x00\x00\x00"), nothing, None)
+    reply = made.answered(Answer(7, True, "ok"), WALL_NS)
+    assert reply is not None
+    assert reply.payload == bytes.fromhex("00010000 01000000 03000000 6f6b00")
+
+
+@pytest.mark.parametrize("verb", [verb for verb in SERVICES if verb not in EXAMPLES])
+def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> None:
+    got = queries().serve(query(f"srv/{verb}", payload=b"\xff nonsense"), nothing, None)
+    assert isinstance(got, Request)
+
+
+@pytest.mark.parametrize(
+    ("payload", "words"),
+    [
+        (b"", "neither a JSON object, a msgpack map nor CDR"),
+        (b"nonsense", "neither a JSON object, a msgpack map nor CDR"),
+        (b"{", "Input data was truncated"),
+        (b"{}", "missing required field `x`"),
+        (b'{"x": 1, "y": 2}', "missing required field `yaw`"),
+        (b'{"x": 1, "y": 2, "yaw": "3"}', "Expected `float`"),
+        (b'{"x": 1, "y": 2, "yaw": 3, "z": 4}', "unknown field `z`"),
+        (b'{"x": 1e7, "y": 2, "yaw": 3}', "x and y must be within 1000 km"),
+        (encode({"x": 1.0, "y": 2.0, "yaw": math.nan}, "msgpack"), "yaw finite"),
+    ],
+)
+def test_a_pose_that_is_none_is_answered_in_words_and_asks_nothing_of_the_robot(
+    payload: bytes, words: str
+) -> None:
+    made = queries()
+    got = made.serve(query("srv/set_pose", payload=payload, fmt="json"), nothing, None)
+    assert isinstance(got, list)
+    (reply,) = got
+    assert reply.ok
+    assert (reply.ticket, reply.key) == (7, "srv/set_pose")
+    said = msgspec.json.decode(reply.payload, type=ServiceReply)
+    assert not said.success
+    assert words in said.message
+    assert said.message.endswith('; send {"x": 0, "y": 0, "yaw": 0}')
+    assert made.answered(Answer(7, True, ""), WALL_NS) is None
+
+
+# ROS services
+
+ASKED = Attachment(7, 1_600_000_000_000_000_000, bytes(range(16)))
+EMPTY = b"\x00\x01\x00\x00\x00"
+
+
+def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: Any) -> Query:
+    given: dict[str, Any] = {"via": via, "payload": payload, "arrived_ns": 99} | changes
+    if via == "rmw":
+        given.setdefault("attachment", ASKED.pack())
+    return query(topic, **given)
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize("verb", TRIGGERS)
+def test_a_trigger_asks_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> None:
+    made = queries()
+    got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
+    by = f"unnamed (rmw {ASKED.gid.hex()})" if via == "rmw" else "unnamed (bridge)"
+    assert got == Request(verb, 7, asked_ns=99, by=by)  # type: ignore[arg-type]
+    reply = made.answered(Answer(7, True, "done"), WALL_NS)
+    assert reply is not None
+    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(True, "done")
+    assert reply.ok
+
+
+def test_over_rmw_a_reply_has_the_request_s_sequence_and_gid_and_its_own_time() -> None:
+    made = queries()
+    made.serve(ros_query("srv/clear"), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, False, "no"), WALL_NS)
+    assert reply is not None
+    assert unpack(reply.attachment) == Attachment(7, WALL_NS, ASKED.gid)
+
+
+def test_by_a_bridge_a_reply_needs_no_attachment() -> None:
+    made = queries()
+    made.serve(ros_query("srv/clear", "bridge", attachment=b"rqh" + bytes(17)), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, True, ""), WALL_NS)
+    assert reply is not None
+    assert reply.attachment == b""
+
+
+@pytest.mark.parametrize("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
+def test_a_trigger_takes_a_request_of_any_length(payload: bytes) -> None:
+    got = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
+    assert isinstance(got, Request)
+
+
+@pytest.mark.parametrize("topic", ["srv/clear", "parameters/list_parameters"])
+@pytest.mark.parametrize("attachment", [b"", bytes(20)])
+def test_over_rmw_a_request_without_its_attachment_is_not_answered(
+    topic: str, attachment: bytes
+) -> None:
+    made = queries()
+    with pytest.raises(DecodeError) as caught:
+        made.serve(ros_query(topic, attachment=attachment), nothing, OUTPUTS)
+    assert caught.value.reason == ("bad_attachment" if attachment else "no_attachment")
+    assert made.answered(Answer(7, True, ""), WALL_NS) is None
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_the_parameter_services_tell_the_configuration(via: str) -> None:
+    payload = Cdr(rcl.Names).encode(rcl.Names(["robot.id"]))
+    (reply,) = reply_to(ros_query("parameters/get_parameters", via, payload))
+    (value,) = Cdr(rcl.Values).decode(reply.payload).values
+    assert value.string_value == "r7"
+    if via == "rmw":
+        assert unpack(reply.attachment) == Attachment(7, OUTPUTS.now.wall_ns, ASKED.gid)
+    else:
+        assert reply.attachment == b""
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize("service", PARAMETER_SERVICES)
+def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
+    service: str, via: str
+) -> None:
+    asked = ros_query(f"parameters/{service}", via, payload=b"\x00")
+    with pytest.raises(DecodeError) as caught:
+        queries().serve(asked, nothing, OUTPUTS)
+    assert caught.value.reason == "malformed"
+    reply = refused(asked, str(caught.value), WALL_NS)
+    assert reply is not None
+    kinds: dict[str, tuple[type[Any], Any]] = {
+        "list_parameters": (rcl.ListReply, rcl.ListReply([], [])),
+        "get_parameters": (rcl.Values, rcl.Values([])),
+        "get_parameter_types": (rcl.Types, rcl.Types([])),
+        "describe_parameters": (rcl.Descriptors, rcl.Descriptors([])),
+        "set_parameters": (rcl.SetReply, rcl.SetReply([NO])),
+        "set_parameters_atomically": (rcl.SetAtomicallyReply, rcl.SetAtomicallyReply(NO)),
+    }
+    kind, expected = kinds[service]
+    assert Cdr(kind).decode(reply.payload) == expected
+    echo = Attachment(7, WALL_NS, ASKED.gid).pack()
+    assert (reply.ok, reply.attachment) == (True, echo if via == "rmw" else b"")
+
+
+@pytest.mark.parametrize("service", rcl.SETTING)
+def test_a_parameter_that_is_set_twice_at_once_is_refused_with_a_result_for_each(
+    service: str,
+) -> None:
+    wishes = [
+        rcl.Parameter("limits.linear_speed", rcl.ParameterValue(rcl.DOUBLE, double_value=value))
+        for value in (0.7, 0.3)
+    ]
+    payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest(wishes))
+    asked = ros_query(f"parameters/{service}", "rmw", payload)
+    with pytest.raises(DecodeError, match=r"limits\.linear_speed is in it twice") as caught:
+        queries().serve(asked, nothing, OUTPUTS)
+    reply = refused(asked, str(caught.value), WALL_NS)
+    assert reply is not None
+    no = rcl.SetParametersResult(False, str(caught.value))
+    if service == "set_parameters":
+        assert Cdr(rcl.SetReply).decode(reply.payload) == rcl.SetReply([no, no])
+    else:
+        assert Cdr(rcl.SetAtomicallyReply).decode(reply.payload) == rcl.SetAtomicallyReply(no)
+
+
+def test_as_many_names_as_fit_are_answered_and_more_by_a_refusal() -> None:
+    names = ["robot.id"] * 256
+    payload = Cdr(rcl.Names).encode(rcl.Names(names))
+    (reply,) = reply_to(ros_query("parameters/get_parameters", payload=payload))
+    values = Cdr(rcl.Values).decode(reply.payload).values
+    assert [value.string_value for value in values] == ["r7"] * 256
+    for more, reason in ((names + names[:1], "malformed"), (["x" * 20_000], "too_big")):
+        payload = Cdr(rcl.Names).encode(rcl.Names(more))[: most_bytes("parameters/") + 1]
+        with pytest.raises(DecodeError) as caught:
+            queries().serve(ros_query("parameters/get_parameters", payload=payload), nothing, None)
+        assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+def test_a_trigger_that_is_turned_away_hears_so(via: str) -> None:
+    reply = refused(ros_query("srv/clear", via), BUSY, WALL_NS)
+    assert reply is not None
+    assert (reply.ok, reply.key, reply.ticket) == (True, "srv/clear", 7)
+    assert Cdr(ServiceReply).decode(reply.payload) == ServiceReply(False, BUSY)
+
+
+def test_who_asks_natively_is_turned_away_with_an_error() -> None:
+    reply = refused(query("odom"), BUSY, WALL_NS)
+    assert reply is not None
+    assert (reply.ok, reply.payload) == (False, BUSY.encode())
+
+
+def test_over_rmw_nobody_is_found_without_the_attachment_of_the_request() -> None:
+    assert refused(ros_query("srv/clear", attachment=b""), BUSY, WALL_NS) is None
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize(
+    ("namespace", "clear", "activate"),
+    [
+        ("", "/acsard/clear", "/acsard/activate"),
+        ("robot1", "/robot1/acsard/clear", "/robot1/acsard/activate"),
+    ],
+)
+def test_to_ros_the_services_are_called_as_ros_calls_them(
+    via: str, namespace: str, clear: str, activate: str
+) -> None:
+    made = queries(replace(CONFIG, ros=RosConfig(namespace=namespace)))
+    made.serve(ros_query("srv/stop", via), nothing, OUTPUTS)
+    words = "call srv/clear first; srv/activate switches it on, not srv/clearance"
+    reply = made.answered(Answer(7, True, words), WALL_NS)
+    assert reply is not None
+    told = Cdr(ServiceReply).decode(reply.payload).message
+    assert told == f"call {clear} first; {activate} switches it on, not srv/clearance"
+
+
+def test_to_others_the_services_are_called_by_their_keys() -> None:
+    made = queries()
+    made.serve(query("srv/stop"), nothing, OUTPUTS)
+    reply = made.answered(Answer(7, True, "call srv/clear first"), WALL_NS)
+    assert reply is not None
+    assert msgspec.json.decode(reply.payload)["message"] == "call srv/clear first"
+
+
+@pytest.mark.parametrize("via", ["bridge", "rmw"])
+@pytest.mark.parametrize("service", rcl.SETTING)
+def test_a_request_to_set_parameters_asks_the_robot_and_hears_its_answer(
+    service: str, via: str
+) -> None:
+    value = rcl.ParameterValue(rcl.DOUBLE, double_value=0.7)
+    payload = Cdr(rcl.SetRequest).encode(
+        rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
+    )
+    made = queries()
+    got = made.serve(ros_query(f"parameters/{service}", via, payload), nothing, OUTPUTS)
+    assert isinstance(got, Request)
+    assert (got.verb, got.id, got.settings) == ("set", 7, {"limits.linear_speed": 0.7})
+    reply = made.answered(Answer(7, False, "call srv/clear first"), WALL_NS)
+    assert reply is not None
+    no = rcl.SetParametersResult(False, "call /acsard/clear first")
+    if service == "set_parameters":
+        assert Cdr(rcl.SetReply).decode(reply.payload) == rcl.SetReply([no])
+    else:
+        assert Cdr(rcl.SetAtomicallyReply).decode(reply.payload) == rcl.SetAtomicallyReply(no)
+    echo = Attachment(7, WALL_NS, ASKED.gid).pack()
+    assert reply.attachment == (echo if via == "rmw" else b"")
+
+
+def test_what_is_set_is_what_config_and_parameters_tell() -> None:
+    made = queries()
+    made.use(replace(CONFIG, limits=LimitsConfig(linear_speed=0.7)))
+    (told,) = made.serve(query("config"), nothing, OUTPUTS)  # type: ignore[misc]
+    assert from_builtins(msgspec.json.decode(told.payload)).limits.linear_speed == 0.7
+    payload = Cdr(rcl.Names).encode(rcl.Names(["limits.linear_speed"]))
+    asked = ros_query("parameters/get_parameters", "bridge", payload)
+    (reply,) = made.serve(asked, nothing, OUTPUTS)  # type: ignore[misc]
+    assert Cdr(rcl.Values).decode(reply.payload).values[0].double_value == 0.7
+
+
+def reply_to(asked: Query) -> list[Reply]:
+    got = queries().serve(asked, nothing, OUTPUTS)
+    assert isinstance(got, list)
+    return got

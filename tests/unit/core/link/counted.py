@@ -1,0 +1,115 @@
+"""Drives as coarse encoders report them, with the pose from the raw counters for comparison.
+
+A drive covers 450 m at random: 600 s at 100 Hz, with stops. The truth is a chain of arcs by the
+wheels' true angles at each report. The raw counter sums the exact differences of their whole counts
+instead. This module is written in numpy from the equations and shares no code with the modules that
+it judges.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from acsard.core.config.settings import DriveConfig, FeedbackConfig, McuConfig, OdometryConfig
+from acsard.core.link.session import McuSession
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.sanity import Sanity
+from acsard.core.values import Instant, Received
+
+Array = NDArray[np.float64]
+RADIUS, TRACK, PERIOD = 0.05, 0.30, 0.01
+PERIOD_NS = 10_000_000
+WALL_NS = 1_800_000_000_000_000_000
+SIGNS = np.array([1, -1, -1, 1])
+"""Sign of each wheel in a turn: front right, front left, rear left, rear right."""
+
+
+def speeds(rng: np.random.Generator, seconds: float) -> Array:
+    """Return the mean speeds of both sides in each period, rad/s, shape (periods, 2).
+
+    The right side comes first.
+    """
+    v = w = 0.0
+    rows, goal, left = [], (0.0, 0.0), 100
+    for _ in range(round(seconds / PERIOD)):
+        if left == 0:
+            stop = rng.random() < 0.1
+            goal = (0.0, 0.0) if stop else (rng.uniform(0.6, 1.2), rng.uniform(-1.2, 1.2))
+            left = int(rng.uniform(50, 400))
+        left -= 1
+        v += max(-PERIOD, min(PERIOD, goal[0] - v))
+        w += max(-4 * PERIOD, min(4 * PERIOD, goal[1] - w))
+        rows.append(((v + w * TRACK / 2) / RADIUS, (v - w * TRACK / 2) / RADIUS))
+    return np.array(rows)
+
+
+def angles(rng: np.random.Generator, seconds: float) -> Array:
+    """Return the wheels' true angles, rad, shape (periods + 1, 4), each with its own phase."""
+    sides = speeds(rng, seconds) * PERIOD
+    wheels = np.vstack([np.zeros(4), np.cumsum(sides[:, [0, 1, 1, 0]], axis=0)])
+    return wheels + rng.uniform(0, math.tau, 4)
+
+
+def counted(wheels: Array, counts: int | NDArray[np.int_]) -> Array:
+    """Return the whole counts of each wheel in each period, shape (periods, 4).
+
+    `counts` is the number of counts per turn.
+    """
+    told: Array = np.diff(np.floor(wheels / math.tau * counts), axis=0)
+    return told
+
+
+def end(turned: Array) -> tuple[float, float]:
+    """Return x and y after these wheel angles, by exact arcs."""
+    right, left = (turned[:, 0] + turned[:, 3]) / 2, (turned[:, 1] + turned[:, 2]) / 2
+    distance, turn = (right + left) / 2 * RADIUS, (right - left) * RADIUS / TRACK
+    heading = np.cumsum(turn) - turn / 2
+    chord = distance * np.sinc(turn / math.tau)
+    return float(np.sum(chord * np.cos(heading))), float(np.sum(chord * np.sin(heading)))
+
+
+def text(row: Array) -> bytes:
+    """Return a line as firmware writes it."""
+    return (
+        ",".join(
+            f"{motor}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
+            for motor, speed in zip("abcd", row.tolist(), strict=True)
+        ).encode()
+        + b"\r\n"
+    )
+
+
+class Host:
+    """The host's processing of lines: session, slew check and odometry, as in `core/robot.py`."""
+
+    def __init__(self, feedback: FeedbackConfig | None = None) -> None:
+        self.session = McuSession(McuConfig(), 100.0)
+        self.sanity = Sanity(feedback or FeedbackConfig())
+        self.odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+        self.now_ns = 1_000_000_000
+        self.lines = self.dropped = 0
+        self.why = ""
+
+    def hear(self, line: bytes, after_ns: int = PERIOD_NS) -> None:
+        self.now_ns += after_ns
+        now = Instant(self.now_ns, self.now_ns + WALL_NS)
+        for feedback in self.session.update(now, True, 1, (Received(now, line),)):
+            self.lines += 1
+            why = self.sanity.impossible(feedback)
+            if why:
+                self.why = why
+                self.dropped += 1
+                self.odometry.skip(feedback)
+            else:
+                self.odometry.fold(feedback)
+
+
+def lines(wheels: Array, counts: int) -> Iterator[bytes]:
+    """Yield the lines of firmware that divides counts by the nominal period."""
+    for row in counted(wheels, counts) * (math.tau / counts / PERIOD):
+        yield text(row)

@@ -1,0 +1,341 @@
+"""Random drives, the lines that an MCU makes from them, and the times at which a host reads those.
+
+The path is the truth. The result of the session under test is compared with it, and with the floor:
+every line with its true time. All randomness comes from the seed.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import deque
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.core.config.settings import DriveConfig, McuConfig, OdometryConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.link.session import McuSession
+from acsard.core.motion import path as way
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.odometry import Odometry
+from acsard.core.values import NS_PER_S, Instant, Pose, Received, WheelSpeeds
+
+RATE = 100.0
+PERIOD, DRIFT = 0.01, 2e-4
+"""Report period, s, and largest relative drift of an MCU's clock."""
+
+BYTE = 10 / 115200
+"""Time of one byte on the wire, s."""
+
+LATENCY, SCHEDULER = 0.016, 0.0003
+"""Time for which an FTDI adapter holds bytes back, and mean wait of a process for its core, s."""
+
+PIECE = 1024
+"""Bytes that one read takes."""
+
+ROLLING = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
+
+GRID = 0.001
+"""Time between the points of a path, s."""
+
+RIPPLE = 0.03
+"""Variation of each side's speed from report to report, rad/s."""
+
+AT_REST = 1500
+"""Points of a path before which nothing moves, because a robot stands while its link starts.
+
+The robot also stands at the end, so that lines still on their way do not matter.
+"""
+
+WALL_NS = 1_800_000_000 * NS_PER_S
+
+Adapter = Literal["acm", "ftdi"]
+
+
+class Path:
+    """Wheel angles of both sides over time, of a drive with turns and stops."""
+
+    def __init__(self, rng: np.random.Generator, seconds: float) -> None:
+        count = int((seconds + 2.0) / GRID)
+        linear = _ramped(rng, count, 1.0, 1.0, lowest=0.6)
+        angular = _ramped(rng, count, 1.0, 4.0)
+        left = (linear - angular * 0.15) / 0.05
+        right = (linear + angular * 0.15) / 0.05
+        # No wheel turns so evenly that two decimals always round it the same way.
+        left += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
+        right += np.repeat(rng.normal(0, RIPPLE, count // 10 + 1), 10)[:count]
+        for wheels in (left, right):
+            wheels[:AT_REST] = wheels[int((seconds - 1.0) / GRID) :] = 0.0
+        self.left = np.concatenate([[0.0], np.cumsum(left) * GRID])
+        self.right = np.concatenate([[0.0], np.cumsum(right) * GRID])
+
+    def angles(self, at: float) -> tuple[float, float]:
+        """Return the angles of the left and right wheels at time `at` in s, rad."""
+        place = at / GRID
+        i = int(place)
+        share = place - i
+        left, right = self.left, self.right
+        return (
+            float(left[i] + (left[i + 1] - left[i]) * share),
+            float(right[i] + (right[i + 1] - right[i]) * share),
+        )
+
+
+def _ramped(
+    rng: np.random.Generator, count: int, most: float, rate: float, lowest: float | None = None
+) -> np.ndarray:
+    """Return a speed that moves at `rate` between random targets.
+
+    A sixth of the targets are zero.
+    """
+    lowest = -most if lowest is None else lowest
+    targets = np.empty(0)
+    while len(targets) < count:
+        target = 0.0 if rng.random() < 1 / 6 else rng.uniform(lowest, most)
+        targets = np.concatenate([targets, np.full(int(rng.uniform(0.8, 4.0) / GRID), target)])
+    speeds, speed = np.empty(count), 0.0
+    for i, target in enumerate(targets[:count].tolist()):
+        speed += min(max(target - speed, -rate * GRID), rate * GRID)
+        speeds[i] = speed
+    return speeds
+
+
+class Case(Struct, frozen=True):
+    """Properties of the connection between MCU and host, in s and shares."""
+
+    adapter: Adapter = "acm"
+    prompted: bool = False
+    """Whether the MCU answers the host's lines.
+
+    Each answer covers the time since the last one. Otherwise the MCU reports by its own clock.
+    """
+    thinking: float = 0.0002
+    """Largest difference between the times of two answers, s."""
+    stall: float = 0.0
+    stall_every: float = 5.0
+    lost: float = 0.0
+    burst_every: float = 0.0
+    """Mean time between bursts of 0.1 to 0.5 s of lost lines, s; 0 means that there are none."""
+
+
+class Line(Struct):
+    """One report, made at time `at` in s, for the time since `before`."""
+
+    at: float
+    before: float
+    speeds: WheelSpeeds
+    data: bytes
+
+
+class Host:
+    """The session under test, and two other poses from the same lines."""
+
+    def __init__(self, case: Case, seed: int, seconds: float) -> None:
+        self.case, self.seconds = case, seconds
+        self.rng = rng = np.random.default_rng(seed)
+        self.path = Path(rng, seconds)
+        self.session = McuSession(McuConfig(), RATE)
+        self.found = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+        self.floor, self.by_arrival = Arcs(), Arcs()
+        """Poses from each line's true time, and from arrival times; `found` is the session's.
+
+        By arrival times, each line's speed applies since the line before it.
+        """
+        self.lines: list[Line] = []
+        self.heard: list[Feedback] = []
+        self.now = 0.0
+        """Time of the last step, s."""
+        self._heard_ns = 0
+        self._reported = 0.0
+        self._stalls = _times(rng, seconds, case.stall_every, case.stall) if case.stall else []
+        self._starts = [start for start, _ in self._stalls]
+        every = case.burst_every
+        starts = [start for start, _ in _times(rng, seconds, every, 0.0)] if every else []
+        self._bursts = [(start, start + rng.uniform(0.1, 0.5)) for start in starts]
+        self._phase = rng.uniform(0, LATENCY)
+
+    # the microcontroller
+
+    def report(self, at: float, nominal: float | None) -> Line:
+        """Return the line about the wheels' motion since the last one, made at time `at`."""
+        now, then = self.path.angles(at), self.path.angles(self._reported)
+        dt = at - self._reported if nominal is None else nominal
+        left, right = (round((a - b) / dt, 2) for a, b in zip(now, then, strict=True))
+        speeds = WheelSpeeds(right, left, left, right)
+        line = Line(at, self._reported, speeds, _encode(speeds))
+        self._reported = at
+        self.lines.append(line)
+        self.floor.roll(left * dt, right * dt)
+        return line
+
+    # the path to the host
+
+    def lost(self, line: Line) -> bool:
+        """Return whether nothing of this line arrives."""
+        gone = any(begin <= line.at < end for begin, end in self._bursts)
+        return gone or self.rng.random() < self.case.lost
+
+    def delivered(self, line: Line) -> float:
+        """Return the time at which the kernel has the line's bytes."""
+        at = line.at + len(line.data) * BYTE
+        if self.case.adapter == "ftdi":
+            return float(np.ceil((at - self._phase) / LATENCY) * LATENCY + self._phase)
+        return at + self.rng.uniform(0, 0.001)
+
+    # the host
+
+    def awake(self, at: float) -> float:
+        """Return the time at which a process that is due at `at` really runs."""
+        at += self.rng.exponential(SCHEDULER)
+        i = bisect.bisect_right(self._starts, at) - 1
+        if i >= 0 and at < self._stalls[i][1]:
+            at = self._stalls[i][1] + self.rng.exponential(SCHEDULER)
+        return at
+
+    def ticks(self) -> Iterator[float]:
+        """Yield the times of the control steps; missed steps are left out."""
+        at = 0.0
+        while True:
+            at = max(self.awake((int(at * RATE + 1e-6) + 1) / RATE), at + 1e-6)
+            yield at
+
+    def tick(self, at: float) -> bool:
+        """Run one control step and return whether a line leaves with it."""
+        self.now = at
+        now = _instant(at)
+        self._update(now, ())
+        return self.session.line(now.mono_ns, ROLLING) is not None
+
+    def read(self, at: float, data: bytes) -> None:
+        """Read the bytes that the kernel holds, one piece at a time."""
+        for start in range(0, len(data), PIECE):
+            now = _instant(at + start / PIECE * 0.0002)
+            self._update(now, (Received(now, data[start : start + PIECE]),))
+
+    def _update(self, now: Instant, received: tuple[Received, ...]) -> None:
+        for feedback in self.session.update(now, True, 1, received):
+            self.heard.append(feedback)
+            self.found.fold(feedback)
+            since = (feedback.heard_ns - (self._heard_ns or feedback.heard_ns)) / NS_PER_S
+            self._heard_ns = feedback.heard_ns
+            speeds = feedback.speeds
+            self.by_arrival.roll(speeds.front_left * since, speeds.front_right * since)
+
+    # the end of the drive
+
+    def errors(self) -> np.ndarray:
+        """Return the errors in m and deg of the session, of the floor and of arrival times."""
+        truth = self._truth()
+        rows = []
+        for odometry in (self.found, self.floor, self.by_arrival):
+            pose = odometry.pose
+            turn = math.degrees(math.remainder(pose.yaw - truth.yaw, math.tau))
+            rows.append((math.hypot(pose.x - truth.x, pose.y - truth.y), abs(turn)))
+        return np.array(rows)
+
+    def _truth(self) -> Pose:
+        truth, (left, right) = Arcs(), (0.0, 0.0)
+        end = self.lines[-1].at
+        for at in (*np.arange(0.005, end, 0.005).tolist(), end):
+            (was_left, was_right), (left, right) = (left, right), self.path.angles(at)
+            truth.roll(left - was_left, right - was_right)
+        return truth.pose
+
+
+class Arcs:
+    """The path of a robot of default size by the angles that its sides roll, rad."""
+
+    def __init__(self) -> None:
+        self._path = way.Path()
+
+    def roll(self, left: float, right: float) -> None:
+        self._path.advance((right + left) / 2 * 0.05, (right - left) * 0.05 / 0.30)
+
+    @property
+    def pose(self) -> Pose:
+        return self._path.pose
+
+
+def _instant(at: float) -> Instant:
+    ns = 10**12 + int(at * NS_PER_S)
+    return Instant(ns, ns + WALL_NS)
+
+
+def _times(
+    rng: np.random.Generator, seconds: float, every: float, length: float
+) -> list[tuple[float, float]]:
+    """Return the starts and ends of a repeated disturbance that has no fixed phase."""
+    starts = np.arange(every * 0.7, seconds - 1.0, every) + rng.uniform(0, every * 0.2)
+    starts += rng.uniform(0, every * 0.1, len(starts))
+    return [(start, start + length) for start in starts.tolist()]
+
+
+def _encode(speeds: WheelSpeeds) -> bytes:
+    tokens = [
+        f"{letter}{'n' if speed < 0 else 'p'}{abs(speed):05.2f}"
+        for letter, speed in zip("abcd", speeds.as_tuple(), strict=True)
+    ]
+    return ", ".join(tokens).encode() + b"\r\n"
+
+
+def drive(case: Case, seed: int, seconds: float) -> Host:
+    """Simulate a whole drive and return its host."""
+    host = Host(case, seed, seconds)
+    if case.prompted:
+        _prompted(host)
+    else:
+        reporting(host)
+    return host
+
+
+def reporting(host: Host) -> None:
+    """Simulate an MCU that makes a line in every period of its own clock.
+
+    It divides by the nominal period.
+    """
+    arrivals: deque[tuple[float, bytes]] = deque()
+    period = PERIOD * (1 + host.rng.uniform(-DRIFT, DRIFT))
+    for k in range(1, int(host.seconds / period)):
+        line = host.report(k * period, PERIOD)
+        if not host.lost(line):
+            arrivals.append((host.delivered(line), line.data))
+    for tick in host.ticks():
+        _read_until(host, arrivals, tick)
+        if not arrivals:
+            return
+        host.tick(tick)
+
+
+def _prompted(host: Host) -> None:
+    """Simulate an MCU that answers each line after 1 ms or more and divides by the true time."""
+    arrivals: deque[tuple[float, bytes]] = deque()
+    free = last = 0.0
+    for tick in host.ticks():
+        _read_until(host, arrivals, tick)
+        if tick > host.seconds:
+            return
+        if not host.tick(tick):
+            continue
+        made = max(
+            tick + 0.0001 + 33 * BYTE + 0.001 + host.rng.uniform(0, host.case.thinking), free
+        )
+        line = host.report(made, None)
+        free = made + len(line.data) * BYTE
+        if not host.lost(line):
+            last = max(host.delivered(line), last)
+            arrivals.append((last, line.data))
+
+
+def _read_until(host: Host, arrivals: deque[tuple[float, bytes]], tick: float) -> None:
+    """Read everything that the host can read before its next step."""
+    while arrivals and arrivals[0][0] < tick:
+        at = max(host.awake(arrivals[0][0]), host.now)
+        if at >= tick:
+            return
+        data = b""
+        while arrivals and arrivals[0][0] <= at:
+            data += arrivals.popleft()[1]
+        host.read(at, data)

@@ -1,0 +1,149 @@
+"""Coarse encoders from bytes to pose: no true line is dropped, and the error is the raw counter's.
+
+Run it with `pytest -m slow -s core/link/test_coarse.py`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from msgspec import Struct
+
+from acsard.core.config.settings import FeedbackConfig
+from tests.unit.core.link.counted import (
+    PERIOD,
+    Array,
+    Host,
+    angles,
+    counted,
+    end,
+    lines,
+    speeds,
+    text,
+)
+from tests.unit.core.link.table import print_row
+
+COUNTS = (16, 20, 40, 96, 400)
+FINER = (1000, 2000, 4000)
+
+
+class Driven(Struct, frozen=True):
+    """Distance from the truth at the end of a drive, m.
+
+    `raw` uses counts, `plain` the reports as they are, and `ours` the session under test.
+    """
+
+    raw: float
+    plain: float
+    ours: float
+    lines: int
+    dropped: int
+
+
+def drive(counts: int, seed: int, seconds: float) -> Driven:
+    wheels = angles(np.random.default_rng(seed), seconds)
+    host = Host()
+    for line in lines(wheels, counts):
+        host.hear(line)
+    assert host.session.snapping.counts == (counts,) * 4
+    pose, true = host.odometry.pose, end(np.diff(wheels, axis=0))
+    exact = counted(wheels, counts) * math.tau / counts
+    plain = np.round(exact / PERIOD, 2) * PERIOD
+    return Driven(
+        math.dist(end(exact), true),
+        math.dist(end(plain), true),
+        math.dist((pose.x, pose.y), true),
+        host.lines,
+        host.dropped,
+    )
+
+
+@pytest.mark.parametrize("counts", COUNTS)
+def test_no_true_line_is_dropped_and_half_a_minute_ends_where_the_counter_says(counts: int) -> None:
+    one = drive(counts, 1, 25.0)
+    assert one.dropped == 0
+    assert one.ours == pytest.approx(one.raw, abs=0.004)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("counts", COUNTS + FINER)
+def test_450_m_end_as_far_off_as_the_raw_counter_does(counts: int) -> None:
+    drives = [drive(counts, seed, 600.0) for seed in range(20)]
+    raw, plain, ours = (
+        float(np.mean([getattr(one, what) for one in drives])) for what in ("raw", "plain", "ours")
+    )
+    dropped = sum(one.dropped for one in drives)
+    print_row(
+        f"{counts} counts a turn",
+        "0.2 x reports" if counts in FINER else "1.05 x raw counter, 0 lines dropped",
+        f"{ours * 1e3:.1f} mm, {ours / raw:.3f} x raw, {ours / plain:.2f} x reports; "
+        f"{dropped} lines dropped",
+    )
+    assert dropped == 0
+    assert ours <= 1.05 * raw or counts in FINER
+    assert ours < 0.2 * plain or counts not in FINER
+
+
+# other effects with coarse encoders: no counts are found for others, and no line is dropped
+
+
+def heard(rows: Array, feedback: FeedbackConfig | None = None) -> Host:
+    host = Host(feedback)
+    for row in rows:
+        host.hear(text(row))
+    return host
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize("counts", [16, 20, 40, 96])
+@pytest.mark.parametrize("acceleration", [100.0, 1500.0])
+def test_no_line_is_dropped_of_a_firmware_that_divides_by_the_time_it_measured(
+    counts: int, acceleration: float
+) -> None:
+    wheels, dice = angles(np.random.default_rng(2), 25.0), np.random.default_rng(1)
+    read = np.concatenate([[0.0], np.cumsum(dice.uniform(0.7, 1.3, len(wheels) - 100))])
+    at = [np.interp(read, np.arange(len(wheels)), wheel) for wheel in wheels.T]
+    rows = counted(np.array(at).T, counts) * math.tau / counts / PERIOD / np.diff(read)[:, None]
+    host = heard(np.round(rows, 2), FeedbackConfig(wheel_acceleration=acceleration))
+    assert (host.dropped, host.why) == (0, "")
+
+
+@pytest.mark.variations(9)
+@pytest.mark.parametrize("counts", [16, 20, 40, 96])
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.7, 0.9])
+def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float) -> None:
+    wheels, speed, rows = angles(np.random.default_rng(3), 25.0), np.zeros(4), []
+    for row in counted(wheels, counts) * math.tau / counts / PERIOD:
+        speed = speed + share * (row - speed)
+        rows.append(speed)
+    host = heard(np.round(np.array(rows), 2))
+    assert (host.dropped, host.why) == (0, "")
+    assert host.session.snapping.counts == (0,) * 4
+
+
+def wild(wheels: int, seed: int) -> Host:
+    """Return the host of a drive in which `wheels` wheels report random speeds until the fault.
+
+    The host joins after the drive has begun.
+    """
+    host, dice = Host(), np.random.default_rng(seed)
+    for right, left in speeds(np.random.default_rng(seed), 9.0)[150:]:
+        row = np.array([right, left, left, right])
+        row[:wheels] = dice.uniform(-60.0, 60.0, wheels)
+        host.hear(text(np.round(row, 2)))
+        if host.sanity.doubtful:
+            break
+    return host
+
+
+def test_a_wheel_that_jumps_at_random_is_found_out_by_the_steps_of_the_others() -> None:
+    found = sorted(wild(1, seed).lines for seed in range(7))
+    assert found[3] <= 60
+
+
+def test_two_wheels_that_jump_at_random_are_believed_as_the_reference_says() -> None:
+    """They could equally be two coarse encoders among fine ones."""
+    assert not wild(2, 1).sanity.doubtful

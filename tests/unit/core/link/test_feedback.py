@@ -1,0 +1,335 @@
+"""Consecutive good lines get their time from the wire and the wheels' angles from the counts."""
+
+from __future__ import annotations
+
+import math
+import random
+from itertools import pairwise
+
+import pytest
+
+from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.link.check import Reading
+from acsard.core.link.codec import Codec
+from acsard.core.link.feedback import Feedback, Timeline
+from acsard.core.values import Instant, WheelSpeeds
+
+MS = 1_000_000
+SPEEDS = WheelSpeeds(1.0, 2.0, 3.0, 4.0)
+LENGTH = 36
+WIRE_NS = 3_125_000
+COUNTS = 3600
+DEGREE = math.tau / 360
+"""The angle of ten counts, rad."""
+
+
+class Bench:
+    """A timeline with the clocks of the host and the MCU."""
+
+    def __init__(self, wheels: WheelMap | None = None, counts: int = COUNTS) -> None:
+        wheels = wheels or WheelMap()
+        mcu = McuConfig(wheels=wheels, encoder_counts=counts, link_check="auto")
+        self.timeline = Timeline(mcu, Codec(wheels), 80.0, 100 * MS, 100.0)
+        self.now_ns, self.mcu_ms = 9000 * MS, 500
+
+    def line(
+        self,
+        *counts: int,
+        ms: float = 10,
+        mcu_ms: int | None = None,
+        following: int = 0,
+        gap: bool = False,
+    ) -> Feedback:
+        """Return the feedback of a line `ms` later on both clocks, with or without counts."""
+        self.now_ns += int(ms * MS)
+        self.mcu_ms += int(ms) if mcu_ms is None else mcu_ms
+        reading = None
+        if counts:
+            a, b, c, d = (count % 65536 for count in counts)
+            reading = Reading(self.mcu_ms % 65536, (a, b, c, d))
+        at = Instant(self.now_ns, self.now_ns + 7)
+        self.timeline.read(at, LENGTH, 1, following)
+        return self.timeline.place(SPEEDS, reading, following, LENGTH, gap)
+
+
+def test_the_first_line_has_a_time_and_nothing_before_it() -> None:
+    bench = Bench()
+    found = bench.line()
+    made_ns = bench.now_ns - WIRE_NS
+    assert found.at == Instant(made_ns, made_ns + 7)
+    assert (found.speeds, found.dt, found.gap, found.heard_ns) == (SPEEDS, 0.0, 0.0, bench.now_ns)
+
+
+def test_bytes_behind_a_line_make_it_older() -> None:
+    bench = Bench()
+    assert bench.line(following=12).at.mono_ns == bench.now_ns - 1_041_666 - WIRE_NS
+
+
+def test_without_counts_dt_is_the_hosts() -> None:
+    bench = Bench()
+    bench.line()
+    found = bench.line(ms=12)
+    assert (found.dt, found.turned) == (0.012, None)
+
+
+def test_with_counts_dt_is_the_mcus_and_the_wheels_turned_as_counted() -> None:
+    bench = Bench()
+    bench.line(0, 0, 0, 0)
+    found = bench.line(10, -20, 30, 0, ms=17, mcu_ms=10)
+    assert found.dt == 0.01
+    assert found.turned == pytest.approx((DEGREE, -2 * DEGREE, 3 * DEGREE, 0.0))
+
+
+def test_the_wiring_says_whose_counts_they_are_and_which_way() -> None:
+    bench = Bench(WheelMap("-d", "+c", "-b", "+a"))
+    bench.line(0, 0, 0, 0)
+    found = bench.line(10, 20, 30, 40)
+    assert found.turned == pytest.approx((-4 * DEGREE, 3 * DEGREE, -2 * DEGREE, DEGREE))
+
+
+def test_the_first_counts_fall_back_to_speed_times_time() -> None:
+    bench = Bench()
+    bench.line()
+    found = bench.line(5, 5, 5, 5)
+    assert (found.dt, found.turned) == (0.01, None)
+
+
+def test_lines_without_counts_end_what_was_compared() -> None:
+    bench = Bench()
+    bench.line(0, 0, 0, 0)
+    bench.line()
+    assert bench.line(10, 10, 10, 10).turned is None
+    assert bench.line(20, 20, 20, 20).turned == pytest.approx((DEGREE,) * 4)
+
+
+def test_counts_bridge_a_gap_that_is_short_enough() -> None:
+    bench = Bench()
+    bench.line(0, 0, 0, 0)
+    found = bench.line(100, 100, 100, 100, ms=300, gap=True)
+    assert (found.dt, found.gap) == (0.0, 0.3)
+    assert found.turned == pytest.approx((10 * DEGREE,) * 4)
+
+
+def test_counts_bridge_no_gap_in_which_they_could_have_wrapped() -> None:
+    bench = Bench()
+    bench.line(0, 0, 0, 0)
+    found = bench.line(100, 100, 100, 100, ms=3000, gap=True)
+    assert (found.dt, found.gap, found.turned) == (0.0, 3.0, None)
+    assert not bench.timeline.restarted
+
+
+def test_a_restarted_clock_is_told_and_is_a_gap() -> None:
+    bench = Bench()
+    bench.line(900, 0, 0, 0)
+    found = bench.line(0, 0, 0, 0, ms=10, mcu_ms=-500)
+    assert bench.timeline.restarted
+    assert (found.dt, found.gap, found.turned) == (0.0, 0.01, None)
+    bench.line(0, 0, 0, 0)
+    assert not bench.timeline.restarted
+
+
+def test_a_leap_is_counted_and_the_speeds_stand_in() -> None:
+    bench = Bench()
+    bench.line(0, 0, 0, 0)
+    found = bench.line(9000, 0, 0, 0)
+    assert (found.dt, found.turned) == (0.01, None)
+    assert (bench.timeline.leaps, bench.timeline.restarted) == (1, False)
+
+
+def test_after_forgetting_the_counts_begin_anew() -> None:
+    bench = Bench()
+    bench.line(0, 0, 0, 0)
+    bench.timeline.forget()
+    assert bench.line(10, 10, 10, 10).turned is None
+
+
+def test_counts_nobody_configured_are_left_alone() -> None:
+    bench = Bench(counts=0)
+    bench.line(0, 0, 0, 0)
+    assert bench.line(10, 10, 10, 10).turned is None
+
+
+# boards for which only the reads give the time
+
+
+def reporting(bench: Bench, lines: int = 80) -> Bench:
+    """Feed this many lines one by one, every 10 ms."""
+    for _ in range(lines):
+        bench.timeline.left(bench.now_ns)
+        bench.line()
+    return bench
+
+
+def read(bench: Bench, ms: float, lines: int, silent: bool = False) -> list[Feedback]:
+    """Read this many lines `ms` after the last read.
+
+    With `silent`, the first one ends a silence.
+    """
+    bench.now_ns += int(ms * MS)
+    at = Instant(bench.now_ns, bench.now_ns + 7)
+    bench.timeline.read(at, LENGTH * lines, lines, 0)
+    return [
+        bench.timeline.place(SPEEDS, None, LENGTH * (lines - i), LENGTH, silent and i == 1)
+        for i in range(1, lines + 1)
+    ]
+
+
+@pytest.mark.parametrize("lines", [5, 15, 25, 28])
+def test_lines_that_lay_in_the_kernel_have_a_slot_each(lines: int) -> None:
+    bench = reporting(Bench(counts=0))
+    found = read(bench, lines * 10, lines, silent=True)
+    assert [(f.dt, f.gap, f.bridged) for f in found] == [(0.01, 0.0, 0.0)] * lines
+
+
+def test_what_the_wheels_are_judged_by_is_the_time_that_passed_here() -> None:
+    bench = reporting(Bench(counts=0))
+    found = read(bench, 250, 25, silent=True)
+    assert found[0].since == 0.0
+    assert sum(f.since for f in found[1:]) == pytest.approx(24 * WIRE_NS / 1e9)
+
+
+def test_stamps_of_lines_that_lay_in_the_kernel_are_a_period_apart() -> None:
+    bench = reporting(Bench(counts=0))
+    found = read(bench, 250, 25, silent=True)
+    stamps = [f.at.mono_ns for f in found]
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([10 * MS] * 24, abs=1000)
+    assert stamps[-1] == pytest.approx(bench.now_ns - WIRE_NS, abs=1000)
+    assert {f.at.wall_ns - f.at.mono_ns for f in found} == {7}
+
+
+def test_missing_lines_are_bridged_and_no_gap() -> None:
+    bench = reporting(Bench(counts=0))
+    for ms in range(0, 310, 10):
+        bench.timeline.left(bench.now_ns + ms * MS)
+    found = bench.line(ms=310, gap=True)
+    assert found.dt == pytest.approx(0.31)
+    assert found.gap == 0.0
+    assert found.bridged == pytest.approx(0.3)
+
+
+def test_what_is_missing_for_a_second_is_a_gap() -> None:
+    bench = reporting(Bench(counts=0))
+    found = bench.line(ms=1200, gap=True)
+    assert (found.dt, found.bridged) == (0.0, 0.0)
+    assert found.gap == pytest.approx(1.2)
+    assert bench.line().dt == 0.01
+
+
+def test_lines_of_a_backlog_with_missing_lines_are_as_far_apart_as_their_stamps() -> None:
+    bench = reporting(Bench(counts=0))
+    for ms in range(0, 390, 10):
+        bench.timeline.left(bench.now_ns + ms * MS)
+    found = read(bench, 390, 3, silent=True)
+    stamps = [f.at.mono_ns / 1e9 for f in found]
+    assert [f.dt for f in found] == pytest.approx([0.38 / 3] * 3)
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([0.38 / 3] * 2, abs=1e-3)
+
+
+def test_a_backlog_whose_missing_lines_last_for_a_second_begins_with_a_gap() -> None:
+    bench = reporting(Bench(counts=0))
+    for ms in range(0, 1500, 10):
+        bench.timeline.left(bench.now_ns + ms * MS)
+    first, second = read(bench, 1500, 2, silent=True)
+    assert (first.dt, first.bridged, second.dt, second.bridged) == (0.0, 0.0, 0.01, 0.0)
+    assert first.gap == pytest.approx(1.49, abs=0.01)
+
+
+def test_a_line_that_is_none_was_one_when_it_was_made() -> None:
+    bench = reporting(Bench(counts=0))
+    bench.now_ns += 10 * MS
+    bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
+    bench.timeline.spoilt()
+    found = bench.line()
+    assert (found.dt, found.bridged) == (0.02, 0.01)
+
+
+def test_without_a_period_lines_of_a_read_share_the_time_since_the_last() -> None:
+    bench = Bench(counts=0)
+    bench.line()
+    found = read(bench, 60, 3)
+    assert [f.dt for f in found] == pytest.approx([0.02] * 3)
+    stamps = [f.at.mono_ns for f in found]
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([20 * MS] * 2)
+    assert stamps[-1] == bench.now_ns - WIRE_NS
+
+
+def test_a_new_session_begins_without_the_old_ones_clock() -> None:
+    bench = reporting(Bench(counts=0))
+    bench.timeline.forget()
+    assert bench.line(ms=20).gap == pytest.approx(0.02)
+    assert bench.line(ms=14).dt == pytest.approx(0.014)
+
+
+@pytest.mark.parametrize("period", [20, 50])
+def test_another_rate_than_ours_has_its_own_period(period: int) -> None:
+    bench = Bench(counts=0)
+    for _ in range(80):
+        bench.line(ms=period)
+    found = read(bench, period * 6, 6, silent=True)
+    assert [(f.dt, f.gap) for f in found] == [(period / 1000, 0.0)] * 6
+
+
+# boards that answer each line
+
+
+def prompted(bench: Bench, lines: int = 60) -> Bench:
+    """Send a line every 10 ms and answer it 8 ms later.
+
+    One stall of the host reveals that the board answers.
+    """
+    for number in range(lines):
+        bench.timeline.left(bench.now_ns + 2 * MS)
+        bench.line(ms=160 if number == 50 else 10)
+        if number == 50:
+            bench.timeline.left(bench.now_ns - 8 * MS)
+    return bench
+
+
+def test_an_answer_is_as_far_from_the_last_as_their_lines() -> None:
+    bench = prompted(Bench(counts=0), 80)
+    bench.timeline.left(bench.now_ns + 202 * MS)
+    found = bench.line(ms=210, gap=True)
+    assert found.dt == pytest.approx(0.21, abs=1e-3)
+    assert (found.gap, found.bridged) == (0.0, 0.0)
+
+
+def test_an_answer_that_says_its_line_is_as_far_from_the_last_as_that() -> None:
+    bench = Bench(counts=0)
+    for number, ms in enumerate((0, 10, 20, 37)):
+        bench.timeline.left(10**9 + ms * MS)
+        bench.now_ns += (10, 3, 25, 1)[number] * MS
+        bench.timeline.read(Instant(bench.now_ns, bench.now_ns), LENGTH, 1, 0)
+        found = bench.timeline.place(SPEEDS, None, 0, LENGTH, False, 10**9 + ms * MS)
+        assert found.asked_ns == 10**9 + ms * MS
+        assert found.dt == pytest.approx((0.0, 0.01, 0.01, 0.017)[number])
+
+
+def test_a_change_of_clocks_adds_up_to_no_time() -> None:
+    bench = Bench(counts=0)
+    began = bench.now_ns + 10 * MS
+    total = 0.0
+    for number in range(400):
+        late = number % 4  # delay of the read, ms
+        bench.timeline.left(bench.now_ns)
+        total += bench.line(ms=10 + late).dt
+        bench.now_ns -= late * MS
+        if number % 100 == 70:
+            bench.timeline._slots.forget()
+    assert total == pytest.approx((bench.now_ns - began) / 1e9, abs=0.004)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> None:
+    """A slot lies at the time of the minimum delay, an answer at that of the mean delay."""
+    bench, chance, total = Bench(counts=0), random.Random(seed), 0.0
+    began = bench.now_ns
+    for number in (*range(200), *range(215, 230)):  # the stall reveals that the board answers
+        left_ns = began + number * 10 * MS
+        bench.timeline.left(left_ns)
+        bench.now_ns = left_ns + int(chance.uniform(7.0, 8.2) * MS)
+        at = Instant(bench.now_ns, bench.now_ns)
+        bench.timeline.read(at, LENGTH, 1, 0)
+        dt = bench.timeline.place(SPEEDS, None, 0, LENGTH, False).dt
+        total += dt if number >= 150 else 0.0
+    assert bench.timeline._told.clock == "prompts"
+    assert total == pytest.approx(0.8, abs=0.0003)

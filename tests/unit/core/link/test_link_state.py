@@ -1,0 +1,100 @@
+"""Trust in the link grows by good lines in a row and is lost by silence, damage and restarts."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from acsard.core.link.link_state import BAD_LINES, GOOD_LINES, TABLE, WORDS, Link, Sign, State
+
+MS = 1_000_000
+QUIET_NS = 100 * MS
+
+
+class Bench:
+    """A link to an MCU that sends a good line every 10 ms."""
+
+    def __init__(self) -> None:
+        self.link, self.now_ns = Link(QUIET_NS), 1000 * MS
+        self.link.sign("opened")
+
+    def good(self, count: int = 1, ms: float = 10, may_rise: bool = True) -> str:
+        for _ in range(count):
+            self.now_ns += int(ms * MS)
+            self.link.good(self.now_ns)
+            self.link.judge(self.now_ns, may_rise)
+        return self.link.state
+
+    def wait(self, ms: float) -> str:
+        self.now_ns += int(ms * MS)
+        self.link.judge(self.now_ns, True)
+        return self.link.state
+
+
+def test_every_state_has_its_words_and_a_way_down() -> None:
+    assert set(WORDS) == set(get_args(State))
+    assert {state for state, sign in TABLE if sign == "closed"} == set(WORDS) - {"down"}
+
+
+def test_it_is_up_with_the_third_good_line_in_a_row() -> None:
+    bench = Bench()
+    assert bench.good(GOOD_LINES - 1) == "booting"
+    bench.link.bad()
+    assert bench.good(GOOD_LINES - 1) == "booting"
+    assert bench.good() == "up"
+
+
+def test_it_does_not_rise_against_a_reason() -> None:
+    bench = Bench()
+    assert bench.good(GOOD_LINES + 1, may_rise=False) == "booting"
+    assert bench.good() == "up"
+
+
+def test_lines_further_apart_than_quiet_are_told_and_make_no_link() -> None:
+    bench = Bench()
+    bench.good(2, ms=101)
+    assert bench.link.sparse_s == 0.0  # a single silence proves nothing
+    assert bench.good(10, ms=101) == "booting"
+    assert bench.link.sparse_s == pytest.approx(0.101)
+    bench.good()
+    assert bench.link.sparse_s == 0.0
+
+
+def test_silence_makes_it_stale_and_good_lines_bring_it_back() -> None:
+    bench = Bench()
+    bench.good(GOOD_LINES)
+    assert bench.wait(100) == "up"
+    assert bench.wait(0.001) == "stale"
+    assert bench.good(GOOD_LINES - 1) == "stale"
+    assert bench.good() == "up"
+
+
+def test_bad_lines_alone_do_not_take_it_down_but_are_told() -> None:
+    bench = Bench()
+    bench.good(GOOD_LINES)
+    assert [bench.link.bad() for _ in range(BAD_LINES + 1)].index(True) == BAD_LINES - 1
+    assert (bench.link.state, bench.link.damaged) == ("up", True)
+    bench.good()
+    assert not bench.link.damaged
+
+
+@pytest.mark.parametrize(
+    ("sign", "state"),
+    [("closed", "down"), ("opened", "booting"), ("restarted", "booting"), ("damaged", "stale")],
+)
+def test_what_ends_a_link_ends_trust_too(sign: Sign, state: State) -> None:
+    bench = Bench()
+    bench.good(GOOD_LINES)
+    bench.link.sign(sign)
+    assert bench.link.state == state
+    assert bench.good(GOOD_LINES - 1) == state
+
+
+def test_the_first_line_of_a_session_comes_after_nothing() -> None:
+    bench = Bench()
+    assert bench.link.good(bench.now_ns) is None
+    assert bench.link.good(bench.now_ns + 7) == 7
+    bench.link.sign("restarted")
+    assert bench.link.silent(bench.now_ns + 8)
+    assert bench.link.good(bench.now_ns + 9) is None

@@ -1,0 +1,396 @@
+"""Tests of the negotiation of the check: questions, accepted answers, and the mode agreed on."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.check import Checked, Reading
+from acsard.core.link.codec import FrameError
+from acsard.core.link.negotiation import (
+    BLIND_PERIOD_NS,
+    FEW_SAMPLES,
+    LATE_NS,
+    MENDS,
+    TABLE,
+    TRIES,
+    WINDOW,
+    Negotiation,
+)
+
+MS = 1_000_000
+STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+GO = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
+READING = Reading(5, (1, 2, 3, 4))
+
+AUTO = McuConfig(link_check="auto")
+SAMPLES = McuConfig(link_check="auto", encoder_counts=3200)
+REQUIRE = McuConfig(link_check="require")
+
+
+class Bench:
+    """A negotiation with its time; a line counts as sent unless `settle(False)` says otherwise."""
+
+    def __init__(self, mcu: McuConfig = AUTO) -> None:
+        self.check = Negotiation(mcu, STOP)
+        self.now_ns = 1000 * MS
+
+    def ask(self, ms: float = 0) -> list[bytes]:
+        """Return the questions sent within this time in periods of 10 ms, all unanswered."""
+        asked = []
+        for _ in range(int(ms / 10) + 1):
+            self.check.settle(True)
+            self.check.judge(self.now_ns)
+            if self.check.asking:
+                line = self.check.question(self.now_ns)
+                asked += [] if line is None else [line]
+            self.now_ns += 10 * MS
+        return asked
+
+    def reply(self, sequence: int, reading: Reading | None = None) -> None:
+        self.check.settle(True)
+        self.check.answered(Checked(STOP[:-2], sequence, reading), self.now_ns)
+
+    def stale(self, sequence: int) -> bool:
+        try:
+            self.reply(sequence)
+        except FrameError as error:
+            return error.reason == "stale_sequence"
+        return False
+
+    def drive(self, count: int = 1) -> list[int]:
+        """Send this many lines and return their sequence numbers."""
+        sequences = []
+        for _ in range(count):
+            self.check.settle(True)
+            sequences.append(sequence_of(self.check.seal(GO, self.now_ns)))
+        return sequences
+
+    def checked(self, reading: Reading | None = None) -> Bench:
+        """Negotiate until the board has answered."""
+        (_, question) = self.ask(110)
+        self.reply(sequence_of(question), reading)
+        assert self.check.checked
+        return self
+
+
+def sequence_of(line: bytes) -> int:
+    return int(line.partition(b"#")[2][:2], 16)
+
+
+def kind(line: bytes) -> str:
+    """Return plain, checked or sampled."""
+    suffix = line.partition(b"#")[2]
+    return ("sampled" if suffix[2:3] == b"S" else "checked") if suffix else "plain"
+
+
+# asking
+
+
+def test_switched_off_nothing_is_asked_and_lines_leave_as_they_are() -> None:
+    check = Negotiation(McuConfig(), STOP)
+    check.begin(fresh=True)
+    assert (check.state, check.in_force) == ("off", "plain")
+    assert check.seal(GO, 0) == GO
+
+
+def test_every_question_is_a_stop() -> None:
+    for mcu in (AUTO, SAMPLES, REQUIRE):
+        for line in Bench(mcu).ask(3000):
+            assert line == STOP or line.startswith(STOP[:-2] + b"#")
+
+
+def test_a_question_that_did_not_leave_is_asked_again_at_once() -> None:
+    check, ms = Bench().check, 1000
+    check.settle(True)
+    kinds = []
+    for left in (False, False, True, False, True):
+        line = check.question(ms * MS)
+        assert line is not None
+        kinds.append(kind(line))
+        check.settle(left)
+        if left:
+            assert check.question((ms + 1) * MS) is None
+            check.settle(True)
+            ms += 100
+        ms += 1
+    assert kinds == ["plain"] * 3 + ["checked"] * 2
+
+
+def test_an_mcu_that_says_nothing_is_asked_in_turn_plainly_and_with_a_check_at_10_hz() -> None:
+    bench = Bench()
+    asked = bench.ask(2000)
+    assert [kind(line) for line in asked[:4]] == ["plain", "checked", "plain", "checked"]
+    assert len(asked) == 21
+    assert bench.check.asking
+
+
+def test_after_a_gap_the_first_question_is_one() -> None:
+    bench = Bench().checked()
+    bench.check.begin()
+    assert kind(bench.ask()[0]) == "checked"
+
+
+def test_a_right_reply_to_a_question_confirms() -> None:
+    bench = Bench().checked()
+    assert bench.check.in_force == "checked"
+    assert kind(bench.check.seal(GO, bench.now_ns)) == "checked"
+
+
+def test_a_right_reply_to_a_sequence_that_was_not_sent_confirms_nothing() -> None:
+    bench = Bench()
+    (_, question) = bench.ask(110)
+    for sequence in set(range(256)) - {sequence_of(question)}:
+        assert bench.stale(sequence)
+    assert bench.check.asking
+
+
+def test_a_question_that_did_not_leave_cannot_be_answered() -> None:
+    bench = Bench()
+    (_, question) = bench.ask(100)
+    bench.check.settle(False)
+    bench.check.settle(True)  # reported once; a later report belongs to another line
+    assert bench.stale(sequence_of(question))
+
+
+def test_a_question_of_each_kind_without_an_answer_settles_for_plain() -> None:
+    bench = Bench()
+    bench.ask()
+    bench.check.heard_plain()
+    asked = bench.ask(1000)
+    assert [kind(line) for line in asked] == ["checked"] * (1 + TRIES)
+    assert (bench.check.state, bench.check.in_force) == ("plain", "plain")
+    assert bench.check.seal(GO, bench.now_ns) == GO
+
+
+def test_samples_are_asked_for_three_times_and_then_three_times_without() -> None:
+    bench = Bench(SAMPLES)
+    bench.ask()
+    bench.check.heard_plain()
+    asked = bench.ask(2000)
+    assert [kind(line) for line in asked] == ["sampled"] * TRIES + ["checked"] * TRIES
+    assert bench.check.state == "plain"
+
+
+def test_questions_that_did_not_leave_are_not_counted() -> None:
+    bench = Bench()
+    bench.check.heard_plain()
+    for _ in range(300):
+        if bench.ask():
+            bench.check.settle(False)
+    assert bench.check.asking
+
+
+def test_a_question_is_counted_once_however_often_it_is_looked_at() -> None:
+    bench = Bench()
+    bench.check.heard_plain()
+    bench.ask()
+    for _ in range(100):
+        bench.now_ns += 10 * MS
+        bench.check.judge(bench.now_ns)
+    assert bench.check.asking
+
+
+def test_silence_is_no_refusal_however_long() -> None:
+    bench = Bench(SAMPLES)
+    bench.ask(60_000)
+    assert bench.check.asking
+    assert not bench.check.trouble
+
+
+def test_a_slow_wire_is_given_time_to_answer() -> None:
+    bench = Bench(McuConfig(link_check="auto", baud_rate=9600))
+    bench.check.heard_plain()
+    bench.ask(4 * 190)
+    assert bench.check.in_force == "being asked for"
+    bench.ask(100)
+    assert bench.check.in_force == "plain"
+
+
+def test_required_and_refused_it_is_asked_for_ever_and_says_why() -> None:
+    bench = Bench(REQUIRE)
+    bench.check.heard_plain()
+    assert len(bench.ask(5000)) > 50
+    assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
+    assert 'mcu.link_check = "require"' in MENDS[bench.check.trouble]
+    assert 'mcu.link_check = "auto"' in MENDS[bench.check.trouble]
+    (question,) = bench.ask(40)
+    bench.reply(sequence_of(question))
+    assert (bench.check.state, bench.check.trouble) == ("checked", "")
+
+
+def test_who_has_answered_with_a_check_is_not_believed_without() -> None:
+    bench = Bench().checked()
+    bench.check.begin()
+    bench.check.heard_plain()
+    bench.ask(5000)
+    assert bench.check.asking
+    assert "damaged" in MENDS[bench.check.trouble]
+
+
+def test_a_new_opening_forgets_who_was_there() -> None:
+    bench = Bench().checked()
+    bench.check.begin(fresh=True)
+    bench.check.heard_plain()
+    bench.ask(1000)
+    assert bench.check.state == "plain"
+
+
+def test_a_plain_question_that_did_not_leave_says_nothing_of_the_one_before() -> None:
+    bench = Bench()
+    plain, question, again = bench.ask(200)
+    assert [kind(line) for line in (plain, question, again)] == ["plain", "checked", "plain"]
+    bench.check.settle(False)
+    bench.reply(sequence_of(question))
+
+
+def test_no_sign_leads_out_of_off() -> None:
+    assert "off" not in {state for state, _ in TABLE} | set(TABLE.values())
+
+
+# sequences
+
+
+def test_sequences_count_up_and_start_over_after_255() -> None:
+    bench = Bench().checked()
+    first, *others = bench.drive(300)
+    assert others == [(first + n) % 256 for n in range(1, 300)]
+
+
+def test_only_the_last_line_can_be_one_that_did_not_leave() -> None:
+    bench = Bench().checked()
+    first, second = bench.drive(2)
+    bench.check.settle(False)
+    bench.check.settle(False)
+    assert bench.stale(second)
+    bench.reply(first)
+
+
+def test_a_line_from_another_time_is_stale_also_when_newer_ones_are_out() -> None:
+    bench = Bench().checked()
+    (old,) = bench.drive()
+    bench.now_ns += LATE_NS + 1
+    (new,) = bench.drive()
+    assert bench.stale(old)
+    bench.reply(new)
+
+
+def test_each_sequence_is_answered_once() -> None:
+    bench = Bench().checked()
+    (sequence,) = bench.drive()
+    bench.reply(sequence)
+    assert bench.stale(sequence)
+
+
+def test_late_answers_of_lines_that_were_piped_are_normal() -> None:
+    bench = Bench().checked()
+    for sequence in bench.drive(10):
+        bench.now_ns += 5 * MS
+        bench.reply(sequence)
+
+
+def test_an_answer_makes_those_before_it_stale() -> None:
+    bench = Bench().checked()
+    first, second, third = bench.drive(3)
+    bench.reply(second)
+    assert bench.stale(first)
+    bench.reply(third)
+
+
+def test_an_answer_may_be_late_but_not_from_another_time() -> None:
+    bench = Bench().checked()
+    assert LATE_NS == 300 * MS  # the timeout of the MCU's own watchdog
+    first, second = bench.drive(2)
+    bench.now_ns += LATE_NS
+    bench.reply(first)
+    bench.now_ns += 1
+    assert bench.stale(second)
+
+
+def test_only_the_last_lines_are_waited_for() -> None:
+    bench = Bench().checked()
+    sequences = bench.drive(WINDOW + 1)
+    assert bench.stale(sequences[0])
+    bench.reply(sequences[1])
+
+
+def test_asking_anew_forgets_what_was_sent_before() -> None:
+    bench = Bench().checked()
+    (sequence,) = bench.drive()
+    bench.check.begin()
+    assert bench.stale(sequence)
+
+
+@given(st.lists(st.integers(-1, 7), max_size=400))
+def test_no_sequence_counts_twice_whatever_is_lost(skips: list[int]) -> None:
+    bench = Bench().checked()
+    sent: list[int] = []
+    answered: set[int] = set()
+    for number, skip in enumerate(skips):
+        sent += bench.drive()
+        if skip >= 0:
+            at = max(0, number - skip)
+            if not bench.stale(sent[at]):
+                assert at not in answered
+                assert all(at > other for other in answered)
+                answered.add(at)
+
+
+# samples
+
+
+def test_an_answer_with_a_sample_has_them_asked_for_on() -> None:
+    bench = Bench(SAMPLES).checked(READING)
+    assert bench.check.in_force == "checked with samples"
+    assert kind(bench.check.seal(GO, bench.now_ns)) == "sampled"
+
+
+def test_an_answer_without_a_sample_ends_asking_for_them() -> None:
+    bench = Bench(SAMPLES).checked()
+    assert bench.check.in_force == "checked"
+    assert kind(bench.check.seal(GO, bench.now_ns)) == "checked"
+
+
+def test_samples_that_stop_coming_are_asked_for_no_more() -> None:
+    bench = Bench(SAMPLES).checked(READING)
+    for _ in range(FEW_SAMPLES - 1):
+        bench.reply(bench.drive()[0])
+    bench.reply(bench.drive()[0], READING)
+    for _ in range(FEW_SAMPLES):
+        assert bench.check.in_force == "checked with samples"
+        bench.reply(bench.drive()[0])
+    assert bench.check.in_force == "checked"
+
+
+@pytest.mark.parametrize("mcu", [AUTO, SAMPLES, REQUIRE])
+def test_while_it_is_asked_nothing_is_in_force(mcu: McuConfig) -> None:
+    assert Bench(mcu).check.in_force == "being asked for"
+
+
+def test_the_pace_of_questions_is_bounded() -> None:
+    assert BLIND_PERIOD_NS == 100 * MS
+    bench = Bench(REQUIRE)
+    bench.check.heard_plain()
+    assert len(bench.ask(1000)) <= 25
+
+
+def test_an_echo_is_never_taken_for_an_answer_and_nothing_drives_on_it() -> None:
+    for mcu in (AUTO, REQUIRE, SAMPLES):
+        bench = Bench(mcu)
+        bench.check.heard_plain()
+        for _ in range(50):
+            for line in bench.ask():
+                assert bench.check.echoed(line[:-2])
+        assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
+        assert "what is sent comes back" in MENDS[bench.check.trouble]
+        bench.check.begin(fresh=True)
+        assert not bench.check.trouble
+
+
+def test_an_answer_is_no_echo() -> None:
+    bench = Bench()
+    (_, question) = bench.ask(110)
+    answer = question.replace(b"H", b"")[:-2]
+    assert not bench.check.echoed(answer)

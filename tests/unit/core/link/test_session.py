@@ -1,0 +1,809 @@
+"""Tests of the link's states, and of the time, gap and session of each good line."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import McuConfig, WheelMap
+from acsard.core.config.wire_time import wire_ns
+from acsard.core.link.check import seal
+from acsard.core.link.feedback import APART_NS, Feedback
+from acsard.core.link.link_state import BAD_LINES, GOOD_LINES
+from acsard.core.link.session import LONG_GAP_NS, McuSession
+from acsard.core.values import NS_PER_S, STILL, Instant, Received, WheelSpeeds
+from tests.vectors.lines import SEED_LINE, SEED_MOTORS, ZERO
+
+MS = 1_000_000
+GOOD = SEED_LINE + b"\r\n"
+BAD = b"hello\r\n"
+WALL_NS = 1_800_000_000 * NS_PER_S
+SLOW = WheelSpeeds(1.0, 1.0, 1.0, 1.0)
+
+
+class Bench:
+    """A session with its time and a port that can be opened and closed."""
+
+    def __init__(
+        self, mcu: McuConfig | None = None, rate_hz: float = 100.0, longest_reply: float = 0.25
+    ) -> None:
+        self.session = McuSession(mcu or McuConfig(), rate_hz, longest_reply=longest_reply)
+        self.now_ns = 1000 * MS
+        self.opened = 0
+        self.port_open = False
+
+    @property
+    def now(self) -> Instant:
+        return Instant(self.now_ns, self.now_ns + WALL_NS)
+
+    def link(self) -> str:
+        return self.session.link
+
+    def line(self, speeds: WheelSpeeds = SLOW) -> bytes | None:
+        return self.session.line(self.now_ns, speeds)
+
+    def answer(self, line: bytes | None) -> bytes:
+        """Return the checked reply to a line from the host."""
+        assert line is not None
+        assert b"#" in line
+        return seal(GOOD, int(line.partition(b"#")[2][:2], 16))
+
+    def talk(self, ms: int = 10, count: int = 1) -> list[Feedback]:
+        """Let a line leave and its answer return `ms` later, `count` times."""
+        heard = []
+        for _ in range(count):
+            line = self.line()
+            checked = line is not None and b"#" in line
+            heard += self.wait(ms, self.answer(line)) if checked else self.wait(ms)
+        return heard
+
+    def checked(self) -> Bench:
+        """Open the port and talk until the link is up and checked."""
+        self.open().wait(10)
+        self.talk(count=30)
+        assert (self.link(), self.session.negotiation.state) == ("up", "checked")
+        return self
+
+    def names(self) -> list[str]:
+        """Return the names of the last update's events."""
+        return [event.name for event in self.session.events]
+
+    def open(self) -> Bench:
+        self.opened += 1
+        self.port_open = True
+        return self
+
+    def close(self) -> Bench:
+        self.port_open = False
+        return self
+
+    def wait(self, ms: float, *reads: bytes) -> list[Feedback]:
+        """Let `ms` pass, then update the session with the bytes that were read just now."""
+        self.now_ns += int(ms * MS)
+        received = tuple(Received(self.now, data) for data in reads)
+        return self.session.update(self.now, self.port_open, self.opened, received)
+
+    def up(self) -> Bench:
+        """Open the port and feed good lines until the link is up."""
+        self.open().wait(10)
+        for _ in range(GOOD_LINES):
+            self.wait(10, GOOD)
+        return self
+
+
+# the link
+
+
+def test_the_link_is_down_while_the_port_is_closed() -> None:
+    bench = Bench()
+    bench.wait(10)
+    assert bench.link() == "down"
+
+
+def test_bytes_read_from_a_closed_port_are_dropped() -> None:
+    bench = Bench()
+    assert bench.wait(10, GOOD * 5) == []
+    assert bench.link() == "down"
+
+
+def test_an_open_port_is_booting() -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    assert bench.link() == "booting"
+
+
+def test_the_link_is_up_with_the_third_good_line_and_not_before() -> None:
+    bench = Bench().open()
+    links = []
+    for _ in range(4):
+        bench.wait(10, GOOD)
+        links.append(bench.link())
+    assert links == ["booting", "booting", "up", "up"]
+
+
+def test_good_lines_of_one_read_count_each() -> None:
+    bench = Bench().open()
+    bench.wait(10, GOOD * 3)
+    assert bench.link() == "up"
+
+
+def test_a_bad_line_while_booting_starts_the_count_again() -> None:
+    bench = Bench().open()
+    bench.wait(10, GOOD + GOOD + BAD + GOOD + GOOD)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD)
+    assert bench.link() == "up"
+
+
+def test_a_board_that_prints_noise_keeps_booting() -> None:
+    bench = Bench().open()
+    for _ in range(100):
+        bench.wait(10, b"\x00\xf8~boot\r\n" + GOOD[:20])
+    assert bench.link() == "booting"
+
+
+def test_bad_lines_do_not_take_the_link_down_while_good_ones_come() -> None:
+    bench = Bench().up()
+    for _ in range(100):
+        bench.wait(10, BAD + BAD + GOOD + BAD)
+        assert bench.link() == "up"
+
+
+def test_after_quiet_without_a_good_line_the_link_is_stale() -> None:
+    bench = Bench().up()
+    bench.wait(100)
+    assert bench.link() == "up"
+    bench.wait(0.000001)
+    assert bench.link() == "stale"
+
+
+def test_bad_lines_do_not_hold_the_link_up() -> None:
+    bench = Bench().up()
+    for _ in range(11):
+        bench.wait(10, BAD)
+    assert bench.link() == "stale"
+
+
+def test_a_stale_link_is_up_again_after_three_good_lines() -> None:
+    bench = Bench().up()
+    bench.wait(150)
+    links = []
+    for _ in range(3):
+        bench.wait(10, GOOD)
+        links.append(bench.link())
+    assert links == ["stale", "stale", "up"]
+
+
+def test_a_stale_link_whose_port_closes_is_down() -> None:
+    bench = Bench().up()
+    bench.wait(150)
+    bench.close().wait(10)
+    assert bench.link() == "down"
+
+
+@pytest.mark.parametrize("lines", range(5))
+def test_a_reopened_port_is_booting_whatever_came_before(lines: int) -> None:
+    bench = Bench().open()
+    bench.wait(10, GOOD * lines)
+    bench.open().wait(10)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD * 2)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD)
+    assert bench.link() == "up"
+
+
+def test_half_a_line_of_the_old_session_does_not_spoil_the_first_of_the_new() -> None:
+    bench = Bench().up()
+    bench.wait(1, GOOD[:10])
+    assert len(bench.open().wait(10, GOOD)) == 1
+
+
+def test_half_a_line_before_the_port_closed_does_not_spoil_the_first_after() -> None:
+    bench = Bench().up()
+    bench.wait(1, GOOD[:10])
+    bench.close().wait(10)
+    assert len(bench.open().wait(10, GOOD)) == 1
+
+
+# silence
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "reply_period", "quiet_ms"),
+    [
+        (100.0, 0.0, 100),  # the minimum
+        (40.0, 0.0, 100),  # 4 x 25 ms, which is equal
+        (20.0, 0.0, 200),  # 4 x 50 ms
+        (23.0, 0.0, 173.913),  # 4 / 23 s
+        (100.0, 0.1, 300),  # 3 x 100 ms, for firmware that reports without being asked
+        (10.0, 0.1, 400),  # 4 x 100 ms exceed 3 x 100 ms
+        (10.0, 0.2, 600),  # 3 x 200 ms exceed 4 x 100 ms
+    ],
+)
+def test_quiet_is_100_ms_or_4_periods_or_3_reply_periods(
+    rate_hz: float, reply_period: float, quiet_ms: float
+) -> None:
+    session = McuSession(McuConfig(reply_period=reply_period), rate_hz)
+    assert session.quiet_ns / MS == pytest.approx(quiet_ms, abs=0.001)
+
+
+def test_the_session_is_silent_until_the_first_good_line() -> None:
+    bench = Bench().open()
+    bench.wait(10, BAD)
+    assert bench.session.silent(bench.now_ns)
+    bench.wait(10, GOOD)
+    assert not bench.session.silent(bench.now_ns)
+
+
+def test_the_session_is_silent_after_quiet() -> None:
+    bench = Bench().up()
+    assert not bench.session.silent(bench.now_ns + bench.session.quiet_ns)
+    assert bench.session.silent(bench.now_ns + bench.session.quiet_ns + 1)
+
+
+def test_a_new_session_is_silent_however_much_the_old_one_said() -> None:
+    bench = Bench().up()
+    bench.open().wait(10)
+    assert bench.session.silent(bench.now_ns)
+
+
+# the time of a line
+
+
+def sampled(bench: Bench, age_ns: int) -> Instant:
+    """Return the time of a line that was complete `age_ns` ago, less the wire time of its bytes."""
+    made_ns = bench.now_ns - age_ns - wire_ns(len(GOOD), 115200)
+    return Instant(made_ns, made_ns + WALL_NS)
+
+
+def test_a_line_that_ends_its_read_was_complete_then_and_made_its_own_bytes_earlier() -> None:
+    bench = Bench().open()
+    (feedback,) = bench.wait(10, GOOD)
+    assert feedback.heard_ns == bench.now_ns
+    assert feedback.at == sampled(bench, 0)
+    assert (feedback.speeds, feedback.dt) == (WheelSpeeds(*SEED_MOTORS), 0.0)
+    assert feedback.steps == (math.inf,) * 4
+
+
+def test_the_bytes_that_followed_a_line_make_it_older_on_both_clocks() -> None:
+    bench = Bench(McuConfig(baud_rate=9600)).open()
+    first, second = bench.wait(10, GOOD + GOOD + GOOD[:12])
+    # At 9600 baud 45 bytes take 46.875 ms, 12 bytes 12.5 ms, and the 33 of the line itself 34.375
+    # ms.
+    assert bench.now_ns - first.at.mono_ns == 46_875_000 + 34_375_000
+    assert bench.now_ns - second.at.mono_ns == 12_500_000 + 34_375_000
+    assert first.at.wall_ns - first.at.mono_ns == WALL_NS
+    assert second.at.wall_ns - second.at.mono_ns == WALL_NS
+
+
+def test_dt_is_the_time_since_the_line_before() -> None:
+    bench = Bench().open()
+    assert [f.dt for f in bench.wait(10, GOOD)] == [0.0]
+    assert [f.dt for f in bench.wait(10, GOOD)] == [0.01]
+    assert [f.dt for f in bench.wait(12.5, GOOD)] == [0.0125]
+
+
+def test_lines_read_together_share_the_time_since_the_read_before() -> None:
+    bench = Bench().up()
+    first, second, third = bench.wait(15, GOOD * 3)
+    assert first.dt == second.dt == third.dt == pytest.approx(0.005)
+
+
+def test_a_line_is_never_older_than_the_one_before_it() -> None:
+    bench = Bench(McuConfig(baud_rate=9600)).open()
+    (first,) = bench.wait(10, GOOD)
+    (second,) = bench.wait(1, GOOD + GOOD[:20])  # 20.8 ms of wire time within 1 ms
+    # The stamps must also differ. A reader of the transforms takes the second of two with one stamp
+    # for an echo.
+    assert second.at.mono_ns == first.at.mono_ns + APART_NS
+    assert second.at.wall_ns == first.at.wall_ns + APART_NS
+    assert second.dt == 0.0
+
+
+@given(
+    reads=st.lists(
+        st.tuples(st.floats(0.0, 90.0), st.integers(0, 4), st.integers(0, 32)), max_size=30
+    ),
+    baud=st.sampled_from([9600, 115200]),
+)
+def test_without_gaps_the_dts_add_up_to_the_time_between_first_and_last_line(
+    reads: list[tuple[float, int, int]], baud: int
+) -> None:
+    bench = Bench(McuConfig(baud_rate=115200 if baud == 115200 else 9600)).open()
+    heard = bench.wait(10, GOOD)
+    for ms, lines, cut in reads:
+        data = GOOD * (lines + 1)
+        heard += bench.wait(ms, data[: 33 * lines + cut], data[33 * lines + cut :])
+    total = (heard[-1].at.mono_ns - heard[0].at.mono_ns) / NS_PER_S
+    apart = len(heard) * APART_NS / NS_PER_S
+    assert sum(f.dt for f in heard) == pytest.approx(total, abs=apart)
+    assert all(f.dt >= 0.0 and f.gap == 0.0 for f in heard)
+    assert all(a.at.mono_ns < b.at.mono_ns for a, b in pairwise(heard))
+    assert all(f.at.mono_ns <= bench.now_ns for f in heard)
+
+
+def test_a_line_cut_over_two_reads_is_as_old_as_the_second() -> None:
+    bench = Bench().up()
+    bench.wait(5, GOOD[:20])
+    (feedback,) = bench.wait(5, GOOD[20:] + GOOD[:3])
+    assert feedback.at == sampled(bench, wire_ns(3, 115200))
+
+
+def test_a_step_of_the_wall_clock_changes_no_dt() -> None:
+    session = McuSession(McuConfig(), 100.0)
+    for step in range(1, 10):
+        now = Instant(step * 10 * MS, WALL_NS + (-1) ** step * 3600 * NS_PER_S)
+        (feedback,) = session.update(now, True, 1, (Received(now, GOOD),))
+        assert feedback.dt == (0.01 if step > 1 else 0.0)
+        late_ns = now.mono_ns - feedback.at.mono_ns
+        assert late_ns == now.wall_ns - feedback.at.wall_ns == wire_ns(len(GOOD), 115200)
+
+
+# gaps
+
+
+def test_after_a_gap_dt_is_zero_and_the_gap_is_its_length() -> None:
+    bench = Bench().up()
+    bench.wait(200)
+    (feedback,) = bench.wait(50, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.0, 0.25)
+
+
+def test_a_silence_as_long_as_quiet_is_no_gap() -> None:
+    bench = Bench().up()
+    (feedback,) = bench.wait(100, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.1, 0.0)
+    (feedback,) = bench.wait(100.000001, GOOD)
+    assert feedback.dt == 0.0
+    assert feedback.gap > 0.1
+
+
+def test_bad_lines_do_not_fill_a_gap() -> None:
+    bench = Bench().up()
+    for _ in range(15):
+        bench.wait(10, BAD)
+    (feedback,) = bench.wait(10, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.0, 0.16)
+
+
+def test_the_second_line_after_a_gap_has_its_dt_again() -> None:
+    bench = Bench().up()
+    bench.wait(500, GOOD)
+    (feedback,) = bench.wait(10, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.01, 0.0)
+
+
+def test_the_time_a_port_was_closed_is_a_gap_however_short() -> None:
+    bench = Bench().up()
+    bench.close().wait(20)
+    (feedback,) = bench.open().wait(20, GOOD)
+    assert (feedback.dt, feedback.gap) == (0.0, 0.04)
+
+
+# a new session
+
+
+def test_a_session_restarts_when_the_port_is_opened_and_only_in_that_update() -> None:
+    bench = Bench()
+    bench.wait(10)
+    assert not bench.session.restarted
+    bench.open().wait(10)
+    assert bench.session.restarted
+    bench.wait(10)
+    assert not bench.session.restarted
+
+
+def test_a_session_restarts_when_the_port_was_closed_and_opened_between_two_updates() -> None:
+    bench = Bench().up()
+    assert not bench.session.restarted
+    bench.open().wait(10, GOOD)
+    assert bench.session.restarted
+
+
+def test_a_closed_port_is_not_yet_a_new_session() -> None:
+    bench = Bench().up()
+    bench.close().wait(10)
+    assert not bench.session.restarted
+
+
+def test_a_session_restarts_with_the_first_line_after_a_long_gap() -> None:
+    bench = Bench().up()
+    bench.wait(LONG_GAP_NS / MS)
+    assert not bench.session.restarted
+    bench.wait(0, GOOD)
+    assert bench.session.restarted
+    bench.wait(10, GOOD)
+    assert not bench.session.restarted
+
+
+def test_a_session_does_not_restart_after_a_short_gap() -> None:
+    bench = Bench().up()
+    bench.wait(999.999, GOOD)
+    assert not bench.session.restarted
+
+
+def test_a_long_gap_counts_wherever_in_the_read_its_end_is() -> None:
+    bench = Bench().up()
+    bench.wait(1500, GOOD + GOOD + BAD + GOOD)
+    assert bench.session.restarted
+
+
+# counting
+
+
+def test_good_lines_are_counted_and_bad_ones_by_reason() -> None:
+    bench = Bench().up()
+    bench.wait(10, b"hello\r\n" + GOOD + b"x" * 200 + b"\n" + b"x\r\n")
+    bench.wait(10, b"ap99.999,bp00.00,cp00.00,dp00.00\n" + b"\x00" * 300)
+    bench.wait(10, b"\n" + b"ap01.00,ap00.00,cp00.00,dp00.00\n" * 3)
+    assert bench.session.good_lines == GOOD_LINES + 1
+    assert bench.session.rejects == {
+        "malformed": 2,
+        "too_long": 2,
+        "over_range": 1,
+        "wheel_twice": 3,
+    }
+
+
+def test_the_counts_go_on_in_the_next_session() -> None:
+    bench = Bench().up()
+    bench.wait(10, BAD + b"x" * 200)
+    bench.close().wait(10)
+    bench.open().wait(10, BAD + b"x" * 200 + b"\n" + GOOD)
+    assert bench.session.rejects["malformed"] == 2
+    assert bench.session.rejects["too_long"] == 2
+    assert bench.session.good_lines == GOOD_LINES + 1
+
+
+def test_the_line_is_read_by_the_wheel_map_of_the_configuration() -> None:
+    mcu = McuConfig(wheels=WheelMap("-d", "+b", "+c", "-a"))
+    (feedback,) = Bench(mcu).open().wait(10, GOOD)
+    assert feedback.speeds == WheelSpeeds(10.25, -8.75, 15.0, -12.5)
+
+
+def test_the_codec_writes_the_dialect_of_the_configuration() -> None:
+    session = McuSession(McuConfig(trailing_comma=True), 100.0)
+    assert session.codec.encode(WheelSpeeds(*SEED_MOTORS)) == SEED_LINE + b",\r\n"
+
+
+def test_an_over_long_line_starts_the_count_of_good_lines_again() -> None:
+    bench = Bench().open()
+    for _ in range(4):
+        bench.wait(10, b"x" * 200 + b"\r\n" + GOOD)
+    assert bench.link() == "booting"
+
+
+def test_good_lines_with_silences_between_them_do_not_bring_the_link_up() -> None:
+    bench = Bench().open()
+    for _ in range(10):
+        bench.wait(150, GOOD)
+    assert bench.link() == "booting"
+
+
+# the checked link
+
+AUTO = McuConfig(link_check="auto")
+REQUIRE = McuConfig(link_check="require")
+BOOTED = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
+
+
+def test_while_the_check_is_asked_for_only_stops_leave_and_the_link_is_not_up() -> None:
+    bench = Bench(REQUIRE).open()
+    for _ in range(300):
+        bench.wait(10, GOOD)
+        line = bench.line()
+        assert line is None or line.startswith(ZERO)
+        assert bench.link() == "booting"
+    assert bench.session.good_lines == 0
+
+
+def test_the_link_is_up_with_the_third_right_reply() -> None:
+    bench = Bench(AUTO).open()
+    bench.wait(10)
+    while bench.session.negotiation.asking:
+        bench.talk()
+    assert (bench.link(), bench.session.good_lines) == ("booting", 1)
+    bench.talk(count=2)
+    assert (bench.link(), bench.session.good_lines) == ("up", 3)
+
+
+def test_an_mcu_without_the_check_is_driven_plainly() -> None:
+    bench = Bench(AUTO).open()
+    for _ in range(40):
+        bench.wait(10, GOOD)
+        bench.line()
+    assert (bench.link(), bench.session.negotiation.state) == ("up", "plain")
+    assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+    assert bench.session.rejects == {}
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        (GOOD, "unchecked"),
+        (seal(GOOD, 200), "stale_sequence"),
+        (seal(GOOD, 1).replace(b"12.50", b"12.51"), "wrong_check"),
+        (seal(b"ap12.50\r\n", 1), "malformed"),
+        (b"x" * 200 + b"\n", "too_long"),
+    ],
+)
+def test_on_a_checked_link_a_reply_without_a_right_suffix_is_dropped_and_counted(
+    line: bytes, reason: str
+) -> None:
+    bench = Bench(AUTO).checked()
+    bench.session.rejects.clear()
+    assert bench.wait(1, line) == []
+    assert bench.session.rejects == {reason: 1}
+    assert bench.link() == "up"
+
+
+def test_a_reply_counts_once() -> None:
+    bench = Bench(AUTO).checked()
+    reply = bench.answer(bench.line())
+    assert len(bench.wait(10, reply + reply + reply)) == 1
+    assert bench.session.rejects["stale_sequence"] == 2
+
+
+def test_replies_to_piped_lines_count_each() -> None:
+    bench = Bench(AUTO).checked()
+    replies = []
+    for _ in range(4):
+        replies.append(bench.answer(bench.line()))
+        bench.wait(10)
+    assert len(bench.wait(1, b"".join(replies))) == 4
+
+
+def test_five_bad_replies_in_a_row_are_no_link_and_the_check_is_asked_for_again() -> None:
+    bench = Bench(AUTO).checked()
+    bench.wait(1, BAD * (BAD_LINES - 1))
+    assert bench.link() == "up"
+    bench.wait(1, BAD)
+    assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
+    assert "damaged" in bench.session.words()
+    line = bench.line()
+    assert line is not None
+    assert line.startswith(ZERO + b"#")
+    bench.wait(10, bench.answer(line))
+    bench.talk(count=2)
+    assert bench.link() == "up"
+    assert bench.line() is not None
+
+
+def test_bad_replies_among_right_ones_are_only_counted() -> None:
+    bench = Bench(AUTO).checked()
+    for _ in range(50):
+        bench.wait(10, BAD * (BAD_LINES - 1) + bench.answer(bench.line()))
+    assert bench.link() == "up"
+
+
+def test_quiet_without_a_right_reply_has_the_check_asked_for_again() -> None:
+    bench = Bench(AUTO).checked()
+    for _ in range(3):
+        bench.wait(30, GOOD)
+    assert bench.link() == "up"
+    bench.wait(11, GOOD)
+    assert (bench.link(), bench.session.negotiation.asking) == ("stale", True)
+
+
+def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
+    bench = Bench(AUTO).checked()
+    for _ in range(500):
+        bench.wait(10, GOOD)
+        line = bench.line()
+        assert line is None or line.startswith(ZERO) or bench.link() == "up"
+    assert bench.session.negotiation.asking
+    assert "before and now does not" in bench.session.words()
+
+
+@pytest.mark.parametrize("mcu", [McuConfig(), AUTO], ids=["plain", "checked"])
+def test_an_mcu_that_names_itself_has_restarted(mcu: McuConfig) -> None:
+    bench = Bench(mcu).checked() if mcu is AUTO else Bench(mcu).up()
+    bench.wait(10, BOOTED)
+    assert bench.session.restarted
+    assert bench.link() == "booting"
+    assert bench.names() == ["mcu_restarted", "link_booting"]
+    line = bench.line()
+    assert line is None or line.startswith(ZERO)
+    assert bench.session.rejects == {}
+
+
+def test_what_the_mcu_says_while_it_is_awaited_is_no_news() -> None:
+    bench = Bench(AUTO).open()
+    bench.wait(10, BOOTED)
+    assert bench.names() == ["link_booting"]
+    assert bench.session.restarted
+
+
+def test_the_outcome_is_an_event() -> None:
+    bench = Bench(AUTO).open()
+    told = []
+    for _ in range(40):
+        bench.talk()
+        told += bench.session.events
+    (outcome,) = [event for event in told if event.name == "link_check"]
+    assert (outcome.level, outcome.text) == ("info", "the serial lines are checked")
+
+
+def test_a_refusal_is_an_event_and_the_reason() -> None:
+    bench = Bench(REQUIRE).open()
+    told = []
+    for _ in range(100):
+        bench.wait(10, GOOD)
+        bench.line()
+        told += bench.session.events
+    (outcome,) = [event for event in told if event.name == "link_check"]
+    assert outcome.level == "error"
+    assert bench.session.words() == outcome.text
+
+
+def test_the_note_behind_a_reason_says_the_check_in_force() -> None:
+    assert Bench().up().session.note == ""
+    assert Bench(AUTO).checked().session.note == " (serial lines checked)"
+
+
+def test_the_first_stop_of_a_silence_leaves_at_once() -> None:
+    """The last line to the MCU, one period ago, commanded motion."""
+    bench = Bench().up()
+    while not bench.session.silent(bench.now_ns):
+        assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+        bench.wait(10)
+    assert bench.line() == bench.session.codec.stop
+
+
+def test_an_mcu_that_has_started_again_is_stopped_at_once() -> None:
+    bench = Bench().up()
+    assert bench.line() == b"ap01.00,bp01.00,cp01.00,dp01.00\r\n"
+    bench.wait(10, BOOTED)
+    assert bench.line() == bench.session.codec.stop
+
+
+def test_a_silent_mcu_gets_stops_at_ten_hertz() -> None:
+    bench = Bench().up()
+    bench.wait(150)
+    assert bench.line(WheelSpeeds(5.0, 5.0, 5.0, 5.0)) == bench.session.codec.stop
+    lines = []
+    for _ in range(100):
+        bench.wait(10)
+        lines.append(bench.line())
+    assert [line for line in lines if line] == [bench.session.codec.stop] * 10
+
+
+def test_zero_is_the_stop_line() -> None:
+    assert Bench().up().line(STILL) == ZERO + b"\r\n"
+
+
+def test_the_link_is_seen_to_go_when_the_mcu_restarts_within_one_read() -> None:
+    bench = Bench().up()
+    bench.wait(10, BOOTED + GOOD * 4)
+    assert bench.link() == "booting"
+    bench.wait(10, GOOD)
+    assert bench.link() == "up"
+
+
+def counts_after(bench: Bench, counts: int) -> tuple[int, ...]:
+    """Return the counts found for an encoder whose lines alternate by one count."""
+    speed = math.tau / counts / 0.01
+    for i in range(400):
+        line = ",".join(f"{motor}p{speed * (i % 2):05.2f}" for motor in "abcd")
+        bench.wait(10, line.encode() + b"\r\n")
+    return bench.session.snapping.counts
+
+
+def test_the_counts_of_an_encoder_are_found_in_its_lines() -> None:
+    assert counts_after(Bench().up(), 20) == (20,) * 4
+
+
+@pytest.mark.parametrize("counts", [20, 40])
+def test_behind_a_port_opened_again_the_encoders_are_unknown(counts: int) -> None:
+    bench = Bench().up()
+    counts_after(bench, 20)
+    bench.close().wait(10)
+    bench.open().wait(10)
+    assert bench.session.snapping.counts == (0,) * 4
+    assert counts_after(bench, counts) == (counts,) * 4
+
+
+def test_an_mcu_that_has_started_again_may_be_another() -> None:
+    bench = Bench().up()
+    counts_after(bench, 20)
+    bench.wait(10, BOOTED)
+    assert bench.session.snapping.counts == (0,) * 4
+
+
+@pytest.mark.parametrize("reads", [1, 4])
+def test_the_bad_lines_of_an_update_are_one_event_for_each_reason(reads: int) -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    bench.wait(10, *([b"x\r\n" * 200 + b"ap99.99\r\n" + b"y" * 300 + b"\r\n"] * reads))
+    told = [(event.kind, event.count, event.text) for event in bench.session.events]
+    assert told == [("malformed", 201 * reads, "b'ap99.99'"), ("too_long", reads, "")]
+    assert bench.session.rejects == {"malformed": 201 * reads, "too_long": reads}
+
+
+# a blocked output
+
+
+def update(bench: Bench, *, left: bool, ms: float = 10, read: bytes = GOOD) -> None:
+    """Let time pass after a line that left or did not leave, then update the session."""
+    bench.now_ns += int(ms * MS)
+    received = (Received(bench.now, read),) if read else ()
+    bench.session.update(bench.now, bench.port_open, bench.opened, received, unsent=not left)
+
+
+def blocked(bench: Bench, ms: float) -> Bench:
+    """Return the session after no line left for this long while good lines kept arriving."""
+    bench.line()
+    update(bench, left=True)
+    for _ in range(round(ms / 10)):
+        bench.line()
+        update(bench, left=False)
+    return bench
+
+
+def test_an_output_that_is_blocked_for_the_watchdog_time_makes_the_link_stale() -> None:
+    bench = blocked(Bench().up(), 290)
+    assert (bench.link(), bench.session.blocked) == ("up", False)
+    bench.line()
+    update(bench, left=False, ms=20)
+    assert (bench.link(), bench.session.blocked) == ("stale", True)
+    assert bench.names() == ["link_stale"]
+    assert bench.session.words() == bench.session.events[0].text
+    assert "sends nothing" in bench.session.words()
+
+
+@pytest.mark.parametrize(("ms", "restarted"), [(900, False), (1010, True)])
+def test_a_line_that_leaves_ends_the_block_and_a_second_of_it_is_a_new_session(
+    ms: float, restarted: bool
+) -> None:
+    bench = blocked(Bench().up(), ms)
+    bench.line()
+    update(bench, left=True)
+    assert (bench.session.blocked, bench.session.restarted) == (False, restarted)
+    for _ in range(GOOD_LINES):
+        bench.line()
+        update(bench, left=True)
+    assert bench.link() == "up"
+
+
+def test_a_step_that_comes_late_is_no_blocked_output() -> None:
+    bench = Bench().up()
+    bench.line()
+    update(bench, left=False, ms=400)
+    bench.line()
+    update(bench, left=True)
+    assert not bench.session.blocked
+
+
+def test_a_block_ends_with_its_opening() -> None:
+    bench = blocked(Bench().up(), 500)
+    bench.close().wait(10)
+    assert not bench.session.blocked
+    bench.up()
+    assert bench.link() == "up"
+
+
+def test_for_a_closed_port_stops_are_made_at_ten_hertz_and_the_opening_gets_one_at_once() -> None:
+    bench = Bench()
+    made = []
+    for _ in range(100):
+        update(bench, left=False, read=b"")
+        made.append(bench.line())
+    assert len([line for line in made if line]) == 10
+    bench.open()
+    update(bench, left=False, read=b"")
+    assert bench.line() == ZERO + b"\r\n"
+
+
+def test_a_blind_stop_that_did_not_leave_is_made_again_with_the_next_line() -> None:
+    bench = Bench().open()
+    bench.wait(10)
+    assert bench.line() == ZERO + b"\r\n"
+    update(bench, left=False, read=b"")
+    assert bench.line() == ZERO + b"\r\n"
+    update(bench, left=True, read=b"")
+    assert bench.line() is None

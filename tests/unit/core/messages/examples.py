@@ -1,0 +1,80 @@
+"""Outputs of one step in which every number is different, so that a swapped field shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from msgspec.structs import replace
+
+from acsard.core.values import (
+    Estimate,
+    Event,
+    Instant,
+    Measured,
+    Outputs,
+    Pose,
+    PoseCovariance,
+    Snapshot,
+    SourceStatus,
+    Spread,
+    Twist,
+    TwistVariances,
+    Wait,
+    WheelSpeeds,
+)
+
+START = Instant(100_000_000_000, 1_700_000_000_000_000_000)
+
+ESTIMATE = Estimate(
+    at=Instant(104_000_000_000, 1_700_000_003_250_000_001),
+    pose=Pose(1.5, -2.5, 0.5),
+    twist=Twist(0.25, -0.75),
+    covariance=PoseCovariance(0.11, 0.12, 0.16, 0.22, 0.26, 0.66),
+    twist_variances=TwistVariances(0.01, 0.02, 0.06),
+    positions=(10.0, 20.0, 30.0, 40.0),
+    speeds=WheelSpeeds(1.0, 2.0, 3.0, 4.0),
+)
+
+OUTPUTS = Outputs(
+    now=Instant(104_004_000_000, 1_700_000_003_254_000_002),
+    due=True,
+    line=None,
+    speeds=WheelSpeeds(5.0, 6.0, 7.0, 8.0),
+    applied=Twist(0.3, 0.9),
+    linked=True,
+    estimates=(ESTIMATE,),
+    mode="driving",
+    reason="driving: commanded by app",
+    link="up",
+    source="app",
+    command_ns=103_990_000_000,
+    status_changed=False,
+    events=(Event("stop", "stopped", by="phone"),),
+)
+
+SNAPSHOT = Snapshot(
+    pose=Pose(1.6, -2.6, 0.6),
+    measured=Twist(0.26, -0.76),
+    speeds=WheelSpeeds(1.1, 2.1, 3.1, 4.1),
+    sources=(
+        SourceStatus("app", 50, 0.01, Wait("nothing")),
+        SourceStatus("nav", 10, None, Wait("command")),
+    ),
+    counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
+    refused="source nav: held up",
+    figures={
+        "period_lateness": Measured(Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0))
+    },
+)
+
+
+def at(instant: Instant, **changes: Any) -> Outputs:
+    """Return the outputs of a tick at another time, with one estimate of that time."""
+    estimate = replace(ESTIMATE, at=instant)
+    return replace(OUTPUTS, now=instant, **({"estimates": (estimate,)} | changes))
+
+
+def later(seconds: float) -> Instant:
+    """Return the instant this many seconds after `START` on both clocks."""
+    ns = round(seconds * 1e9)
+    return Instant(START.mono_ns + ns, START.wall_ns + ns)

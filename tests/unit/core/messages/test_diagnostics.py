@@ -1,0 +1,177 @@
+"""Tests of the text and level of each row of `diagnostics`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import BusConfig, Config, ControlConfig, McuConfig, RobotConfig
+from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
+from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.values import GyroStatus, Measured, Outputs, RoutersStatus, Snapshot, Spread
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
+
+CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))
+NO_CERTIFICATE = (0, "")
+
+
+def rows(
+    config: Config = CONFIG, outputs: Outputs = OUTPUTS, snapshot: Snapshot = SNAPSHOT
+) -> list[DiagnosticStatus]:
+    return diagnostics(config, outputs, snapshot, NO_CERTIFICATE).status
+
+
+def row(name: str, *args: Any, **changes: Any) -> DiagnosticStatus:
+    (one,) = [one for one in rows(*args, **changes) if one.name == f"acsard: {name}"]
+    return one
+
+
+def seen(**changes: Any) -> Snapshot:
+    return replace(SNAPSHOT, **changes)
+
+
+def values(one: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in one.values}
+
+
+# names, by which rqt_robot_monitor identifies its rows
+
+
+def test_every_status_names_the_robot_it_is_of() -> None:
+    found = rows()
+    assert {one.hardware_id for one in found} == {"r7"}
+    assert len({one.name for one in found}) == len(found)
+
+
+@pytest.mark.parametrize("mode", ["inactive", "waiting", "stopped", "fault", "leaving"])
+@pytest.mark.parametrize("link", ["up", "stale", "booting", "down"])
+def test_no_row_comes_or_goes_while_the_robot_lives(mode: str, link: str) -> None:
+    outputs = replace(OUTPUTS, mode=mode, link=link, source="", reason="words")
+    snapshot = seen(figures={}, counters={}, sources=(), refused_age_s=0.0, missed_last_minute=9)
+    names = [(one.name, one.hardware_id) for one in rows()]
+    assert [(one.name, one.hardware_id) for one in rows(CONFIG, outputs, snapshot)] == names
+
+
+@pytest.mark.parametrize("does", ["waiting for rest", "used", "silent", "dead", "not believed"])
+def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
+    assert [one.name for one in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
+        *(one.name for one in rows()),
+        "acsard: gyro",
+    ]
+
+
+def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() -> None:
+    """The row must be there before the first look at the routers.
+
+    That look takes half a second, and the monitor would otherwise see a row appear.
+    """
+    config = replace(CONFIG, bus=BusConfig(connect=("tcp/a:7447",)))
+    one = row("router", config)
+    assert (one.level, one.message) == (OK, "not connected yet")
+    assert values(one) == {"tcp/a:7447": "not connected yet"}
+    looked = seen(routers=RoutersStatus(missing=("tcp/a:7447",)))
+    assert [of.name for of in rows(config, snapshot=looked)] == [of.name for of in rows(config)]
+
+
+# mode
+
+
+@pytest.mark.parametrize(
+    ("mode", "level"),
+    [
+        ("driving", OK),
+        ("ready", OK),
+        ("waiting", OK),
+        ("inactive", OK),
+        ("leaving", OK),
+        ("stopped", WARN),
+        ("fault", ERROR),
+    ],
+)
+def test_what_is_latched_is_no_ok_and_its_reason_the_message(mode: str, level: int) -> None:
+    one = row("mode", outputs=replace(OUTPUTS, mode=mode, reason="words"))
+    assert (one.level, one.message) == (level, "words")
+    assert values(one) == {"mode": mode, "source": "app"}
+
+
+# link
+
+
+@pytest.mark.parametrize(
+    ("link", "level"), [("up", OK), ("stale", ERROR), ("booting", ERROR), ("down", ERROR)]
+)
+def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
+    one = row("serial link", outputs=replace(OUTPUTS, link=link))
+    assert (one.level, one.message) == (level, link)
+
+
+@pytest.mark.parametrize(("link", "level"), [("up", WARN), ("down", ERROR)])
+def test_the_simulator_is_never_taken_for_a_robot(link: str, level: int) -> None:
+    one = row("serial link", Config(), replace(OUTPUTS, link=link))
+    assert (one.level, one.message) == (level, f"{link}: the simulator, no wheel turns")
+
+
+def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> None:
+    mcu, control = McuConfig(port="/dev/x", baud_rate=38400), ControlConfig(rate=50)
+    one = row("serial link", replace(CONFIG, mcu=mcu, control=control))
+    assert values(one) == {
+        "port": "/dev/x",
+        "wire_use": "0.43",  # 50 lines a second of 33 bytes with 10 bits each, on 38400 baud
+        "check": "plain",
+        "lines": "100",
+        "line_malformed": "2",
+    }
+
+
+# control loop
+
+
+@pytest.mark.parametrize(("missed", "level"), [(0, OK), (1, OK), (2, WARN)])
+def test_more_than_one_period_in_a_hundred_missed_in_the_last_minute_is_a_warning(
+    missed: int, level: int
+) -> None:
+    one = row("control loop", snapshot=seen(missed_last_minute=missed))
+    assert one.level == level
+    assert one.message == f"{missed} of {100 + missed} periods missed in the last minute"
+    assert values(one) == {
+        "period_lateness_p50_us": "50",
+        "period_lateness_p99_us": "400",
+        "period_lateness_max_us": "900",
+        "period_lateness_minute_p50_us": "40",
+        "period_lateness_minute_p99_us": "80",
+        "period_lateness_minute_max_us": "90",
+    }
+
+
+def test_what_was_missed_an_hour_ago_is_told_and_no_warning_any_more() -> None:
+    one = row("control loop", snapshot=seen(counters={"missed_periods": 100_000}))
+    assert (one.level, values(one)["missed_periods"]) == (OK, "100000")
+
+
+def test_a_bad_minute_is_a_warning_after_any_number_of_good_hours() -> None:
+    long = {"period_lateness": Measured(Spread(10_000_000), Spread(5_800))}
+    assert row("control loop", snapshot=seen(figures=long, missed_last_minute=200)).level == WARN
+
+
+# commands
+
+
+def test_the_commands_show_what_each_source_waits_for_and_what_was_refused() -> None:
+    one = row("commands")
+    assert (one.level, one.message) == (OK, "commanded by app")
+    assert values(one) == {
+        "app": "driving",
+        "nav": "a command",
+        "commands": "7",
+        "command_stale": "3",
+    }
+    assert row("commands", outputs=replace(OUTPUTS, source="")).message == "waiting for a command"
+
+
+def test_commands_are_a_warning_while_a_source_is_refused_and_say_why() -> None:
+    one = row("commands", snapshot=seen(refused_age_s=REFUSED_S / 2))
+    assert (one.level, one.message) == (WARN, "commanded by app; refused: source nav: held up")
+    later = row("commands", snapshot=seen(refused_age_s=REFUSED_S))
+    assert (later.level, later.message) == (OK, "commanded by app")

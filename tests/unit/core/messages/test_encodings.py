@@ -1,0 +1,292 @@
+"""msgpack, JSON and CDR are recognized by name and by first bytes.
+
+Any bad input raises only `DecodeError`.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acsard.core.messages.encodings import (
+    FORMATS,
+    DecodeError,
+    Decoder,
+    Format,
+    detect,
+    encode,
+    encoding_name,
+)
+from acsard.core.messages.schema import Info, RobotState, Time, Twist, Vector3
+from tests.each import each
+
+TWIST = Twist(Vector3(0.5), Vector3(z=0.2))
+AS_CDR = b"\x00\x01\x00\x00" + struct.pack("<6d", 0.5, 0, 0, 0, 0, 0.2)
+AS_JSON = b'{"linear":{"x":0.5,"y":0.0,"z":0.0},"angular":{"x":0.0,"y":0.0,"z":0.2}}'
+
+twists = Decoder(Twist)
+
+
+def refusal(encoding: str, payload: bytes) -> str:
+    with pytest.raises(DecodeError) as caught:
+        twists.decode(encoding, payload)
+    return caught.value.reason
+
+
+def test_an_encoding_names_the_format_the_type_and_its_version() -> None:
+    assert encoding_name("msgpack", "Odometry") == "application/msgpack;acsard.Odometry.v1"
+    assert encoding_name("json", "Odometry") == "application/json;acsard.Odometry.v1"
+    assert encoding_name("cdr", "Odometry") == "application/cdr;acsard.Odometry.v1"
+    assert encoding_name("json") == "application/json"
+    assert encoding_name("cdr") == "application/cdr"
+
+
+def test_json_is_the_maps_of_the_ros_message() -> None:
+    assert encode(TWIST, "json") == AS_JSON
+
+
+def test_msgpack_is_the_same_maps() -> None:
+    assert msgspec.msgpack.decode(encode(TWIST, "msgpack")) == msgspec.json.decode(AS_JSON)
+
+
+def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
+    assert encode(TWIST, "cdr") == AS_CDR
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        {"x": 0.5},
+        [0.5],
+        0.5,
+        None,
+        Info("r7", "1.2.3", 42, "/dev/x", True, 100.0, [], []),
+        RobotState(Time(), "", "", 0, 0, 0, 0, 0, [], "", "", [], "", {}),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
+    with pytest.raises(DecodeError, match=f"{type(value).__name__} is no ROS message") as caught:
+        encode(value, "cdr")
+    assert caught.value.reason == "unknown_format"
+
+
+@pytest.mark.parametrize("cls", [dict, Info, RobotState])
+@pytest.mark.parametrize("encoding", ["", "application/cdr"])
+def test_what_is_no_ros_message_is_not_read_from_cdr_either(
+    cls: type[object], encoding: str
+) -> None:
+    with pytest.raises(DecodeError) as caught:
+        Decoder(cls).decode(encoding, AS_CDR)
+    assert caught.value.reason == "unknown_format"
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("named", [True, False])
+def test_a_message_comes_back_with_and_without_its_encoding(form: Format, named: bool) -> None:
+    encoding = encoding_name(form, "Twist") if named else ""
+    assert twists.decode(encoding, encode(TWIST, form)) == TWIST
+
+
+@pytest.mark.parametrize(
+    ("encoding", "form"),
+    [
+        ("application/json", "json"),
+        ("application/json;acsard.Twist.v1", "json"),
+        ("text/json", "json"),
+        ("application/msgpack", "msgpack"),
+        ("application/msgpack;whatever", "msgpack"),
+        ("application/cdr", "cdr"),
+        ("application/cdr;acsard.Twist.v1", "cdr"),
+        ("application/cdr;whatever", "cdr"),
+    ],
+)
+@pytest.mark.parametrize("payload", [AS_JSON, encode(TWIST, "msgpack"), AS_CDR, b"", b"\xff"])
+def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload: bytes) -> None:
+    assert detect(encoding, payload) == form
+
+
+@each("encoding", ["", "zenoh/bytes", "text/plain", "zenoh/string", "x"])
+@each(
+    ("payload", "form"),
+    [
+        (b"{}", "json"),
+        (b" \t\r\n{", "json"),
+        (b"\x80", "msgpack"),
+        (b"\x82\xa1", "msgpack"),
+        (b"\x8f", "msgpack"),
+        (b"\xde\x00\x10", "msgpack"),
+        (b"\xdf\x00\x00\x00\x10", "msgpack"),
+        (b"\x00\x00", "cdr"),
+        (b"\x00\x01", "cdr"),
+        (b"\x00\x00\x00\x00", "cdr"),
+        (b"\x00\x01\x00\x03", "cdr"),
+        (b"\x00\x01\xff\xff{}", "cdr"),
+    ],
+)
+def test_without_one_the_first_bytes_decide(encoding: str, payload: bytes, form: str) -> None:
+    assert detect(encoding, payload) == form
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"   ", b"[1]", b'"stop"', b"1", b"null", b"\x90", b"\x93\x01", b"\x7f", b"\xa1x",
+     b"\xc0", b"\xdc\x00\x00", b"\xdd", b"\x00", b"\x00\x02\x00\x00",
+     b"\x00\x03\x00\x00", b"\x01\x00\x00\x00", b"\x00\x07\x00\x00", b"\n\x00\x01",
+     b"\xef\xbb\xbf{}"],
+)  # fmt: skip
+def test_what_is_no_json_object_no_msgpack_map_and_no_cdr_is_not_guessed(payload: bytes) -> None:
+    assert refusal("", payload) == "unknown_encoding"
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b'{"linear":{}}', "wrong_shape"),
+        (b'{"angular":{},"linear":{},"x":1}', "wrong_shape"),
+        (b'{"linear":{"X":1},"angular":{}}', "wrong_shape"),
+        (b'{"linear":{"x":"1"},"angular":{}}', "wrong_shape"),
+        (b'{"linear":null,"angular":{}}', "wrong_shape"),
+        (b'{"linear":[0.5,0,0],"angular":{}}', "wrong_shape"),
+        (b'{"linear":{"x":1e999},"angular":{}}', "wrong_shape"),
+        (b'{"linear":{"x":NaN},"angular":{}}', "malformed"),
+        (b'{"linear":{"x":Infinity},"angular":{}}', "malformed"),
+        (b'{"linear":{},"angular":{}', "malformed"),
+        (b'{"linear":{},"angular":{}} x', "malformed"),
+        (b'{"linear":{},"angular":{},"\xff":1}', "malformed"),
+        (b"{", "malformed"),
+    ],
+)
+def test_json_that_is_not_the_message_is_refused_by_reason(payload: bytes, reason: str) -> None:
+    assert refusal("", payload) == reason
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"\x80", "wrong_shape"),
+        (b"\x81\xa6linear\x80", "wrong_shape"),
+        (b"\x82\xa6linear\x80\xa7angular\xc0", "wrong_shape"),
+        (b"\x82\xa6linear\x81\xa1x\xa11\xa7angular\x80", "wrong_shape"),
+        (b"\x82\x01\x80\x02\x80", "wrong_shape"),
+        (b"\x82\xa6linear\x80", "malformed"),
+        (b"\x82\xa6linear\x80\xa7angular\x80\x00", "malformed"),
+        (b"\xdf\xff\xff\xff\xff", "malformed"),
+        (b"\x81\xdb\xff\xff\xff\xff", "malformed"),
+        (b"\x82\xa1\xff\x80\xa7angular\x80", "malformed"),
+        (b"\xc1", "malformed"),
+    ],
+)
+def test_msgpack_that_is_not_the_message_is_refused_by_reason(payload: bytes, reason: str) -> None:
+    assert refusal("application/msgpack", payload) == reason
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"\x00\x01",
+        b"\x00\x01\x00",
+        b"\x00\x01\x00\x00",
+        b"\x00\x02" + AS_CDR[2:],
+        b"\x00\x03" + AS_CDR[2:],
+        AS_CDR[4:],
+        AS_CDR[:-1],
+        AS_CDR[:-8],
+    ],
+)
+def test_cdr_that_is_not_the_message_is_refused_as_malformed(payload: bytes) -> None:
+    assert refusal("application/cdr", payload) == "malformed"
+
+
+@pytest.mark.parametrize("surplus", [1, 3, 4, 7, 100])
+def test_surplus_bytes_after_cdr_are_padding(surplus: int) -> None:
+    assert twists.decode("", AS_CDR + b"\xff" * surplus) == TWIST
+
+
+def test_cdr_in_the_other_byte_order_is_read_too() -> None:
+    swapped = b"\x00\x00\x00\x00" + struct.pack(">6d", 0.5, 0, 0, 0, 0, 0.2)
+    assert twists.decode("", swapped) == TWIST
+    assert twists.decode("application/cdr", swapped) == TWIST
+
+
+def test_a_payload_of_the_other_format_than_it_says_is_refused() -> None:
+    assert refusal("application/cdr", AS_JSON) == "malformed"
+    assert refusal("application/cdr", encode(TWIST, "msgpack")) == "malformed"
+    assert refusal("application/json", AS_CDR) == "malformed"
+    assert refusal("application/msgpack", AS_CDR) in ("malformed", "wrong_shape")
+    assert refusal("application/msgpack", AS_JSON) in ("malformed", "wrong_shape")
+    assert refusal("application/json", encode(TWIST, "msgpack")) == "malformed"
+
+
+@pytest.mark.parametrize("depth", [10, 1000, 100_000])
+@pytest.mark.parametrize(
+    ("start", "nested"),
+    [
+        (b"", b'{"linear":'),
+        (b'{"linear":', b"["),
+        (b'{"x":', b"["),
+        (b"", b'{"x":'),
+        (b"", b"\x81\xa6linear"),
+        (b"\x81\xa6linear", b"\x91"),
+        (b"\x81\xa1x", b"\x91"),
+        (b"\x81", b"\x91"),
+        (b"", b"\x81"),
+    ],
+)
+def test_deep_nesting_is_refused(start: bytes, nested: bytes, depth: int) -> None:
+    assert refusal("", start + nested * depth) in ("wrong_shape", "malformed")
+
+
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_deep_nesting_is_refused_also_where_any_value_is_welcome(form: Format) -> None:
+    anything = Decoder(dict[str, object])
+    deep = b'{"x":' * 50_000 if form == "json" else b"\x81\xa1x" * 50_000
+    with pytest.raises(DecodeError) as caught:
+        anything.decode("", deep)
+    assert caught.value.reason == "malformed"
+
+
+headed = st.builds(
+    bytes.__add__, st.sampled_from([AS_CDR[:4], bytes(4)]), st.binary(min_size=40, max_size=80)
+)
+
+
+@given(
+    st.binary(max_size=80) | headed,
+    st.sampled_from(["", "application/json", "application/msgpack", "application/cdr"]),
+)
+@settings(max_examples=400)
+def test_any_bytes_are_a_message_or_a_decode_error(payload: bytes, encoding: str) -> None:
+    try:
+        got = twists.decode(encoding, payload)
+    except DecodeError:
+        return
+    assert isinstance(got, Twist)
+
+
+axis = st.floats(allow_nan=False, allow_infinity=False)
+vector = st.builds(Vector3, axis, axis, axis)
+
+
+@given(st.builds(Twist, vector, vector), st.sampled_from(FORMATS))
+def test_every_finite_twist_comes_back_bit_for_bit(twist: Twist, form: Format) -> None:
+    assert twists.decode("", encode(twist, form)) == twist
+
+
+@pytest.mark.parametrize(
+    ("payload", "says"),
+    [
+        (b'{"linear": {"x": NaN}}', "line 1, column 18: JSON has no NaN and no infinity"),
+        (b'{\n "linear": {"x": -Infinity}}', "line 2, column 18: JSON has no NaN and no infinity"),
+        (b'{"linear":\n}', "line 2, column 1: invalid character"),
+    ],
+)
+def test_what_is_no_json_is_told_with_its_line_and_column(payload: bytes, says: str) -> None:
+    with pytest.raises(DecodeError) as refused:
+        Decoder(Twist).decode("application/json", payload)
+    assert (refused.value.reason, str(refused.value)) == ("malformed", says)

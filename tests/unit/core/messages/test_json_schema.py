@@ -1,0 +1,230 @@
+"""The JSON Schemas hold in a third-party validator."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import msgspec
+import pytest
+from jsonschema import Draft202012Validator
+from msgspec.structs import replace
+
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config, JointsConfig, McuConfig, OdometryConfig
+from acsard.core.incoming.commands import Arrival, Receiver
+from acsard.core.incoming.imu import ImuTold
+from acsard.core.incoming.queries import interfaces, topic_table
+from acsard.core.link.link_state import TABLE as LINKS
+from acsard.core.messages.encodings import DecodeError, encode
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.report import Report
+from acsard.core.messages.schema import MESSAGES, Info, Message, ServiceReply
+from acsard.core.messages.topics import PUBLISHED, TOPICS
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.modes import Mode
+from acsard.core.values import GyroDoes, Role
+from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
+
+INCOMING = {
+    "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
+    "DoorState"
+}  # fmt: skip
+OUTGOING = set(SCHEMAS) - INCOMING
+
+
+def parts(name: str) -> list[dict[str, Any]]:
+    """Return all objects of a schema that have fields of their own, itself included."""
+    schema = SCHEMAS[name]
+    return [one for one in (schema, *schema["$defs"].values()) if "properties" in one]
+
+
+def refused(name: str, value: object) -> list[str]:
+    """Return the validator's objections to a value."""
+    return [error.message for error in Draft202012Validator(SCHEMAS[name]).iter_errors(value)]
+
+
+def as_json(message: Message) -> Any:
+    return msgspec.json.decode(encode(message, "json"))
+
+
+# the form of the schemas
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_each_is_a_schema_of_the_dialect_it_names_and_has_an_id_of_its_own(name: str) -> None:
+    schema = SCHEMAS[name]
+    assert schema["$schema"] == Draft202012Validator.META_SCHEMA["$id"]
+    assert (schema["$id"], schema["title"]) == (f"urn:acsard:{name}.v1", name)
+    Draft202012Validator.check_schema(schema)
+
+
+@pytest.mark.parametrize("name", sorted(OUTGOING))
+def test_what_goes_out_has_all_its_fields_and_may_get_more(name: str) -> None:
+    assert parts(name)
+    for part in parts(name):
+        assert part["required"] == list(part["properties"])
+        assert "additionalProperties" not in part
+
+
+@pytest.mark.parametrize("name", sorted(INCOMING))
+def test_what_comes_in_may_leave_out_what_has_a_default_and_add_nothing(name: str) -> None:
+    assert parts(name)
+    for part in parts(name):
+        assert part["additionalProperties"] is False
+        missing = set(part["properties"]) - set(part["required"])
+        assert all(field not in part["required"] for field in missing)
+
+
+def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
+    """Types appear by name, with `In` added if the same name is also published."""
+    said = {topic.direction: set[str]() for topic in TOPICS}
+    for topic in TOPICS:
+        said[topic.direction] |= {name for name in topic.type.split(" or ") if name in MESSAGES}
+    out = said["out"] | said["service"] | said["query"] | {"Imu"}  # published by the simulator
+    came = said["in"] | {"SetPose", "Release", "Settings"}
+    assert {name.removesuffix("In") for name in INCOMING} == came
+    assert {name for name in INCOMING if name.endswith("In")} == {f"{n}In" for n in came & out}
+    assert out | {"Config"} == OUTGOING
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "field", "values"),
+    [
+        ("RobotState", "", "mode", {str(mode) for mode in Mode}),
+        ("RobotState", "", "link", {state for state, _ in LINKS} | set(LINKS.values())),
+        ("RobotState", "", "gyro", set(get_args(GyroDoes))),
+        ("DiagnosticArray", "DiagnosticStatus", "level", {0, 1, 2, 3}),
+        ("Interfaces", "HardwareInterface", "kind", {"command", "state"}),
+        ("Interfaces", "HardwareInterface", "unit", {"rad", "rad/s"}),
+        ("Topics", "TopicInfo", "direction", {topic.direction for topic in TOPICS}),
+        ("WhoAmI", "", "role", set(get_args(Role))),
+        ("Config", "LogConfig", "level", {"debug", "info", "warning", "error"}),
+    ],
+)  # fmt: skip
+def test_a_closed_set_is_an_enum(name: str, part: str, field: str, values: set[object]) -> None:
+    schema = SCHEMAS[name]
+    fields = (schema["$defs"][part] if part else schema)["properties"]
+    assert set(fields[field]["enum"]) == values
+
+
+def test_a_pattern_is_one_of_ecmascript() -> None:
+    assert SCHEMAS["Config"]["$defs"]["RobotConfig"]["properties"]["id"]["pattern"].endswith("}$")
+    assert "\\\\Z" not in msgspec.json.encode(SCHEMAS["Config"]).decode()
+
+
+# messages that the daemon publishes
+
+
+@pytest.mark.parametrize("topic", [t for t in PUBLISHED if not t.simulated], ids=lambda t: t.key)
+def test_what_is_published_is_as_its_schema_says_and_nothing_may_be_missing(topic: Any) -> None:
+    report = Report(Config(), START)
+    list(report.due(OUTPUTS, {topic.key}, lambda: SNAPSHOT))
+    message = report.current(topic.key, lambda: SNAPSHOT)
+    assert message is not None
+    value = as_json(message)
+    assert refused(topic.type, value) == []
+    assert refused(topic.type, value | {"later": 1}) == []
+    for field in value:
+        assert refused(topic.type, {key: one for key, one in value.items() if key != field})
+
+
+@pytest.mark.parametrize("mode", [*Mode])
+def test_each_mode_may_be_said_and_no_other(mode: str) -> None:
+    report = Report(Config(), START)
+    list(report.due(replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT))
+    message = report.current("state", lambda: SNAPSHOT)
+    assert message is not None
+    state = as_json(message)
+    assert refused("RobotState", state) == []
+    assert refused("RobotState", state | {"mode": "idle"})
+
+
+def test_answers_are_as_their_schemas_say() -> None:
+    told = {
+        "Interfaces": interfaces(Config(), OUTPUTS),
+        "Topics": topic_table(Config()),
+        "ServiceReply": ServiceReply(True, "stopped"),
+        "Info": Info("acsar", "1", 7, "sim", True, 100.0, ["tcp/127.0.0.1:7448"], []),
+    }
+    assert {name: refused(name, as_json(value)) for name, value in told.items()} == {
+        name: [] for name in told
+    }
+
+
+@pytest.mark.parametrize(
+    "config",
+    [Config(), Config(mcu=McuConfig(port="/dev/ttyACM0"), odometry=OdometryConfig(gyro=True))],
+)
+def test_the_configuration_in_force_is_as_its_schema_says(config: Config) -> None:
+    value = msgspec.json.decode(msgspec.json.encode(effective(config)))
+    assert refused("Config", value) == []
+    assert refused("Config", value | {"mcu": value["mcu"] | {"baud_rate": 300}})
+    assert refused("Config", {key: one for key, one in value.items() if key != "limits"})
+
+
+# messages that the daemon accepts
+
+NAMES = list(JointsConfig().as_tuple())
+ZERO: dict[str, Any] = {"linear": {}, "angular": {}}
+TURN: dict[str, Any] = {"angular_velocity": {"z": 0.5}}
+WHEELS: dict[str, Any] = {"name": NAMES, "velocity": [1.0, 1, 1, 1.0]}
+
+
+def taken(name: str, value: object) -> bool:
+    """Return whether the daemon accepts a value on the key of this type."""
+    key = {"J": "wheel_cmd/app", "T": "cmd/app", "I": "imu"}.get(name[0], "set_pose")
+    payload = msgspec.json.encode(value)
+    if name == "Release":
+        return _decodes(lambda: Receiver.request("clear", 1, "application/json", payload))
+    if key == "set_pose":
+        return _decodes(lambda: Receiver.request("set_pose", 1, "application/json", payload))
+    arrival = Arrival(key, True, payload, "application/json", 1_000_000_000, None, "")
+    if key == "imu":
+        return ImuTold().hear(arrival, {"imu_wrong_shape": 0}, []) is not None
+    receiver = Receiver(JointsConfig(), Kinematics(Config().drive))
+    return _decodes(lambda: receiver.command(arrival))
+
+
+def _decodes(call: Any) -> bool:
+    try:
+        call()
+    except DecodeError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "good"),
+    [
+        ("Twist", ZERO, True),
+        ("Twist", {"linear": {"x": 1, "y": 0.0}, "angular": {"z": -1.5}}, True),
+        ("Twist", {"linear": {"x": 1}}, False),
+        ("Twist", {"linear": {"X": 1}, "angular": {}}, False),
+        ("Twist", {"linear": {"x": "1"}, "angular": {}}, False),
+        ("Twist", ZERO | {"source": "app"}, False),
+        ("TwistStampedIn", {"twist": ZERO}, True),
+        ("TwistStampedIn", {"header": {"stamp": {"sec": 5}}, "twist": ZERO}, True),
+        ("TwistStampedIn", {"header": {}}, False),
+        ("TwistStampedIn", {"header": {"seq": 1}, "twist": ZERO}, False),
+        ("TwistStampedIn", {"header": {"stamp": {"nanosec": 10**9}}, "twist": ZERO}, False),
+        ("JointStateIn", WHEELS, True),
+        ("JointStateIn", WHEELS | {"header": {"frame_id": "base_link"}, "effort": []}, True),
+        ("JointStateIn", {"name": NAMES}, False),
+        ("JointStateIn", WHEELS | {"velocities": []}, False),
+        ("ImuIn", TURN, True),
+        ("ImuIn", TURN | {"angular_velocity_covariance": [0.1] * 9}, True),
+        ("ImuIn", TURN | {"angular_velocity_covariance": [0.1]}, False),
+        ("ImuIn", {"header": {}}, False),
+        ("SetPose", {"x": 1, "y": 2.0, "yaw": 0}, True),
+        ("SetPose", {"x": 1, "y": 2.0}, False),
+        ("SetPose", {"x": 1, "y": 2.0, "yaw": 0, "z": 0}, False),
+        ("Release", {"latch": 5}, True),
+        ("Release", {"latch": None}, True),
+        ("Release", {}, True),
+        ("Release", {"latch": -1}, False),
+        ("Release", {"latch": 2**53}, False),
+        ("Release", {"number": 5}, False),
+    ],
+)  # fmt: skip
+def test_the_schema_takes_what_the_daemon_takes(name: str, value: object, good: bool) -> None:
+    assert (refused(name, value) == [], taken(name, value)) == (good, good)

@@ -1,0 +1,727 @@
+"""Tests of the messages due after a step: their stamps, frames and covariance cells."""
+
+from __future__ import annotations
+
+import math
+import random
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.settings import (
+    BusConfig,
+    Config,
+    DriveConfig,
+    FootprintConfig,
+    LidarConfig,
+    OdometryConfig,
+    RatesConfig,
+    RobotConfig,
+)
+from acsard.core.messages.report import Report, from_rpy, from_yaw
+from acsard.core.messages.schema import (
+    DiagnosticArray,
+    DiagnosticStatus,
+    Events,
+    Figure,
+    Happening,
+    JointState,
+    Message,
+    Odometry,
+    Quaternion,
+    RobotState,
+    SourceState,
+    Spread,
+    TFMessage,
+    Time,
+    TwistStamped,
+    Vector3,
+)
+from acsard.core.messages.topics import PUBLISHED
+from acsard.core.motion.gyro import WORDS
+from acsard.core.motion.told import missed
+from acsard.core.values import (
+    Estimate,
+    Event,
+    GyroDoes,
+    GyroStatus,
+    Instant,
+    Outputs,
+    RoutersStatus,
+    Snapshot,
+    WheelsStatus,
+)
+from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
+
+ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
+"""Keys that a report publishes.
+
+The simulator publishes the true values of a simulated robot itself.
+"""
+FRAMES = OdometryConfig(
+    odom_frame="r7/odom",
+    base_frame="r7/base",
+    pose_covariance_diagonal=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
+    twist_covariance_diagonal=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+)
+CONFIG = Config(robot=RobotConfig("r7"), odometry=FRAMES)
+
+HALF = math.sqrt(0.5)
+
+
+def look() -> Snapshot:
+    return SNAPSHOT
+
+
+def never() -> Snapshot:
+    raise AssertionError("the snapshot is dear and nobody asked for it")
+
+
+def published(outputs: Outputs = OUTPUTS, config: Config = CONFIG) -> dict[str, Any]:
+    """Return all messages due after these outputs if they are the first, by key."""
+    return dict(Report(config, START).due(outputs, ALL, look))
+
+
+def rates(**hz: float) -> Config:
+    return replace(CONFIG, rates=RatesConfig(**hz))
+
+
+def times_of(key: str, config: Config, steps: int = 1000, **changes: Any) -> list[int]:
+    """Return the numbers of the steps at 100 Hz after which `key` was published."""
+    report = Report(config, START)
+    return [
+        step
+        for step in range(steps)
+        for name, _ in report.due(at(later(step / 100), **changes), {key}, look)
+        if name == key
+    ]
+
+
+# stamps and frames
+
+
+def test_all_messages_of_a_sample_carry_the_samples_own_stamp() -> None:
+    found = published()
+    stamp = Time(1_700_000_003, 250_000_001)
+    assert found["odom"].header.stamp == stamp
+    assert found["wheel_states"].header.stamp == stamp
+    assert [t.header.stamp for t in found["tf"].transforms] == [stamp]
+
+
+def test_what_is_decided_now_carries_the_time_of_the_step() -> None:
+    found = published()
+    stamp = Time(1_700_000_003, 254_000_002)
+    assert found["cmd_vel_out"].header.stamp == stamp
+    assert found["state"].stamp == stamp
+    assert found["diagnostics"].header.stamp == stamp
+
+
+def test_the_frames_are_the_configured_ones() -> None:
+    found = published()
+    assert found["odom"].header.frame_id == "r7/odom"
+    assert found["odom"].child_frame_id == "r7/base"
+    (transform,) = found["tf"].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("r7/odom", "r7/base")
+    assert found["cmd_vel_out"].header.frame_id == "r7/base"
+
+
+def test_each_message_is_of_the_type_its_topic_says() -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, set(), never))
+    for topic in PUBLISHED:
+        if topic.key in ALL:
+            assert type(report.current(topic.key, look)).__name__ == topic.type
+
+
+# odometry and transforms
+
+
+def test_odom_has_the_pose_and_the_twist_of_the_sample() -> None:
+    odom: Odometry = published()["odom"]
+    assert odom.pose.pose.position == Vector3(1.5, -2.5, 0.0)
+    assert odom.pose.pose.orientation == from_yaw(0.5)
+    assert odom.twist.twist.linear == Vector3(0.25, 0.0, 0.0)
+    assert odom.twist.twist.angular == Vector3(0.0, 0.0, -0.75)
+
+
+def test_the_pose_covariance_has_each_figure_in_its_cell() -> None:
+    odom: Odometry = published()["odom"]
+    # fmt: off
+    assert odom.pose.covariance == [
+        0.11, 0.12, 0.0, 0.0, 0.0, 0.16,
+        0.12, 0.22, 0.0, 0.0, 0.0, 0.26,
+        0.0,  0.0,  3.0, 0.0, 0.0, 0.0,
+        0.0,  0.0,  0.0, 4.0, 0.0, 0.0,
+        0.0,  0.0,  0.0, 0.0, 5.0, 0.0,
+        0.16, 0.26, 0.0, 0.0, 0.0, 0.66,
+    ]
+    # fmt: on
+
+
+def test_the_twist_covariance_is_the_samples_and_of_other_axes_the_configured() -> None:
+    covariance = published()["odom"].twist.covariance
+    rows = [covariance[6 * i : 6 * i + 6] for i in range(6)]
+    assert [rows[i][i] for i in range(6)] == [0.01, 0.02, 0.3, 0.4, 0.5, 0.06]
+    assert all(rows[i][j] == 0.0 for i in range(6) for j in range(6) if i != j)
+
+
+def test_both_covariances_are_symmetrical() -> None:
+    odom = published()["odom"]
+    for cells in (odom.pose.covariance, odom.twist.covariance):
+        assert len(cells) == 36
+        assert all(cells[6 * i + j] == cells[6 * j + i] for i in range(6) for j in range(6))
+
+
+def test_tf_says_the_same_place_as_odom() -> None:
+    found = published()
+    (transform,) = found["tf"].transforms
+    assert transform.transform.translation == found["odom"].pose.pose.position
+    assert transform.transform.rotation == found["odom"].pose.pose.orientation
+
+
+def test_without_publish_tf_there_is_no_tf_but_odom_goes_on() -> None:
+    config = replace(CONFIG, odometry=replace(FRAMES, publish_tf=False))
+    report = Report(config, START)
+    keys = [key for key, _ in report.due(OUTPUTS, ALL, look)]
+    assert "tf" not in keys
+    assert "odom" in keys
+    assert report.current("tf", never) is None
+
+
+def test_wheel_states_name_each_wheel_with_its_angle_and_speed() -> None:
+    states: JointState = published()["wheel_states"]
+    assert states.name == list(CONFIG.joints.as_tuple())
+    assert states.position == [10.0, 20.0, 30.0, 40.0]
+    assert states.velocity == [1.0, 2.0, 3.0, 4.0]
+    assert states.effort == []
+
+
+def test_cmd_vel_out_is_the_twist_applied_after_the_limits() -> None:
+    out: TwistStamped = published()["cmd_vel_out"]
+    assert (out.twist.linear, out.twist.angular) == (Vector3(x=0.3), Vector3(z=0.9))
+
+
+# quaternions
+
+YAWS = [
+    (0.0, Quaternion(0, 0, 0, 1)),
+    (math.pi / 2, Quaternion(0, 0, HALF, HALF)),
+    (-math.pi / 2, Quaternion(0, 0, -HALF, HALF)),
+    (math.pi, Quaternion(0, 0, 1, 0)),
+    (math.pi / 3, Quaternion(0, 0, 0.5, math.sqrt(0.75))),
+]
+"""Worked by hand: a turn by a about z is sin(a/2) k + cos(a/2)."""
+
+RPYS = [
+    ((0, 0, 0), Quaternion(0, 0, 0, 1)),
+    ((1, 0, 0), Quaternion(HALF, 0, 0, HALF)),
+    ((0, 1, 0), Quaternion(0, HALF, 0, HALF)),
+    ((0, 0, 1), Quaternion(0, 0, HALF, HALF)),
+    ((2, 0, 0), Quaternion(1, 0, 0, 0)),
+    ((1, 1, 0), Quaternion(0.5, 0.5, -0.5, 0.5)),
+    ((1, 0, 1), Quaternion(0.5, 0.5, 0.5, 0.5)),
+    ((0, 1, 1), Quaternion(-0.5, 0.5, 0.5, 0.5)),
+    ((1, 1, 1), Quaternion(0, HALF, 0, HALF)),
+    ((-1, 1, 0), Quaternion(-0.5, 0.5, 0.5, 0.5)),
+]
+"""Quarter turns about x, y, z with their quaternions, worked by hand as qz qy qx.
+
+The rules are i j = k, j k = i, k i = j.
+"""
+
+
+def close(q: Quaternion, r: Quaternion) -> bool:
+    return all(
+        math.isclose(a, b, abs_tol=1e-12)
+        for a, b in zip((q.x, q.y, q.z, q.w), (r.x, r.y, r.z, r.w), strict=True)
+    )
+
+
+@pytest.mark.parametrize(("yaw", "turn"), YAWS)
+def test_a_yaw_is_its_quaternion(yaw: float, turn: Quaternion) -> None:
+    assert close(from_yaw(yaw), turn)
+    assert close(from_rpy(0.0, 0.0, yaw), turn)
+
+
+@pytest.mark.parametrize(("quarters", "turn"), RPYS)
+def test_quarter_turns_about_fixed_axes_are_their_quaternion(
+    quarters: tuple[int, int, int], turn: Quaternion
+) -> None:
+    roll, pitch, yaw = (n * math.pi / 2 for n in quarters)
+    assert close(from_rpy(roll, pitch, yaw), turn)
+
+
+angle = st.floats(-math.pi, math.pi)
+
+
+def rotated(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return q v q*, computed as t = 2 u x v, v' = v + w t + u x t."""
+    (a, b, c), u = v, (q.x, q.y, q.z)
+    t = tuple(
+        2 * component
+        for component in (u[1] * c - u[2] * b, u[2] * a - u[0] * c, u[0] * b - u[1] * a)
+    )
+    return (
+        a + q.w * t[0] + u[1] * t[2] - u[2] * t[1],
+        b + q.w * t[1] + u[2] * t[0] - u[0] * t[2],
+        c + q.w * t[2] + u[0] * t[1] - u[1] * t[0],
+    )
+
+
+@given(angle, angle, angle)
+def test_a_quaternion_turns_a_vector_as_the_three_turns_one_after_the_other(
+    roll: float, pitch: float, yaw: float
+) -> None:
+    x, y, z = 1.0, 2.0, 3.0
+    y, z = y * math.cos(roll) - z * math.sin(roll), y * math.sin(roll) + z * math.cos(roll)
+    x, z = x * math.cos(pitch) + z * math.sin(pitch), z * math.cos(pitch) - x * math.sin(pitch)
+    x, y = x * math.cos(yaw) - y * math.sin(yaw), x * math.sin(yaw) + y * math.cos(yaw)
+    assert rotated(from_rpy(roll, pitch, yaw), (1.0, 2.0, 3.0)) == pytest.approx((x, y, z))
+
+
+# transforms that never change
+
+LIDAR = LidarConfig(
+    lidar_frame="eye",
+    lidar_x_offset=0.1,
+    lidar_y_offset=-0.2,
+    lidar_z_offset=0.3,
+    lidar_roll=0.4,
+    lidar_pitch=0.5,
+    lidar_yaw=0.6,
+)
+FOOTPRINT = FootprintConfig(publish_tf=True, footprint_frame="floor", footprint_z_offset=-0.05)
+
+
+def static(lidar: LidarConfig, footprint: FootprintConfig) -> TFMessage:
+    return Report(replace(CONFIG, lidar=lidar, footprint=footprint), START).tf_static()
+
+
+def test_the_static_transforms_say_where_lidar_and_floor_are_on_the_base() -> None:
+    lidar, floor = static(LIDAR, FOOTPRINT).transforms
+    assert (lidar.header.frame_id, lidar.child_frame_id) == ("r7/base", "eye")
+    assert lidar.transform.translation == Vector3(0.1, -0.2, 0.3)
+    assert lidar.transform.rotation == from_rpy(0.4, 0.5, 0.6)
+    assert (floor.header.frame_id, floor.child_frame_id) == ("r7/base", "floor")
+    assert floor.transform.translation == Vector3(0.0, 0.0, -0.05)
+    assert floor.transform.rotation == Quaternion()
+
+
+def test_the_static_transforms_carry_the_time_of_the_start() -> None:
+    stamps = {t.header.stamp for t in static(LIDAR, FOOTPRINT).transforms}
+    assert stamps == {Time(1_700_000_000, 0)}
+
+
+@pytest.mark.parametrize("lidar", [True, False])
+@pytest.mark.parametrize("footprint", [True, False])
+def test_each_static_transform_has_its_own_switch(lidar: bool, footprint: bool) -> None:
+    message = static(replace(LIDAR, publish_tf=lidar), replace(FOOTPRINT, publish_tf=footprint))
+    names = [transform.child_frame_id for transform in message.transforms]
+    assert names == ["eye"] * lidar + ["floor"] * footprint
+
+
+def test_by_default_only_the_lidar_is_published() -> None:
+    names = [t.child_frame_id for t in Report(Config(), START).tf_static().transforms]
+    assert names == ["lidar_link"]
+
+
+# state and diagnostics
+
+
+def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
+    assert published()["state"] == RobotState(
+        stamp=Time(1_700_000_003, 254_000_002),
+        mode="driving",
+        reason="driving: commanded by app",
+        x=1.6,
+        y=-2.6,
+        yaw=0.6,
+        linear=0.26,
+        angular=-0.76,
+        wheels=[1.1, 2.1, 3.1, 4.1],
+        link="up",
+        source="app",
+        sources=[SourceState("app", 50, 0.01, ""), SourceState("nav", 10, None, "a command")],
+        refused="source nav: held up",
+        counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
+        figures={
+            "period_lateness": Figure(
+                Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0)
+            )
+        },
+    )
+
+
+def values(one: DiagnosticStatus) -> dict[str, str]:
+    return {pair.key: pair.value for pair in one.values}
+
+
+def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, set(), never))
+
+    def seen() -> Snapshot:
+        return replace(SNAPSHOT, encoders=(20, 0, 0, 400))
+
+    state, array = report.current("state", seen), report.current("diagnostics", seen)
+    assert isinstance(state, RobotState)
+    assert isinstance(array, DiagnosticArray)
+    assert state.encoders == [20, 0, 0, 400]
+    (row,) = (one for one in array.status if one.name == "acsard: serial link")
+    shown = {key: value for key, value in values(row).items() if key.startswith("counts")}
+    assert shown == {"counts_front_right": "20", "counts_rear_right": "400"}
+
+
+@pytest.mark.parametrize(
+    ("routers", "level", "message", "shown"),
+    [
+        (RoutersStatus(("a",)), 0, "connected", {"a": "connected"}),
+        (
+            RoutersStatus(("a",), ("b",)),
+            1,
+            "not connected to b",
+            {"a": "connected", "b": "not connected"},
+        ),
+        (
+            RoutersStatus(("a", "b"), peers=("b",)),
+            1,
+            "connected; b is no router: who connects here sees this robot only",
+            {"a": "connected", "b": "a peer, no router"},
+        ),
+    ],
+)
+def test_a_router_that_is_missing_is_a_warning(
+    routers: RoutersStatus, level: int, message: str, shown: dict[str, str]
+) -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, ALL, look))
+    array = report.current("diagnostics", lambda: replace(SNAPSHOT, routers=routers))
+    assert isinstance(array, DiagnosticArray)
+    (row,) = (one for one in array.status if one.name == "acsard: router")
+    assert (row.level, row.message, values(row)) == (level, message, shown)
+
+
+def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
+    assert "acsard: router" not in {one.name for one in published()["diagnostics"].status}
+
+
+# keys without subscribers
+
+
+@pytest.mark.parametrize("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
+def test_only_what_is_wanted_is_published(wanted: set[str]) -> None:
+    found = Report(CONFIG, START).due(OUTPUTS, wanted, look)
+    assert sorted(key for key, _ in found) == sorted(wanted - {"tf_static"})
+
+
+def test_feedback_is_out_before_the_summary_is_built() -> None:
+    due = Report(CONFIG, START).due(OUTPUTS, ALL, never)
+    assert [next(due)[0] for _ in range(3)] == ["odom", "tf", "wheel_states"]
+
+
+def test_nobody_looks_at_the_robot_for_a_summary_that_nobody_wants() -> None:
+    wanted = ALL - {"state", "diagnostics"}
+    assert len(list(Report(CONFIG, START).due(OUTPUTS, wanted, never))) == 5
+
+
+def test_nobody_looks_at_the_robot_for_a_summary_that_is_not_due() -> None:
+    report = Report(CONFIG, START)
+    list(report.due(at(later(0)), ALL, look))
+    assert not list(report.due(at(later(0.01), estimates=()), {"state", "diagnostics"}, never))
+
+
+def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> None:
+    report = Report(CONFIG, START)
+    assert report.current("events", look) is None
+    many = tuple(Event("commander", f"the {n}. takes over", by="app", count=2) for n in range(25))
+    assert not list(report.due(replace(OUTPUTS, events=many, due=False), set(), look))
+    assert not list(report.due(replace(OUTPUTS, events=()), {"events"}, look))
+    quiet = replace(OUTPUTS, now=later(7), due=False, estimates=())
+    ((key, told),) = report.due(quiet, {"events"}, never)
+    assert isinstance(told, Events)
+    assert (key, told.total, len(told.events)) == ("events", 26, 20)
+    assert told.events[0].text == "the 6. takes over"
+    assert told.events[0].count == 2
+    assert told.events[0].stamp == Time.from_ns(OUTPUTS.now.wall_ns)
+    assert told.events[-1] == Happening(told.stamp, "stop", "info", "stopped", "phone", 1)
+    assert told.stamp == Time.from_ns(quiet.now.wall_ns)
+    assert report.current("events", never) == told
+
+
+def test_a_fault_is_not_pushed_out_by_what_goes_on_and_on() -> None:
+    report, fault = Report(CONFIG, START), Event("fault", "a wheel is dead", "error")
+    for second, event in enumerate([fault, *[missed(3)] * 100]):
+        list(report.due(replace(OUTPUTS, events=(event,), now=later(second)), set(), look))
+    told = report.current("events", never)
+    assert isinstance(told, Events)
+    assert [(one.name, one.count) for one in told.events] == [("fault", 1), ("missed_periods", 300)]
+
+
+def test_every_sample_of_a_step_is_published_in_order() -> None:
+    estimates: list[Estimate] = [replace(ESTIMATE, at=Instant(n, n)) for n in (1_000, 2_000, 3_000)]
+    found = Report(CONFIG, START).due(replace(OUTPUTS, estimates=tuple(estimates)), {"odom"}, look)
+    stamps = [m.header.stamp.nanosec for _, m in found if isinstance(m, Odometry)]
+    assert stamps == [1_000, 2_000, 3_000]
+
+
+def test_a_step_without_feedback_publishes_no_odometry() -> None:
+    left = {"cmd_vel_out", "events", "state", "diagnostics"}
+    assert set(published(replace(OUTPUTS, estimates=()))) == left
+
+
+def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
+    assert "cmd_vel_out" not in published(replace(OUTPUTS, due=False))
+
+
+# publishing rates
+
+
+@pytest.mark.parametrize("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
+def test_a_rate_of_zero_is_every_sample(key: str) -> None:
+    assert times_of(key, CONFIG) == list(range(1000))
+
+
+@pytest.mark.parametrize("key", ["odom", "wheel_states", "cmd_vel_out", "state", "diagnostics"])
+@pytest.mark.parametrize("hz", [1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0])
+def test_the_average_rate_is_the_configured_one(key: str, hz: float) -> None:
+    times = times_of(key, rates(**{key: hz}))
+    assert abs(len(times) - hz * 10) <= 1
+
+
+@pytest.mark.parametrize("hz", [10.0, 30.0, 50.0])
+def test_steps_a_little_early_or_late_do_not_change_the_average(hz: float) -> None:
+    report, count = Report(rates(odom=hz), START), 0
+    for step in range(1000):
+        late = (step * 7 % 11 - 5) * 1e-4  # up to half a millisecond early or late
+        count += len(list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)))
+    assert abs(count - hz * 10) <= 1
+
+
+@pytest.mark.parametrize(("hz", "steps"), [(20.0, 5), (25.0, 4), (50.0, 2)])
+def test_steps_a_little_early_or_late_do_not_make_the_gaps_uneven(hz: float, steps: int) -> None:
+    report, found = Report(rates(odom=hz), START), []
+    for step in range(1000):
+        late = (5 - step * 7 % 11) * 1e-5  # the first step is the latest of all
+        if list(report.due(at(later(1.0 + step / 100 + late)), {"odom"}, look)):
+            found.append(step)
+    assert {b - a for a, b in pairwise(found)} == {steps}
+
+
+def test_a_rate_above_that_of_the_samples_is_every_sample() -> None:
+    assert times_of("odom", rates(odom=1000.0)) == list(range(1000))
+
+
+def test_odom_and_tf_go_together_at_a_limited_rate() -> None:
+    report = Report(rates(odom=10.0), START)
+    for step in range(300):
+        keys = [key for key, _ in report.due(at(later(step / 100)), {"odom", "tf"}, look)]
+        assert keys in ([], ["odom", "tf"])
+
+
+def test_state_comes_at_ten_and_diagnostics_at_one_hertz_by_default() -> None:
+    assert abs(len(times_of("state", CONFIG)) - 100) <= 1
+    assert abs(len(times_of("diagnostics", CONFIG)) - 10) <= 1
+
+
+@pytest.mark.parametrize("key", ["state", "diagnostics"])
+def test_a_change_is_published_at_once(key: str) -> None:
+    report = Report(CONFIG, START)
+    list(report.due(at(later(0)), {key}, look))
+    for step in (1, 2, 3):
+        changed = at(later(step / 100), status_changed=True)
+        assert [name for name, _ in report.due(changed, {key}, look)] == [key]
+
+
+def test_after_a_change_the_next_state_comes_a_period_later() -> None:
+    report = Report(CONFIG, START)
+    found = [
+        step
+        for step in range(60)
+        if list(report.due(at(later(step / 100), status_changed=step == 25), {"state"}, look))
+    ]
+    after = [step for step in found if step > 25]
+    assert 25 in found
+    assert 9 <= after[0] - 25 <= 10
+
+
+def test_a_pause_is_not_made_up_for_by_a_burst() -> None:
+    report = Report(CONFIG, START)
+    list(report.due(at(later(0)), {"state"}, look))
+    found = [s for s in range(500, 520) if list(report.due(at(later(s / 100)), {"state"}, look))]
+    assert found[0] == 500
+    assert len(found) <= 3
+
+
+# last values
+
+
+@pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
+def test_there_is_no_present_value_before_the_first_step(key: str) -> None:
+    assert Report(CONFIG, START).current(key, never) is None
+
+
+def test_the_static_transforms_are_there_from_the_start() -> None:
+    report = Report(CONFIG, START)
+    assert report.current("tf_static", never) == report.tf_static()
+
+
+@pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
+def test_the_present_value_is_what_was_or_would_have_been_published(key: str) -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, set(), never))
+    assert report.current(key, look) == published()[key]
+
+
+def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
+    report = Report(CONFIG, START)
+    list(report.due(OUTPUTS, set(), never))
+    report.due(at(later(9), estimates=()), set(), never)
+    odom: Message | None = report.current("odom", look)
+    assert odom == published()["odom"]
+
+
+@pytest.mark.parametrize("key", ["", "alive", "cmd/app", "info", "nonsense"])
+def test_what_is_not_published_has_no_present_value(key: str) -> None:
+    report = Report(CONFIG, START)
+    report.due(OUTPUTS, ALL, look)
+    assert report.current(key, never) is None
+
+
+def test_at_ten_hertz_the_gaps_are_even_too() -> None:
+    report, rnd = Report(Config(), START), random.Random(1)
+    found: list[int] = []
+    for step in range(3000):
+        late = rnd.uniform(0, 1e-4)
+        if list(report.due(at(later(1.0 + step / 100 + late)), {"state"}, look)):
+            found.append(step)
+    assert {b - a for a, b in pairwise(found[2:])} == {10}
+
+
+# the gyro
+
+
+def with_gyro(status: GyroStatus) -> tuple[RobotState, list[DiagnosticStatus]]:
+    report = Report(replace(CONFIG, drive=DriveConfig(wheel_separation_multiplier=1.5)), START)
+    list(report.due(OUTPUTS, set(), never))
+
+    def seen() -> Snapshot:
+        return replace(SNAPSHOT, gyro=status)
+
+    state, array = report.current("state", seen), report.current("diagnostics", seen)
+    assert isinstance(state, RobotState)
+    assert isinstance(array, DiagnosticArray)
+    return state, [one for one in array.status if one.name == "acsard: gyro"]
+
+
+def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
+    state, rows = with_gyro(GyroStatus())
+    assert (state.gyro, rows) == ("off", [])
+
+
+@pytest.mark.parametrize(
+    ("does", "level"),
+    [
+        ("waiting for rest", 0),
+        ("used", 0),
+        ("silent", 1),
+        ("disagrees", 1),
+        ("reversed", 1),
+        ("in degrees", 1),
+        ("dead", 1),
+        ("not believed", 1),
+    ],
+)
+def test_what_the_gyro_does_is_said_and_how_bad_that_is(does: GyroDoes, level: int) -> None:
+    state, (row,) = with_gyro(GyroStatus(does))
+    assert (state.gyro, row.level, row.message) == (does, level, WORDS[does])
+    assert {pair.key for pair in row.values} == {"delay_s"}
+
+
+def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> None:
+    learned = GyroStatus("used", bias=-0.0123, delay=0.02, track=1.2, track_deviation=0.05)
+    state, (row,) = with_gyro(learned)
+    shown = {
+        "delay_s": "0.020",
+        "bias_rad_s": "-0.01230",
+        "wheel_separation_multiplier": "1.500",
+        "learned_multiplier": "1.800",
+        "learned_multiplier_std": "0.090",
+    }
+    assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
+    assert state.track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
+    assert row.message == f"{WORDS['used']}; effective track: {state.track}"
+    state, (row,) = with_gyro(replace(learned, track_use="used"))
+    assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
+    assert state.track == "learned 1.800 ± 0.090 in use, configured 1.500"
+    assert with_gyro(GyroStatus("used"))[0].track == ""
+
+
+# suspect wheels
+
+
+def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
+    doubt = WheelsStatus("rear_left wheel is left out", ("rear_left",), ("right",), (0.01, -0.02))
+    for said, level in ((WheelsStatus(), 0), (doubt, 1)):
+        report, snapshot = Report(CONFIG, START), replace(SNAPSHOT, doubt=said)
+        list(report.due(OUTPUTS, set(), never))
+        seen = partial(replace, snapshot)
+        state, array = report.current("state", seen), report.current("diagnostics", seen)
+        assert isinstance(state, RobotState)
+        assert isinstance(array, DiagnosticArray)
+        (row,) = [one for one in array.status if one.name == "acsard: wheels"]
+        assert (state.doubt, row.level) == (said.text, level)
+        assert row.message == (said.text or "front and rear agree")
+    assert {pair.key: pair.value for pair in row.values} == {
+        "left_out": "rear_left",
+        "slipping": "right",
+        "front_more_left": "0.010",
+        "front_more_right": "-0.020",
+    }
+
+
+# the certificate of the bus
+
+DAY_NS = 86400 * 10**9
+
+
+@pytest.mark.parametrize(
+    ("days", "level", "words"),
+    [
+        (400, 0, "valid for 400 days"),
+        (30, 0, "valid for 30 days"),
+        (29, 1, "valid for 29 days"),
+        (-2, 2, "ended 2 days ago"),
+    ],
+)
+def test_a_certificate_that_ends_is_said_in_time(days: int, level: int, words: str) -> None:
+    config = replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls"))
+    made = Report(config, START, OUTPUTS.now.wall_ns + days * DAY_NS)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    state = made.current("state", lambda: SNAPSHOT)
+    assert isinstance(state, RobotState)
+    assert state.certificate.startswith(words)
+    array = made.current("diagnostics", lambda: SNAPSHOT)
+    assert isinstance(array, DiagnosticArray)
+    (status,) = [one for one in array.status if one.name == "acsard: certificate"]
+    assert (status.level, status.message) == (level, state.certificate)
+
+
+def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
+    made = Report(replace(CONFIG, bus=BusConfig(tls="/etc/acsard/tls")), START)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    state = made.current("state", lambda: SNAPSHOT)
+    assert isinstance(state, RobotState)
+    assert "`acsard doctor`" in state.certificate
+
+
+def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
+    made = Report(CONFIG, START, 0)
+    made.due(OUTPUTS, set(), lambda: SNAPSHOT)
+    state = made.current("state", lambda: SNAPSHOT)
+    assert isinstance(state, RobotState)
+    assert state.certificate == ""

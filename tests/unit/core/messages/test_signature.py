@@ -1,0 +1,90 @@
+"""The sender of a command is read from the project's own attachment, if there is one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.messages.signature import DIGITS, MAX_NAME, Signature, public_name, unpack
+
+WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence": 12}
+
+
+def test_what_is_packed_is_read() -> None:
+    signature = Signature("laptop/12/ab", 5, 1)
+    assert unpack(signature.pack()) == signature
+
+
+@pytest.mark.parametrize("form", [lambda told: json.dumps(told).encode(), msgspec.msgpack.encode])
+@pytest.mark.parametrize("left_out", [(), ("stamp",), ("sequence",), ("stamp", "sequence")])
+def test_a_map_in_json_or_msgpack_is_a_signature_and_only_the_sender_must_be_there(
+    form: object, left_out: tuple[str, ...]
+) -> None:
+    assert callable(form)
+    told = {name: value for name, value in WHOLE.items() if name not in left_out}
+    signature = unpack(form(told))
+    assert signature == Signature("joystick-7", told.get("stamp"), told.get("sequence"))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "attachment",
+    [
+        b"",
+        b"{",
+        b"traceparent=00-1",
+        b"\x81",
+        json.dumps({"stamp": 5}).encode(),
+        json.dumps(WHOLE | {"sender": ""}).encode(),
+        json.dumps(WHOLE | {"sender": "x" * 65}).encode(),
+        json.dumps(WHOLE | {"stamp": -1}).encode(),
+        json.dumps(WHOLE | {"stamp": 1 << 70}).encode(),
+        json.dumps(WHOLE | {"sequence": 1.5}).encode(),
+        msgspec.msgpack.encode([1, 2, 3]),
+    ],
+)
+def test_anything_else_is_somebody_else_s(attachment: bytes) -> None:
+    assert unpack(attachment) is None
+
+
+@given(st.binary(max_size=80))
+def test_no_bytes_raise_anything(attachment: bytes) -> None:
+    unpack(attachment)
+    unpack(b"{" + attachment)
+
+
+@pytest.mark.parametrize(
+    ("sender", "name"),
+    [
+        ("joystick/s3cret", "joystick"),
+        ("laptop/12/s3cret", "laptop/12"),
+        ("mallory (rmw 00)/x", "mallory ?rmw 00?"),
+        ("a\nACSARD_EVENT=stop/x", "a?ACSARD_EVENT?stop"),
+        ("J\u00fcrgen/x", "J\u00fcrgen"),
+        ("x" * 50 + "/s3cret", "x" * MAX_NAME),
+    ],
+)
+def test_a_public_name_is_the_name_before_the_secret_and_a_hash_of_both(
+    sender: str, name: str
+) -> None:
+    digits = hashlib.sha256(sender.encode()).hexdigest()[:16]
+    assert public_name(sender) == f"{name}/{digits}"
+
+
+@pytest.mark.parametrize("sender", ["s3cret", "/s3cret", " /s3cret", "1f2e" * 8])
+def test_a_sender_id_without_a_name_has_a_hash_alone(sender: str) -> None:
+    assert public_name(sender) == hashlib.sha256(sender.encode()).hexdigest()[:16]
+
+
+@given(st.text(min_size=1, max_size=64))
+def test_any_sender_id_has_a_short_printable_public_name_that_is_not_its_own(sender: str) -> None:
+    name = public_name(sender)
+    assert name != sender
+    assert len(name) <= MAX_NAME + 1 + DIGITS
+    assert name.isprintable()
+    assert not set(name) & set('(),="[]\n')
+    assert public_name(name) != name

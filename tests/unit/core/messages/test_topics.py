@@ -1,0 +1,164 @@
+"""The table has every key of the design exactly once, and the form of a full key."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig
+from acsard.core.messages.schema import MESSAGES
+from acsard.core.messages.topics import (
+    PUBLISHED,
+    SERVICES,
+    TOPICS,
+    VERBS,
+    by_key,
+    command_key,
+    full_key,
+    json_key,
+    offered,
+    published,
+    row_of,
+    source_keys,
+)
+
+PROMISED = [
+    ("odom", "out", "Odometry"),
+    ("tf", "out", "TFMessage"),
+    ("tf_static", "out", "TFMessage"),
+    ("wheel_states", "out", "JointState"),
+    ("cmd_vel_out", "out", "TwistStamped"),
+    ("state", "out", "RobotState"),
+    ("diagnostics", "out", "DiagnosticArray"),
+    ("events", "out", "Events"),
+    ("sim/pose", "out", "PoseStamped"),
+    ("json/<key>", "out", "JSON"),
+    ("cmd/<source>", "in", "Twist or TwistStamped"),
+    ("wheel_cmd/<source>", "in", "JointState"),
+    ("cmd/<source>/<certificate>", "in", "Twist or TwistStamped"),
+    ("wheel_cmd/<source>/<certificate>", "in", "JointState"),
+    ("imu", "in", "Imu"),
+    ("stop", "in", "anything"),
+    ("door", "in", "DoorState"),
+    ("srv/stop", "service", "ServiceReply"),
+    ("srv/clear", "service", "ServiceReply"),
+    ("srv/activate", "service", "ServiceReply"),
+    ("srv/deactivate", "service", "ServiceReply"),
+    ("srv/reset_odometry", "service", "ServiceReply"),
+    ("srv/set_pose", "service", "ServiceReply"),
+    ("srv/set", "service", "ServiceReply"),
+    ("info", "query", "Info"),
+    ("config", "query", "Config"),
+    ("interfaces", "query", "Interfaces"),
+    ("topics", "query", "Topics"),
+    ("schema/<Type>", "query", "JSON Schema"),
+    ("whoami/<role>", "query", "WhoAmI"),
+    ("alive", "out", "liveliness token"),
+]
+"""Keys of DESIGN section 3, and the key on which the TLS gateway reports to the daemon."""
+
+
+def test_the_table_is_the_one_of_the_design() -> None:
+    assert sorted((t.key, t.direction, t.type) for t in TOPICS) == sorted(PROMISED)
+
+
+def test_no_key_is_there_twice() -> None:
+    assert len({topic.key for topic in TOPICS}) == len(TOPICS)
+
+
+def test_every_row_says_what_it_is_for() -> None:
+    assert all(topic.note for topic in TOPICS)
+
+
+def test_published_is_every_way_out_but_the_token_and_the_same_in_json() -> None:
+    apart = ("alive", "json/<key>")
+    names = [key for key, direction, _ in PROMISED if direction == "out" and key not in apart]
+    assert [topic.key for topic in PUBLISHED] == names
+    assert all(topic.type in MESSAGES for topic in PUBLISHED)
+
+
+def test_only_the_static_transforms_wait_for_late_joiners() -> None:
+    assert [topic.key for topic in TOPICS if topic.latched] == ["tf_static"]
+
+
+GYRO = OdometryConfig(gyro=True)
+REAL = Config(mcu=McuConfig(port="/dev/ttyACM0"))
+
+
+def test_the_truth_is_offered_where_the_robot_is_simulated_and_nowhere_else() -> None:
+    simulated = {topic.key for topic in offered(Config())}
+    assert simulated - {topic.key for topic in offered(REAL)} == {"sim/pose"}
+
+
+@pytest.mark.parametrize("config", [Config(), REAL, replace(REAL, odometry=GYRO)])
+def test_published_is_what_goes_out_of_what_is_offered(config: Config) -> None:
+    assert published(config) == tuple(row for row in offered(config) if row in PUBLISHED)
+
+
+@pytest.mark.parametrize("config", [Config(), REAL])
+def test_a_gyro_is_listened_to_only_where_it_is_wanted(config: Config) -> None:
+    wanted = {topic.key for topic in offered(replace(config, odometry=GYRO))}
+    assert wanted - {topic.key for topic in offered(config)} == {"imu"}
+
+
+def test_the_simulator_publishes_what_its_gyro_says() -> None:
+    said = {topic.key for topic in published(Config(odometry=GYRO))}
+    assert said - {topic.key for topic in PUBLISHED} == {"imu"}
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_every_service_has_a_row(service: str) -> None:
+    row = by_key(f"srv/{service}")
+    assert row is not None
+    assert row.direction == "service"
+    assert VERBS[row.key] == service
+
+
+def test_a_full_key_has_the_robot_in_it() -> None:
+    assert full_key("r7", "cmd/teleop") == "acsard/r7/cmd/teleop"
+
+
+@pytest.mark.parametrize(
+    ("key", "pattern"),
+    [("cmd/<source>", "cmd/*"), ("wheel_cmd/<source>", "wheel_cmd/*"),
+     ("cmd/<source>/<certificate>", "cmd/*/*"),
+     ("schema/<Type>", "schema/*"), ("json/<key>", "json/**"),
+     ("odom", "odom"), ("srv/stop", "srv/stop")],
+)  # fmt: skip
+def test_a_placeholder_is_a_wildcard_on_the_bus(key: str, pattern: str) -> None:
+    row = by_key(key)
+    assert row is not None
+    assert row.pattern == pattern
+
+
+def test_a_source_commands_by_twist_or_by_wheels() -> None:
+    keys = ["cmd/app", "cmd/nav", "wheel_cmd/app", "wheel_cmd/nav"]
+    assert source_keys(["app", "nav"]) == keys
+    assert source_keys(["app"], "anna") == ["cmd/app/anna", "wheel_cmd/app/anna"]
+    assert [command_key("cmd", "app"), command_key("cmd", "app", "anna")] == [
+        "cmd/app",
+        "cmd/app/anna",
+    ]
+
+
+def test_a_published_key_is_in_the_json_tree_by_its_whole_name() -> None:
+    assert json_key("sim/pose") == "json/sim/pose"
+
+
+def test_a_key_that_is_not_in_the_table_does_not_exist() -> None:
+    assert by_key("odometry") is None
+    assert by_key("cmd/teleop") is None
+
+
+def test_every_key_belongs_to_its_row_and_no_other_key_to_one() -> None:
+    for topic in TOPICS:
+        filled = (
+            topic.key.replace("<source>", "app")
+            .replace("<certificate>", "laptop anna")
+            .replace("<Type>", "Twist")
+            .replace("<role>", "viewer")
+        )
+        assert row_of(filled) is topic
+        assert row_of(topic.key) is topic
+    for key in ("", "cmd", "cmd/", "cmd/app/x/y", "cmd//x", "schema/", "odometry", "srv/ghost"):
+        assert row_of(key) is None

@@ -1,0 +1,578 @@
+"""Tests of the arbiter: priority, timeouts, order of arrival, and waiting sources."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.motion.arbiter import Choice
+from acsard.core.values import REST, Command, SourceStatus, Twist, Wait
+from tests.unit.core.motion.commanders import BACK, GO, HIGH, LEFT, LOW, MS, RIGHT, SLOW, Bench
+
+# one source
+
+
+def test_nobody_drives_when_nobody_commands() -> None:
+    choice = Bench(HIGH, LOW).choice()
+    assert (choice.source, choice.twist, choice.arrived_ns) == ("", None, None)
+    assert choice.wait == Wait("command")
+
+
+def test_without_sources_nobody_drives() -> None:
+    assert Bench().driver() == ""
+
+
+def test_a_command_is_followed_and_the_choice_names_its_source() -> None:
+    bench = Bench(HIGH)
+    assert bench.send(HIGH) == ""
+    assert bench.choice() == Choice("high", GO, Wait("nothing"), bench.now_ns)
+
+
+def test_the_newest_command_counts() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH, GO)
+    bench.send(HIGH, BACK)
+    assert bench.choice().twist == BACK
+
+
+def test_a_zero_is_a_command_too() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH, REST)
+    assert bench.choice().twist == REST
+    assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("source", [HIGH, SLOW, Source("quick", 1, timeout=0.02)])
+def test_a_command_counts_until_the_timeout_of_its_source(source: Source) -> None:
+    bench = Bench(source)
+    bench.send(source)
+    bench.wait(source.timeout * 1000)
+    assert bench.driver() == source.name
+    bench.wait(0.000001)
+    assert bench.driver() == ""
+
+
+def test_each_command_begins_the_timeout_again() -> None:
+    bench = Bench(HIGH)
+    for _ in range(10):
+        bench.send(HIGH)
+        assert bench.wait(240).driver() == "high"
+
+
+# refusals
+
+
+@pytest.mark.parametrize(
+    "twist",
+    [
+        Twist(math.nan, 0.0),
+        Twist(0.0, math.nan),
+        Twist(math.inf, 0.0),
+        Twist(0.0, -math.inf),
+    ],
+)
+def test_what_is_not_finite_is_refused(twist: Twist) -> None:
+    bench = Bench(HIGH)
+    assert bench.send(HIGH, twist) == "not_finite"
+    assert bench.driver() == ""
+
+
+def test_an_unknown_source_is_refused_and_never_listed() -> None:
+    bench = Bench(HIGH)
+    assert bench.send("stranger") == "unknown_source"
+    assert bench.driver() == ""
+    assert [s.name for s in bench.arbiter.sources(bench.now_ns)] == ["high"]
+
+
+def test_a_stale_command_adds_no_sender_to_its_source() -> None:
+    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "clock", "a")
+    assert bench.stamped(LOW, 5000.0, "clock", sender="a") == "stale"
+    assert bench.status(LOW).waits_for == Wait("command")
+
+
+def test_a_huge_command_is_accepted_for_the_limits_to_clamp() -> None:
+    bench = Bench(HIGH)
+    assert bench.send(HIGH, Twist(1e308, -1e308)) == ""
+
+
+def test_a_refused_command_refreshes_no_timeout() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(200)
+    assert bench.send(HIGH, Twist(math.nan, 0.0)) == "not_finite"
+    assert bench.wait(60).driver() == ""
+
+
+def test_a_refused_command_changes_no_twist() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.send(HIGH, Twist(math.nan, 0.0))
+    assert bench.choice().twist == GO
+
+
+# several sources
+
+
+def test_the_higher_priority_drives_whatever_the_order_of_arrival() -> None:
+    for first, second in ((HIGH, LOW), (LOW, HIGH)):
+        bench = Bench(LOW, HIGH)
+        bench.send(first)
+        bench.send(second)
+        assert bench.driver() == "high"
+
+
+def test_the_higher_priority_takes_over_at_once() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(LOW)
+    assert bench.driver() == "low"
+    bench.send(HIGH, BACK)
+    assert bench.choice().twist == BACK
+
+
+def test_when_the_higher_priority_falls_silent_the_lower_takes_over_with_its_own_command() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(HIGH, GO)
+    bench.wait(200).send(LOW, BACK)
+    assert bench.driver() == "high"
+    assert bench.wait(51).choice().twist == BACK
+
+
+def test_when_the_higher_priority_falls_silent_an_old_lower_command_stays_dead() -> None:
+    bench = Bench(SLOW, LOW)
+    bench.send(SLOW)
+    bench.send(LOW)
+    bench.wait(1000)
+    assert bench.driver() == "slow"
+    assert bench.wait(1).driver() == ""
+
+
+def test_the_order_of_configuration_does_not_matter() -> None:
+    for sources in ((HIGH, LEFT, LOW), (LOW, LEFT, HIGH), (LEFT, HIGH, LOW)):
+        bench = Bench(*sources)
+        for source in sources:
+            bench.send(source)
+        assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
+def test_among_equals_the_first_to_come_keeps_the_robot(sources: tuple[Source, ...]) -> None:
+    bench = Bench(*sources)
+    for _ in range(50):
+        bench.send(LEFT)
+        assert bench.driver() == "left"
+        bench.wait(20).send(RIGHT)
+        assert bench.driver() == "left"
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
+def test_among_equals_the_second_takes_over_when_the_first_is_silent_and_keeps_it(
+    sources: tuple[Source, ...],
+) -> None:
+    bench = Bench(*sources)
+    bench.send(LEFT)
+    assert bench.driver() == "left"
+    bench.wait(200).send(RIGHT)
+    assert bench.wait(51).driver() == "right"
+    bench.send(LEFT)
+    assert bench.driver() == "right"
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT, HIGH), (RIGHT, LEFT, HIGH)])
+def test_among_equals_the_first_to_come_has_the_robot_back_after_a_higher_one(
+    sources: tuple[Source, ...],
+) -> None:
+    bench = Bench(*sources)
+    bench.send(RIGHT)
+    assert bench.driver() == "right"
+    bench.wait(10).send(LEFT)
+    bench.send(RIGHT)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+    for _ in range(3):
+        bench.wait(100).send(LEFT)
+        bench.send(RIGHT)
+    assert bench.driver() == "right"
+
+
+def test_among_equals_the_first_to_come_is_the_first_to_arrive() -> None:
+    bench = Bench(LEFT, RIGHT)
+    bench.send(RIGHT)
+    bench.wait(1).send(LEFT)
+    assert bench.driver() == "right"
+
+
+def test_a_lower_priority_never_keeps_the_robot_from_a_higher() -> None:
+    bench = Bench(LEFT, HIGH, RIGHT)
+    bench.send(LEFT)
+    assert bench.driver() == "left"
+    bench.send(RIGHT)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+
+
+# the senders of one source
+
+
+def test_the_zero_of_one_sender_arms_no_other_of_its_source() -> None:
+    bench = Bench(HIGH, armed=False)
+    for step in range(40):
+        bench.send(HIGH, GO, "a")
+        if step == 10:
+            bench.send(HIGH, REST, "b")
+        assert bench.choice().twist in (None, REST)
+        bench.wait(50)
+
+
+def test_the_sender_that_was_neutral_drives_while_another_of_its_source_was_not() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, GO, "a")
+    assert bench.driver() == ""
+    bench.wait(50).send(HIGH, REST, "b")
+    for _ in range(10):
+        bench.wait(50).send(HIGH, GO, "a")
+        bench.send(HIGH, BACK, "b")
+        assert bench.choice().twist == BACK
+
+
+def test_of_two_senders_of_a_source_the_first_is_followed_alone_and_the_other_is_told() -> None:
+    bench = Bench(HIGH, armed=False)
+    for sender in ("a", "b"):
+        bench.send(HIGH, REST, sender)
+        bench.wait(20)
+    for _ in range(50):
+        bench.send(HIGH, GO, "a")
+        assert bench.choice().twist == GO
+        bench.wait(20).send(HIGH, BACK, "b")
+        assert bench.choice().twist == GO
+        assert bench.status(HIGH).waits_for == Wait("senders", senders=1)
+        bench.wait(20)
+
+
+def test_the_second_sender_of_a_source_has_it_once_the_first_is_silent_and_keeps_it() -> None:
+    bench = Bench(HIGH, armed=False)
+    for sender in ("a", "b"):
+        bench.send(HIGH, REST, sender)
+        bench.wait(20)
+    bench.send(HIGH, GO, "a")
+    bench.wait(200).send(HIGH, BACK, "b")
+    assert bench.wait(50).choice().twist == GO
+    assert bench.wait(1).choice().twist == BACK
+    assert bench.status(HIGH).waits_for == Wait("nothing")
+    bench.send(HIGH, GO, "a")
+    assert bench.choice().twist == BACK
+
+
+def test_a_zero_of_the_second_sender_brakes_nobody_who_came_first() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "a")
+    bench.wait(20).send(HIGH, GO, "a")
+    bench.wait(20).send(HIGH, REST, "b")
+    assert bench.choice().twist == GO
+
+
+def test_a_sender_that_was_never_neutral_holds_its_source_s_place_with_zero() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST)
+    bench.send(LOW)
+    bench.send(HIGH, GO, "a")
+    choice = bench.choice()
+    assert (choice.source, choice.twist) == ("high", None)
+    assert bench.status(HIGH).waits_for == Wait("neutral", "high", 1.0)
+
+
+@pytest.mark.parametrize("sources", [(LEFT, RIGHT), (RIGHT, LEFT)])
+def test_among_equal_sources_the_sender_who_came_first_counts(sources: tuple[Source, ...]) -> None:
+    bench = Bench(*sources)
+    bench.send(RIGHT, REST, "r")
+    bench.wait(10).send(LEFT, REST, "l")
+    bench.send(RIGHT, GO, "r")
+    bench.send(LEFT, BACK, "l")
+    assert bench.choice().twist == GO
+
+
+def test_each_sender_must_be_neutral_again_once_that_is_required() -> None:
+    bench = Bench(HIGH, armed=False)
+    for sender in ("a", "b"):
+        bench.send(HIGH, REST, sender)
+    bench.arbiter.require_neutral(bench.now_ns)
+    for sender in ("a", "b"):
+        bench.wait(50).send(HIGH, GO, sender)
+        assert bench.driver() == ""
+
+
+@pytest.mark.parametrize("before", [REST, GO])
+def test_what_arrived_before_neutral_was_asked_for_makes_no_sender_neutral_nor_heard(
+    before: Twist,
+) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.arbiter.require_neutral(bench.now_ns + 100 * MS)
+    bench.send(HIGH, before, "a")
+    bench.wait(300).send(HIGH, GO, "a")
+    assert bench.driver() == ""
+
+
+def test_without_neutral_first_the_first_sender_to_come_is_followed() -> None:
+    bench = Bench(HIGH, neutral_first=False, armed=False)
+    bench.send(HIGH, GO, "a")
+    bench.wait(20).send(HIGH, BACK, "b")
+    assert bench.choice().twist == GO
+
+
+def test_a_source_s_age_is_that_of_the_last_command_of_any_sender() -> None:
+    bench = Bench(HIGH, armed=False)
+    for sender in ("a", "b", "a", "b"):
+        bench.wait(50).send(HIGH, REST, sender)
+    assert bench.wait(20).status(HIGH).age_s == 0.02
+    bench.send(HIGH, REST, "a")
+    assert bench.wait(10).status(HIGH).age_s == 0.01
+
+
+# how many senders are remembered
+
+
+def armed_in_turn(bench: Bench, senders: list[str]) -> None:
+    for sender in senders:
+        bench.wait(10).send(HIGH, REST, sender)
+
+
+def drives(bench: Bench, sender: str) -> bool:
+    """Send as this sender while all others are silent, and return whether it drives.
+
+    The sender is silent again afterwards.
+    """
+    bench.wait(300).send(HIGH, GO, sender)
+    allowed = bench.driver() == "high"
+    bench.wait(300)
+    return allowed
+
+
+def test_sixteen_senders_of_a_source_may_drive_in_turn() -> None:
+    bench = Bench(HIGH, armed=False)
+    senders = [f"sender {number}" for number in range(16)]
+    armed_in_turn(bench, senders)
+    assert all(drives(bench, sender) for sender in senders)
+
+
+def test_a_seventeenth_sender_takes_the_place_of_the_one_silent_for_longest() -> None:
+    bench = Bench(HIGH, armed=False)
+    senders = [f"sender {number}" for number in range(16)]
+    armed_in_turn(bench, senders)
+    # now the first sender is the one noticed longest ago
+    bench.wait(300).send(HIGH, GO, senders[0])
+    assert bench.wait(300).send(HIGH, REST, "one more") == ""
+    # That sender is checked last, because a forgotten sender takes a place again when it returns.
+    asked = ("one more", senders[0], senders[2], senders[1])
+    assert [drives(bench, sender) for sender in asked] == [True, True, True, False]
+
+
+def test_sixteen_live_senders_let_in_no_other_and_keep_the_one_that_came_first() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "holder")
+    bench.wait(20).send(HIGH, GO, "holder")
+    answers = [bench.wait(1).send(HIGH, REST, f"stranger {number}") for number in range(16)]
+    assert answers == [""] * 15 + ["crowded"]
+    assert bench.choice().twist == GO
+    assert bench.wait(14).send(HIGH, GO, "holder") == ""
+    assert bench.choice().twist == GO
+
+
+def test_a_refused_sample_of_a_new_sender_makes_nobody_forgotten() -> None:
+    bench = Bench(HIGH, armed=False)
+    senders = [f"sender {number}" for number in range(16)]
+    armed_in_turn(bench, senders)
+    bench.wait(300)
+    assert bench.send(HIGH, Twist(math.nan, 0.0), "one more") == "not_finite"
+    assert all(drives(bench, sender) for sender in senders)
+
+
+def test_of_more_than_sixteen_senders_those_that_may_not_drive_are_forgotten_first() -> None:
+    bench = Bench(HIGH, armed=False)
+    senders = [f"sender {number}" for number in range(15)]
+    armed_in_turn(bench, senders)
+    for number in range(100):
+        bench.wait(1).send(HIGH, BACK, f"stranger {number}")
+    assert all(drives(bench, sender) for sender in senders)
+
+
+def test_a_crowd_that_sends_zeros_takes_the_robot_from_nobody_who_is_heard_as_often() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "a")
+    for number in range(200):
+        if number % 8 == 0:
+            bench.send(HIGH, GO, "a")
+        bench.wait(1).send(HIGH, REST, f"stranger {number}")
+        assert bench.choice().twist == GO
+    assert bench.status(HIGH).waits_for == Wait("senders", senders=15)
+
+
+def test_a_crowd_that_sends_what_cannot_be_read_makes_nobody_forgotten() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, REST, "a")
+    for number in range(100):
+        bench.wait(1).unreadable(HIGH, f"stranger {number}")
+    bench.wait(951).send(HIGH, GO, "a")
+    assert bench.driver() == "high"
+
+
+def test_the_crowd_of_one_source_is_none_of_another() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST, "a")
+    for number in range(100):
+        bench.send(HIGH, REST, f"stranger {number}")
+    bench.wait(300).send(LOW, GO, "a")
+    assert bench.driver() == "low"
+
+
+# commands that last but do not move the robot
+
+
+def held(bench: Bench, source: Source, seconds: float, twist: Twist = REST) -> Wait:
+    """Send this twist ten times a second for this time and return the reported wait."""
+    for _ in range(round(10 * seconds)):
+        bench.wait(100).send(source, twist)
+    return bench.choice().wait
+
+
+def test_zeros_alone_hold_the_robot_and_that_is_said_after_a_while() -> None:
+    bench = Bench(HIGH)
+    assert held(bench, HIGH, 3.0) == Wait("nothing")
+    assert held(bench, HIGH, 0.2) == Wait("zeros", "high", lasts=3.0)
+    assert bench.choice().twist == REST
+    assert held(bench, HIGH, 60.0) == Wait("zeros", "high", lasts=60.0)
+    assert bench.status(HIGH).waits_for == Wait("nothing")
+
+
+def test_a_speed_among_the_zeros_or_silence_begins_anew() -> None:
+    bench = Bench(HIGH)
+    held(bench, HIGH, 5.0)
+    bench.wait(100).send(HIGH, GO)
+    assert bench.choice().wait == Wait("nothing")
+    assert held(bench, HIGH, 2.9) == Wait("nothing")
+    bench.wait(300)
+    assert held(bench, HIGH, 2.9) == Wait("nothing")
+    assert held(bench, HIGH, 0.3).what == "zeros"
+
+
+def test_wheels_that_cancel_out_are_no_zeros() -> None:
+    bench = Bench(HIGH)
+    for _ in range(40):
+        command = Command("high", REST, bench.wait(100).now_ns, cancelled=True)
+        assert bench.arbiter.accept(command) == ""
+    assert bench.choice().wait == Wait("nothing")
+
+
+def test_zeros_keep_a_lower_source_waiting_for_ever_and_say_whom() -> None:
+    bench = Bench(HIGH, LOW)
+    for _ in range(100):
+        bench.wait(100).send(HIGH, REST)
+        bench.send(LOW, GO)
+    assert bench.driver() == "high"
+    assert bench.choice().wait == Wait("zeros", "high", lasts=3.0, kept="low")
+
+
+def test_zeros_keep_another_sender_of_the_same_source_waiting_and_say_so() -> None:
+    bench = Bench(HIGH)
+    for _ in range(50):
+        bench.wait(100).send(HIGH, REST, "a")
+        bench.send(HIGH, GO, "b")
+    assert bench.choice().wait.kept == "another sender of high"
+
+
+def test_who_must_be_neutral_and_sends_on_is_told_that_it_lasts() -> None:
+    bench = Bench(HIGH, armed=False)
+    assert held(bench, HIGH, 3.0, GO) == Wait("neutral", "high", 1.0)
+    assert held(bench, HIGH, 0.2, GO) == Wait("neutral", "high", 1.0, lasts=3.0)
+
+
+# the published state
+
+
+def test_the_sources_are_listed_by_priority() -> None:
+    statuses = Bench(LOW, HIGH, LEFT).arbiter.sources(0)
+    assert [(s.name, s.priority) for s in statuses] == [("high", 100), ("left", 50), ("low", 10)]
+
+
+def test_a_source_that_was_never_heard_has_no_age_and_waits_for_a_command() -> None:
+    bench = Bench(HIGH, armed=False)
+    assert bench.status(HIGH) == SourceStatus("high", 100, None, Wait("command"))
+
+
+def test_the_age_is_that_of_the_last_accepted_command() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(100).send(HIGH, Twist(math.nan, 0.0))
+    assert bench.status(HIGH).age_s == 0.1
+
+
+def test_a_command_that_arrived_just_now_or_while_the_step_ran_has_no_age() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    assert bench.status(HIGH).age_s == 0.0
+    assert bench.wait(-1).status(HIGH).age_s == 0.0
+
+
+def test_the_source_that_drives_waits_for_nothing() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+    assert bench.status(HIGH).waits_for == Wait("nothing")
+
+
+def test_a_source_that_may_drive_waits_for_nothing_before_anyone_was_chosen() -> None:
+    bench = Bench(HIGH)
+    bench.arbiter.require_neutral()
+    bench.send(HIGH, REST)
+    assert bench.status(HIGH).waits_for == Wait("nothing")
+
+
+def test_a_silent_source_waits_for_a_command() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(251).choice()
+    assert bench.status(HIGH).waits_for == Wait("command")
+
+
+def test_a_source_that_was_not_neutral_says_how_to_become_so() -> None:
+    bench = Bench(SLOW, armed=False)
+    bench.send(SLOW)
+    bench.choice()
+    assert bench.status(SLOW).waits_for == Wait("neutral", "slow", 1.0)
+
+
+def test_a_lower_source_is_told_who_is_above_it() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(HIGH)
+    bench.send(LOW)
+    bench.choice()
+    assert bench.status(LOW).waits_for == Wait("higher", "high")
+
+
+def test_an_equal_source_is_told_who_came_first() -> None:
+    bench = Bench(LEFT, RIGHT)
+    bench.send(RIGHT)
+    bench.choice()
+    bench.wait(10).send(LEFT)
+    bench.choice()
+    assert bench.status(LEFT).waits_for == Wait("equal", "right")
+
+
+# settings that change
+
+
+def test_a_new_timeout_applies_to_a_sender_that_drives() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(300)
+    assert bench.driver() == ""
+    bench.arbiter.use(CommandsConfig(True, 1.0, (Source("high", 100, timeout=0.5),)))
+    assert bench.driver() == "high"
+
+
+def test_clocks_that_were_set_are_counted_by_how_much_later_they_were_believed() -> None:
+    bench = Bench(HIGH, armed=False).known(HIGH)
+    assert bench.arbiter.forgiven_ns == 0
+    for number in range(60):
+        bench.wait(50).stamped(HIGH, min(10.0 * number, 300.0), twist=REST)
+    assert bench.arbiter.forgiven_ns == pytest.approx(300 * MS, rel=0.1)

@@ -1,0 +1,411 @@
+"""The limits of `Freshness`, to the nanosecond: what it accepts at a limit, and refuses beyond it.
+
+A sender sends at 20 Hz unless a test says something else, and its source has a timeout of 250 ms.
+"""
+
+from __future__ import annotations
+
+from itertools import count
+
+import pytest
+
+from acsard.core.motion.freshness import Freshness, Verdict
+from acsard.core.values import NS_PER_S, Command
+from tests.unit.core.motion.commanders import GO, MS
+
+PERIOD = 50 * MS
+TIMEOUT = 250 * MS
+DRIFT = 10_000
+"""The drift that is allowed for in one period, ns."""
+
+Step = tuple[int, int]
+"""The time since the command before, and the delay, ns."""
+
+
+class Sender:
+    """A sender at a `Freshness` of its own. Times are in ns, and its delay is 0 at first."""
+
+    def __init__(self, known: bool = True, steady: bool = False) -> None:
+        self.freshness, self.steady = Freshness(), steady
+        self.at_ns = NS_PER_S
+        if known:
+            assert self.steadily(0, 20)[-1] == "fresh"
+
+    def sends(self, after: int, delay: int, number: int | None = None, clock: str = "a") -> Verdict:
+        self.at_ns += after
+        stamp_ns = self.at_ns - delay
+        command = Command(
+            "high", GO, self.at_ns, stamp_ns, clock, sequence=number, steady=self.steady
+        )
+        return self.freshness.judge(command, TIMEOUT)
+
+    def each(self, steps: list[Step]) -> list[Verdict]:
+        return [self.sends(*step) for step in steps]
+
+    def steadily(self, delay: int, times: int) -> list[Verdict]:
+        return [self.sends(PERIOD, delay) for _ in range(times)]
+
+
+# a known clock
+
+
+@pytest.mark.parametrize("steady", [True, False])
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "fresh"), (1, "stale")])
+def test_a_command_may_be_late_by_the_timeout_and_the_drift(
+    steady: bool, beyond: int, verdict: Verdict
+) -> None:
+    assert Sender(steady=steady).sends(6 * PERIOD, TIMEOUT + 6 * DRIFT + beyond) == verdict
+
+
+FALL = (PERIOD, DRIFT - 50 * MS)
+"""A command that is 50 ms earlier than the minimum."""
+
+
+@pytest.mark.parametrize(
+    ("steps", "verdict"),
+    [
+        ([FALL], "fresh"),
+        ([(PERIOD, FALL[1] - 1)], "stale"),
+        ([FALL, (0, FALL[1])], "fresh"),
+        ([FALL, (0, FALL[1] - 1)], "stale"),
+        ([FALL, (0, FALL[1] + 1), (0, FALL[1] - 1)], "stale"),
+        ([FALL, (100 * MS, FALL[1] + 2 * DRIFT - 10 * MS)], "fresh"),
+        ([FALL, (100 * MS, FALL[1] + 2 * DRIFT - 10 * MS - 1)], "stale"),
+        ([FALL, (10 * MS, FALL[1] - 2 * MS)], "stale"),
+    ],
+)
+def test_delays_may_fall_by_50_ms_of_which_a_tenth_of_the_time_is_forgotten(
+    steps: list[Step], verdict: Verdict
+) -> None:
+    assert Sender().each(steps)[-1] == verdict
+
+
+def test_a_steady_clock_that_came_early_counts_no_more_before_it_has_proved_itself() -> None:
+    assert Sender(steady=True).each([(PERIOD, -200 * MS), (PERIOD, -40 * MS)]) == [
+        "first",
+        "unproven",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("after", "delay", "verdict"),
+    [
+        (250 * NS_PER_S, 0, "fresh"),
+        (250 * NS_PER_S + 1, 0, "first"),
+        (250 * NS_PER_S, -1, "stale"),
+        (251 * NS_PER_S, NS_PER_S, "stale"),
+        (251 * NS_PER_S, NS_PER_S - 1, "first"),
+    ],
+)
+def test_a_clock_is_new_after_250_s_by_both_clocks(
+    after: int, delay: int, verdict: Verdict
+) -> None:
+    assert Sender().sends(after, delay) == verdict
+
+
+def test_a_number_that_comes_twice_with_its_stamp_is_stale_even_if_it_is_0() -> None:
+    sender = Sender()
+    assert sender.sends(PERIOD, 0, 0) == "fresh"
+    assert sender.sends(10 * MS, 10 * MS, 0) == "stale"
+
+
+# a proof
+
+
+@pytest.mark.parametrize(
+    ("delay", "verdict"),
+    [
+        (-50 * MS, "unproven"),
+        (-50 * MS - 1, "first"),
+        (1000 * MS, "unproven"),
+        (1000 * MS + 1, "first"),
+    ],
+)
+def test_a_proof_begins_again_if_the_delay_jumps(delay: int, verdict: Verdict) -> None:
+    sender = Sender(known=False)
+    assert sender.sends(0, 0) == "first"
+    assert sender.sends(PERIOD, delay) == verdict
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "unproven"), (1, "first")])
+def test_a_proof_begins_again_after_a_silence_of_over_2_s(beyond: int, verdict: Verdict) -> None:
+    sender = Sender(known=False)
+    assert sender.sends(0, 0) == "first"
+    assert sender.sends(2 * NS_PER_S + beyond, 0) == verdict
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
+def test_the_proof_of_a_clock_that_was_set_begins_again_after_a_silence_of_over_2_s(
+    beyond: int, verdict: Verdict
+) -> None:
+    late = 600 * MS
+    steps = [(NS_PER_S, late), (2 * NS_PER_S + beyond, late), (750 * MS, late)]
+    assert Sender().each(steps) == ["stale", "stale", verdict]
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "fresh"), (1, "unproven")])
+def test_the_two_halves_of_a_proof_may_differ_by_half_a_percent_of_its_time(
+    beyond: int, verdict: Verdict
+) -> None:
+    half = 125 * MS
+    for delay in (half // 100 + beyond, -half // 100 - beyond):
+        assert Sender(known=False).each([(0, 0), (half, delay), (half, delay)])[-1] == verdict
+
+
+@pytest.mark.parametrize(
+    "afters",
+    [
+        (0, 1900 * MS, 50 * MS, 50 * MS, 50 * MS),
+        (0, 250 * MS, 50 * MS, 50 * MS, 25 * MS),
+    ],
+)
+def test_a_half_of_a_proof_that_follows_a_silence_lasts_as_long_as_any(
+    afters: tuple[int, ...],
+) -> None:
+    verdicts = Sender(known=False).each([(after, 0) for after in afters])
+    assert verdicts == ["first", "unproven", "unproven", "unproven", "fresh"]
+
+
+EIGHT: dict[str, tuple[list[float], bool]] = {
+    "they differ by 50 ms and go up and down": ([0, 60, 50, 70, 0, 60, 50, 70], True),
+    "they differ by more than 50 ms": ([30, 0, 60, 50 + 1e-6, 30, 0, 60, 50 + 1e-6], False),
+    "they rise by half a percent of the time": ([0, 9, 2, 9, 4, 9, 5, 9], True),
+    "they rise by more": ([0, 9, 2, 9, 4, 9, 5 + 1e-6, 9], False),
+    "they fall by half a percent of the time": ([5, 9, 4, 9, 2, 9, 0, 9], True),
+    "they fall by more": ([5 + 1e-6, 9, 4, 9, 2, 9, 0, 9], False),
+}
+
+
+@pytest.mark.parametrize("case", EIGHT)
+def test_a_proof_through_jitter_compares_the_minima_of_four_pairs_of_halves(case: str) -> None:
+    delays, proved = EIGHT[case]
+    half = 125 * MS
+    steps = [(half, round(delay * MS)) for delay in [*delays, delays[-1]]]
+    verdicts = Sender(known=False).each(steps)
+    assert verdicts == ["first", *["unproven"] * 7, "fresh" if proved else "unproven"]
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "fresh"), (1, "unproven")])
+def test_a_command_that_ends_a_proof_counts_only_if_it_is_not_late_itself(
+    beyond: int, verdict: Verdict
+) -> None:
+    half = 125 * MS
+    steps = [(0, 0), (half, 0), (half, TIMEOUT + beyond)]
+    assert Sender(known=False).each(steps)[-1] == verdict
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
+def test_a_late_command_at_the_end_of_a_proof_delays_that_by_a_half(
+    beyond: int, verdict: Verdict
+) -> None:
+    """An earlier version looked again 4.5 s later."""
+    sender, late = Sender(), 600 * MS
+    assert sender.sends(NS_PER_S, late) == "stale"
+    assert set(sender.steadily(late, 29)) == {"stale"}
+    assert sender.sends(PERIOD, late + TIMEOUT + beyond) == verdict
+    if beyond:
+        assert sender.steadily(late, 15) == [*["stale"] * 14, "set"]
+
+
+def test_a_clock_that_was_prompt_meanwhile_proves_a_new_delay_from_the_start() -> None:
+    sender, late = Sender(), 600 * MS
+    for _ in range(3):
+        assert set(sender.steadily(late, 29)) == {"stale"}
+        assert sender.sends(PERIOD, 0) == "fresh"
+
+
+# a clock that creeps or jumps
+
+
+@pytest.mark.parametrize(("beyond", "commands"), [(0, 5), (1, 30)])
+def test_a_delay_that_changes_by_a_tenth_of_the_time_and_5_ms_creeps_and_proves_itself_sooner(
+    beyond: int, commands: int
+) -> None:
+    sender, crept = Sender(), 255 * MS + beyond
+    assert sender.sends(300 * MS, 245 * MS) == "fresh"
+    verdicts = sender.steadily(crept, 31)
+    assert verdicts.index("set") == commands
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
+def test_a_delay_that_creeps_may_go_on_by_a_twentieth_of_the_proof_time(
+    beyond: int, verdict: Verdict
+) -> None:
+    sender, crept, half = Sender(), 255 * MS, 125 * MS
+    assert sender.sends(300 * MS, 245 * MS) == "fresh"
+    later = crept + 2 * half // 20 + beyond
+    assert sender.each([(PERIOD, crept), (half, later), (half, later)])[-1] == verdict
+
+
+# adjustments that show
+
+
+def test_the_part_of_a_delay_that_no_adjustment_shows_is_counted() -> None:
+    """The clock was set back by 500 ms, and then the network takes 100 ms more."""
+    sender = Sender()
+    begun_ns = sender.at_ns
+    sender.each([(PERIOD, 500 * MS), (150 * MS, 600 * MS)])
+    while sender.sends(PERIOD, 600 * MS) != "set":
+        assert sender.at_ns - begun_ns < 3 * NS_PER_S
+    drift = (sender.at_ns - begun_ns) // 5000
+    assert sender.freshness.forgiven_ns == 100 * MS - drift
+
+
+def test_a_delay_from_before_an_adjustment_is_counted() -> None:
+    """The network took 200 ms when the clock was set back by 3 s, and takes less since."""
+    sender = Sender()
+    begun_ns = sender.at_ns
+    assert sender.sends(300 * MS, 200 * MS) == "fresh"
+    sender.sends(PERIOD, 3200 * MS)
+    assert sender.steadily(3000 * MS, 31)[-1] == "set"
+    drift = (sender.at_ns - begun_ns) // 5000
+    assert sender.freshness.forgiven_ns == 200 * MS - drift
+
+
+def test_a_clock_that_was_set_forward_is_forgiven_nothing() -> None:
+    sender = Sender()
+    assert sender.steadily(-600 * MS, 31)[-1] == "set"
+    assert sender.freshness.forgiven_ns == 0
+
+
+def test_what_an_adjustment_shows_forgives_no_other_delay() -> None:
+    """The clock is set back by 500 ms, and the network holds everything back for 8 s."""
+    sender = Sender()
+    sender.sends(PERIOD, 500 * MS)
+    sender.sends(PERIOD + 8 * NS_PER_S, 8500 * MS)
+    assert set(sender.steadily(8500 * MS, 100)) == {"stale"}
+
+
+def test_an_adjustment_that_was_believed_forgives_no_later_delay() -> None:
+    sender = Sender()
+    assert sender.steadily(5000 * MS, 31)[-1] == "set"
+    sender.sends(PERIOD + 3 * NS_PER_S, 8000 * MS)
+    assert set(sender.steadily(8000 * MS, 100)) == {"stale"}
+
+
+@pytest.mark.parametrize(("departed", "verdict"), [(10_000, "set"), (10_001, "stale")])
+def test_a_clock_that_advances_by_10_us_at_most_stands(departed: int, verdict: Verdict) -> None:
+    sender = Sender()
+    assert sender.sends(3 * NS_PER_S + departed, 3 * NS_PER_S) == "stale"
+    assert sender.steadily(3 * NS_PER_S, 30)[-1] == verdict
+
+
+@pytest.mark.parametrize(
+    ("departed", "verdict"), [(2_000_000_000, "stale"), (2_000_000_001, "set")]
+)
+def test_a_sender_that_pauses_for_over_2_s_may_have_set_its_clock(
+    departed: int, verdict: Verdict
+) -> None:
+    sender, late = Sender(), 5 * NS_PER_S
+    assert sender.sends(late + departed, late) == "stale"
+    assert sender.steadily(late, 30)[-1] == verdict
+
+
+@pytest.mark.parametrize(
+    ("before", "then", "verdict"),
+    [(7, 8, "set"), (7, 51, "stale"), (7, 9, "stale"), (7, None, "set"), (None, 8, "set")],
+)
+def test_numbers_tell_a_pause_from_a_loss(
+    before: int | None, then: int | None, verdict: Verdict
+) -> None:
+    sender, late = Sender(), 5 * NS_PER_S
+    assert sender.sends(PERIOD, 0, before) == "fresh"
+    numbers = count(then) if then is not None else None
+    verdicts = [
+        sender.sends(after, late, next(numbers) if numbers else None)
+        for after in (late + 3 * NS_PER_S, *[PERIOD] * 30)
+    ]
+    assert verdicts == [*["stale"] * 30, verdict]
+
+
+# the budget
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
+def test_a_second_and_a_sixtieth_of_the_proof_time_is_forgiven_at_once(
+    beyond: int, verdict: Verdict
+) -> None:
+    sender, proof = Sender(), 1500 * MS
+    late = NS_PER_S + proof // 60 + (2 * NS_PER_S + proof) // 5000 + beyond
+    assert sender.sends(2 * NS_PER_S, late) == "stale"
+    assert sender.steadily(late, 30)[-1] == verdict
+
+
+def test_a_fourth_jump_of_300_ms_is_over_the_second_that_is_forgiven() -> None:
+    sender, ends = Sender(), list[Verdict]()
+    for jump in range(1, 5):
+        assert sender.sends(NS_PER_S, jump * 300 * MS) == "stale"
+        ends.append(sender.steadily(jump * 300 * MS, 30)[-1])
+    assert ends == ["set", "set", "set", "stale"]
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "set"), (1, "stale")])
+def test_after_a_pause_that_took_all_a_sixtieth_of_the_time_is_forgiven(
+    beyond: int, verdict: Verdict
+) -> None:
+    sender, proof, paused = Sender(), 1500 * MS, 5 * NS_PER_S
+    sender.sends(paused + 3 * NS_PER_S, paused)
+    assert sender.steadily(paused, 30)[-1] == "set"
+    assert set(sender.steadily(paused, 17 * 20)) == {"fresh"}
+    late = paused + (18 * NS_PER_S + proof) // 60 + (NS_PER_S + proof) // 5000 + beyond
+    assert sender.sends(NS_PER_S, late) == "stale"
+    assert sender.steadily(late, 30)[-1] == verdict
+
+
+# many senders
+
+
+def test_senders_without_a_name_are_told_apart_by_their_source() -> None:
+    freshness = Freshness()
+    verdicts = [
+        freshness.judge(Command(source, GO, n * PERIOD, n * PERIOD - delay), TIMEOUT)
+        for n in range(10)
+        for source, delay in (("high", 0), ("low", 3600 * NS_PER_S))
+    ]
+    assert verdicts[-2:] == ["fresh", "fresh"]
+
+
+def test_a_known_clock_outlives_any_number_of_senders_that_send_once() -> None:
+    sender = Sender()
+    for number in range(2000):
+        sender.sends(5 * MS, 0, clock=f"stranger {number}")
+    assert sender.sends(0, 0) == "fresh"
+
+
+def test_the_proof_of_a_sender_among_others_ends_with_a_silence_of_over_2_s_as_well() -> None:
+    sender = Sender(known=False)
+    assert sender.sends(0, 0) == "first"
+    sender.sends(2 * NS_PER_S, 0, clock="b")
+    assert sender.sends(0, 0) == "unproven"
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "first")])
+def test_a_clock_that_others_saw_silent_for_over_an_hour_is_forgotten(
+    beyond: int, verdict: Verdict
+) -> None:
+    sender, hour = Sender(), 3600 * NS_PER_S
+    sender.sends(hour + beyond, 0, clock="b")
+    assert sender.sends(0, hour) == verdict
+
+
+def numbered(freshness: Freshness, at_ns: int, number: int, sender: str = "a") -> Verdict:
+    command = Command("high", GO, at_ns, sender=sender, sequence=number)
+    return freshness.judge(command, TIMEOUT)
+
+
+@pytest.mark.parametrize(("beyond", "verdict"), [(0, "stale"), (1, "fresh")])
+def test_numbers_without_stamps_begin_again_after_over_2_s(beyond: int, verdict: Verdict) -> None:
+    freshness = Freshness()
+    assert numbered(freshness, NS_PER_S, 6) == "fresh"
+    assert numbered(freshness, 3 * NS_PER_S + beyond, 5) == verdict
+
+
+@pytest.mark.parametrize(("others", "verdict"), [(1023, "stale"), (1024, "fresh")])
+def test_the_numbers_of_1024_senders_without_stamps_are_remembered(
+    others: int, verdict: Verdict
+) -> None:
+    freshness = Freshness()
+    assert numbered(freshness, 0, 6) == "fresh"
+    for number in range(others):
+        numbered(freshness, 1, 1, f"stranger {number}")
+    assert numbered(freshness, 2, 5) == verdict

@@ -1,0 +1,534 @@
+"""A command counts only when its delay is known to be short, whatever the clocks show."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import Source
+from acsard.core.motion.freshness import FORGIVE_NS, Freshness, Verdict
+from acsard.core.values import NS_PER_S, REST, Command
+from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LOW, MS, SLOW, Bench
+
+
+class Clock:
+    """A sender's clock as `Freshness` sees it. Times are in ms."""
+
+    def __init__(self, known: bool = True, steady: bool = False) -> None:
+        self.freshness, self.steady = Freshness(), steady
+        self.now = 0.0
+        self.steadily(0.0, 1000 if known else 0)
+
+    def sends(self, delay: float, after: float = 50.0, name: str = "a") -> Verdict:
+        self.now += after
+        at_ns = round(self.now * MS)
+        stamp_ns = at_ns - round(delay * MS)
+        command = Command("high", GO, at_ns, stamp_ns, name, steady=self.steady)
+        return self.freshness.judge(command, 250 * MS)
+
+    def steadily(self, delay: float, lasting: float, every: float = 50.0) -> list[Verdict]:
+        return [self.sends(delay, every) for _ in range(int(lasting / every))]
+
+
+# first contact
+
+
+@pytest.mark.parametrize("delay", [0.0, 300.0, -86_400_000.0, 1.8e12])
+def test_a_clock_never_heard_counts_once_its_delays_were_steady_for_a_timeout(delay: float) -> None:
+    verdicts = Clock(known=False).steadily(delay, 400)
+    assert verdicts == ["first", *["unproven"] * 4, *["fresh"] * 3]
+
+
+@pytest.mark.parametrize("every", [263.0, 500.0, 1900.0])
+def test_one_that_sends_seldom_needs_three(every: float) -> None:
+    verdicts = Clock(known=False).steadily(0.0, 3 * every, every)
+    assert verdicts == ["first", "unproven", "fresh"]
+
+
+def test_one_that_falls_silent_meanwhile_begins_again() -> None:
+    clock = Clock(known=False)
+    clock.steadily(0.0, 250)
+    assert clock.sends(0.0, after=2001) == "first"
+    assert "fresh" in clock.steadily(0.0, 250)
+
+
+@pytest.mark.parametrize("faster", [0.98, 0.9, 0.8, 1.02, 1.1, 1.3, 2.0, 5.0, 50.0])
+@pytest.mark.parametrize("heaps", [1, 6])
+def test_a_backlog_never_counts_however_fast_or_slowly_it_pours(faster: float, heaps: int) -> None:
+    # The sender sends at 20 Hz for a minute. The backlog arrives `faster` than it was sent, one by
+    # one or in groups.
+    clock = Clock(known=False)
+    for number in range(1200):
+        after = 0.0 if number % heaps else heaps * 50 / faster
+        delay = clock.now + after - number * 50.0
+        assert clock.sends(delay, after) in ("first", "unproven")
+
+
+def test_what_pours_out_at_the_pace_it_was_sent_is_a_clock_that_is_behind() -> None:
+    assert Clock(known=False).steadily(5000.0, 300)[-1] == "fresh"
+
+
+@pytest.mark.parametrize("jitter", [1.0, 10.0, 30.0, 100.0])
+def test_jitter_keeps_nobody_out_for_three_seconds(jitter: float) -> None:
+    for seed in range(50):
+        dice, clock = random.Random(seed), Clock(known=False)
+        assert "fresh" in [clock.sends(dice.uniform(0.0, jitter)) for _ in range(60)]
+
+
+@pytest.mark.parametrize("hz", [10.0, 20.0, 50.0, 100.0, 200.0])
+def test_first_contact_through_jitter_of_60_ms_takes_2_s_in_the_median_and_mostly_under_5_s(
+    hz: float,
+) -> None:
+    """The jitter is exponential and no command overtakes another, as on TCP.
+
+    An earlier version took 4 s, and 14 s at worst.
+    """
+    took = []
+    for seed in range(100):
+        dice, clock, arrival = random.Random(seed), Clock(known=False), 0.0
+        for number in range(int(20 * hz)):
+            before, sent = arrival, number / hz
+            arrival = max(arrival + 1e-5, sent + dice.expovariate(1 / 0.06))
+            if clock.sends(1000 * (arrival - sent), 1000 * (arrival - before)) == "fresh":
+                took.append(arrival)
+                break
+    took.sort()
+    print(f"\n{hz:g} Hz: {took[50]:.2f} s, 95 of 100 in {took[95]:.2f} s, all in {took[-1]:.2f} s")
+    assert len(took) == 100
+    assert took[50] <= 2.0
+    assert took[95] <= 5.0
+
+
+@pytest.mark.parametrize(("jitter", "zeros"), [(10.0, 8), (40.0, 8), (40.0, 1)])
+def test_a_zero_among_jitter_is_not_forgotten_before_its_clock_is_known(
+    jitter: float, zeros: int
+) -> None:
+    for seed in range(50):
+        dice, bench = random.Random(seed), Bench(HIGH, armed=False)
+        for number in range(60):
+            late, twist = dice.uniform(0.0, jitter), REST if number < zeros else GO
+            bench.wait(50).stamped(HIGH, late, twist=twist)
+        assert bench.driver() == "high"
+
+
+def test_a_zero_at_the_head_of_a_backlog_is_forgotten() -> None:
+    bench = Bench(HIGH, armed=False)
+    for number in range(300):
+        bench.wait(40 if number < 200 else 50)  # by then the backlog is gone
+        late = max(0.0, 2000 - 10.0 * number)
+        bench.stamped(HIGH, late, twist=GO if number else REST)
+    assert bench.choice().wait.what == "neutral"
+
+
+def test_a_network_that_lets_in_by_heaps_keeps_nobody_out() -> None:
+    clock = Clock(known=False)
+    for _ in range(10):
+        verdicts = [clock.sends(80.0 - 20.0 * n, 0.0 if n else 100.0) for n in range(5)]
+    assert set(verdicts) == {"fresh"}
+
+
+def test_a_proof_takes_the_source_s_timeout_but_no_more_than_two_seconds() -> None:
+    patient = Source("patient", 1, timeout=10.0)
+    for source, seconds in ((SLOW, 1.0), (patient, 2.0)):
+        bench = Bench(source)
+        answers = [bench.wait(100).stamped(source) for _ in range(25)]
+        assert answers.index("") == 10 * seconds
+
+
+# a known clock
+
+
+def test_a_command_later_than_the_promptest_by_more_than_the_timeout_is_stale() -> None:
+    clock = Clock()
+    assert clock.sends(0.0) == "fresh"
+    assert clock.sends(250.0, after=300.0) == "fresh"
+    assert clock.sends(250.2, after=300.0) == "stale"
+    assert clock.sends(0.0) == "fresh"
+
+
+@pytest.mark.parametrize("source", [SLOW, Source("quick", 1, timeout=0.02)])
+def test_how_late_is_stale_depends_on_the_source(source: Source) -> None:
+    bench = Bench(source).known(source)
+    assert bench.wait(1100).stamped(source, late_ms=source.timeout * 1000) == ""
+    assert bench.wait(1100).stamped(source, late_ms=source.timeout * 1000 + 1) == "stale"
+
+
+def test_a_stale_command_refreshes_nothing() -> None:
+    bench = Bench(HIGH).known(HIGH)
+    for _ in range(5):
+        bench.wait(51)
+        assert bench.stamped(HIGH, late_ms=5000) == "stale"
+        bench.offset_ns += 10 * MS
+    assert bench.driver() == ""
+
+
+def test_a_backlog_is_not_obeyed_and_what_is_fresh_again_is() -> None:
+    bench = Bench(HIGH).known(HIGH)
+    bench.wait(3000)
+    ages = [float(age) for age in range(3000, -1, -50)]
+    answers = [bench.stamped(HIGH, late_ms=age) for age in ages]
+    # After a silence of 3 s the minimum delay may have risen by 3 s x 2e-4 = 0.6 ms.
+    assert answers == ["stale" if age > 250.6 else "" for age in ages]
+
+
+def test_each_clock_is_known_for_itself_and_on_all_its_sources() -> None:
+    bench = Bench(HIGH, LOW).known(HIGH, clock="alice")
+    bench.offset_ns -= HOUR_NS
+    assert bench.stamped(HIGH, clock="bob") == "unproven"
+    assert bench.stamped(LOW, clock="alice") == "stale"
+
+
+def test_a_command_without_a_stamp_is_as_old_as_its_arrival() -> None:
+    bench = Bench(HIGH).known(HIGH)
+    assert bench.wait(5000).send(HIGH) == ""
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4])
+def test_an_hour_with_a_drifting_clock_loses_no_command(drift: float) -> None:
+    # 1e-4 x 3600 s = 360 ms, which exceeds the timeout if the estimate did not follow the drift.
+    bench = Bench(HIGH).known(HIGH)
+    for _ in range(3600 * 5):
+        bench.offset_ns -= int(drift * 200 * MS)
+        assert bench.wait(200).stamped(HIGH) == ""
+
+
+def test_after_so_long_a_silence_that_drift_is_a_delay_a_clock_is_as_good_as_new() -> None:
+    clock = Clock()
+    assert clock.sends(0.0, after=249_999) == "fresh"
+    assert clock.sends(0.0, after=250_001) == "first"
+    assert clock.steadily(0.0, 250)[-1] == "fresh"
+
+
+def test_only_so_many_clocks_are_remembered_and_the_longest_unheard_goes_first() -> None:
+    clock = Clock()
+    for number in range(1023):
+        clock.sends(0.0, 1e-3, f"sender {number}")
+    assert clock.sends(0.0) == "fresh"
+    for number in range(1024):
+        clock.sends(0.0, 1e-3, f"another {number}")
+    assert clock.sends(0.0) == "first"
+
+
+def test_one_at_20_hz_stays_known_among_four_thousand_names_a_second() -> None:
+    clock = Clock()
+    for number in range(2000):
+        verdict = clock.sends(0.0, 0.0) if number % 200 == 0 else "fresh"
+        assert verdict == "fresh"
+        clock.sends(0.0, 0.25, f"stranger {number}")
+
+
+def test_one_at_20_hz_who_is_new_becomes_known_among_four_thousand_names_a_second() -> None:
+    clock = Clock(known=False)
+    verdicts = []
+    for number in range(2000):
+        if number % 200 == 0:
+            verdicts.append(clock.sends(0.0, 0.0))
+        clock.sends(0.0, 0.25, f"stranger {number}")
+    assert verdicts[-1] == "fresh"
+
+
+def test_one_who_comes_late_among_others_who_send_as_well_begins_anew_at_best() -> None:
+    clock, verdicts = Clock(), []
+    for _ in range(100):
+        for number in range(40):
+            clock.sends(0.0, 1.0, f"another {number}")
+        verdicts.append(clock.sends(1000.0, 10.0))
+    set_at = verdicts.index("set")
+    assert set(verdicts[:set_at]) == {"stale"}
+    assert set_at * 50.0 > 1000.0
+
+
+@given(
+    order=st.lists(
+        st.tuples(st.integers(0, 4), st.sampled_from([1.0, 50.0, 900.0, 2100.0, 260_000.0])),
+        max_size=60,
+    )
+)
+def test_what_is_forgotten_would_have_begun_anew(order: list[tuple[int, float]]) -> None:
+    """Each sender among others gets the same verdicts as if it were alone."""
+    among = Clock(known=False)
+    alone = {name: Clock(known=False) for name in range(5)}
+    for name, after in order:
+        verdict = among.sends(0.0, after, f"sender {name}")
+        alone[name].now = among.now - 50.0
+        assert alone[name].sends(0.0) == verdict
+
+
+@given(
+    jitter=st.lists(st.floats(0.0, 249.0), min_size=1, max_size=50),
+    offset_s=st.floats(-1e9, 1e9),
+)
+def test_no_command_within_the_timeout_is_ever_stale(jitter: list[float], offset_s: float) -> None:
+    bench = Bench(HIGH)
+    bench.offset_ns = int(offset_s * NS_PER_S)
+    bench.known(HIGH)
+    for late in jitter:
+        assert bench.wait(250).stamped(HIGH, late_ms=late) == ""
+
+
+# a clock that was set
+
+
+@pytest.mark.parametrize("step", [300.0, 10_000.0, -100.0, -10_000.0])
+def test_a_clock_that_was_set_is_refused_until_its_delays_were_steady_for_a_second_and_a_half(
+    step: float,
+) -> None:
+    verdicts = Clock().steadily(step, 1700)
+    assert verdicts == [*["stale"] * 30, "set", *["fresh"] * 3]
+
+
+@pytest.mark.parametrize("step", [200.0, -40.0])
+def test_a_step_that_a_network_may_make_is_none(step: float) -> None:
+    clock = Clock()
+    assert clock.sends(step, after=250.0) == "fresh"
+    assert set(clock.steadily(step, 1000)) == {"fresh"}
+
+
+@pytest.mark.parametrize("step", [5000.0, -5000.0])
+def test_one_stamp_that_is_wrong_costs_nothing_but_itself(step: float) -> None:
+    clock = Clock()
+    assert clock.sends(step) == "stale"
+    assert set(clock.steadily(0.0, 500)) == {"fresh"}
+
+
+def test_delays_that_keep_falling_below_the_promptest_do_not_count() -> None:
+    # A clock set forward hides a delay, so delays that fall like those of a backlog are treated as
+    # one.
+    clock = Clock()
+    verdicts = [clock.sends(-50.0 * n, 10.0) for n in range(100)]
+    assert verdicts[0] == "fresh"
+    assert set(verdicts[1:]) == {"stale"}
+
+
+def test_a_clock_that_was_set_and_falls_silent_meanwhile_is_refused_for_the_whole_time_again() -> (
+    None
+):
+    clock = Clock()
+    assert set(clock.steadily(1000.0, 1400)) == {"stale"}
+    assert clock.sends(1000.0, after=2001) == "stale"
+    assert set(clock.steadily(1000.0, 1450)) == {"stale"}
+    assert "set" in clock.steadily(1000.0, 150)
+
+
+def test_a_clock_that_is_slewed_fast_is_followed() -> None:
+    clock = Clock()
+    assert {clock.sends(-4.0 * n) for n in range(500)} == {"fresh"}
+
+
+def test_a_clock_that_is_slewed_slow_counts_again_each_time_it_has_crept_too_far() -> None:
+    clock = Clock()
+    verdicts = [clock.sends(4.0 * n) for n in range(240)]
+    assert verdicts.count("set") == 3
+    assert verdicts.count("stale") <= 20
+
+
+def test_late_by_a_jump_and_rising_no_less_is_a_queue_that_grows_and_no_clock() -> None:
+    clock = Clock()
+    assert {clock.sends(1000.0 + 4.0 * n) for n in range(200)} == {"stale"}
+
+
+def test_a_clock_that_was_set_has_its_sender_let_go_first() -> None:
+    bench = Bench(HIGH).known(HIGH)
+    assert bench.stamped(HIGH) == ""
+    assert bench.driver() == "high"
+    bench.offset_ns -= NS_PER_S
+    answers = [bench.wait(50).stamped(HIGH) for _ in range(35)]
+    assert answers == [*["stale"] * 30, *[""] * 5]
+    assert bench.driver() == ""
+    for _ in range(7):
+        bench.wait(50).stamped(HIGH, twist=REST)
+    bench.wait(50).stamped(HIGH)
+    assert bench.driver() == "high"
+
+
+# one clock per sender, on all its sources
+
+
+def driving(bench: Bench, source: Source, late_ms: float, ms: float) -> list[str]:
+    """Send speeds from the same sender at 20 Hz for this many ms and return the verdicts."""
+    return [bench.wait(50).stamped(source, late_ms, "joe", GO, "joe") for _ in range(int(ms / 50))]
+
+
+def test_zeros_of_a_clock_that_wavers_on_another_source_made_nobody_neutral() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    for _ in range(3):
+        assert bench.wait(50).stamped(HIGH, 0.0, "joe", REST, "joe") == "unproven"
+    assert bench.wait(50).stamped(LOW, 2000.0, "joe", REST, "joe") == "unproven"
+    assert driving(bench, HIGH, 2000.0, 1000)[-1] == "", "its delays are steady again"
+    assert bench.driver() == ""
+
+
+def test_a_clock_that_was_set_must_be_neutral_on_each_of_its_sources() -> None:
+    bench = Bench(HIGH, LOW, armed=False).known(HIGH, "joe", "joe").known(LOW, "joe", "joe")
+    bench.wait(50).stamped(LOW, 0.0, "joe", GO, "joe")
+    assert bench.driver() == "high" or bench.driver() == "low"
+    bench.wait(1000)
+    answers = driving(bench, HIGH, 5000.0, 3000)
+    assert answers[0] == "stale"
+    assert answers[-1] == ""
+    assert bench.driver() == ""
+    bench.wait(300)
+    assert driving(bench, LOW, 5000.0, 50) == [""]
+    assert bench.driver() == "", "it was free there before its clock was set"
+
+
+# two kinds of clocks
+
+
+@pytest.mark.parametrize("delay", [275.0, 1000.0, 8000.0])
+def test_a_steady_clock_that_is_late_stays_refused_however_long(delay: float) -> None:
+    clock = Clock(steady=True)
+    assert set(clock.steadily(delay, 60_000)) == {"stale"}
+    assert clock.sends(delay, after=10_000.0) == "stale", "also behind a pause of its own"
+    assert clock.sends(0.0) == "fresh"
+
+
+@pytest.mark.parametrize("slope", [0.01, 0.05, 0.1])
+def test_a_steady_clock_is_not_followed_while_it_creeps_away(slope: float) -> None:
+    clock = Clock(steady=True)
+    verdicts = [clock.sends(slope * 50.0 * number) for number in range(1200)]
+    assert verdicts.index("stale") <= 260.0 / (slope * 50.0)
+    assert set(verdicts[verdicts.index("stale") :]) == {"stale"}
+
+
+def test_a_steady_clock_whose_minimum_was_that_of_a_backlog_proves_itself_again() -> None:
+    clock = Clock(known=False, steady=True)
+    clock.steadily(3000.0, 500)
+    verdicts = clock.steadily(0.0, 400)
+    assert verdicts == ["first", *["unproven"] * 4, *["fresh"] * 3]
+
+
+def test_a_foreign_clock_is_forgiven_a_second_and_a_second_more_each_minute() -> None:
+    clock = Clock()
+    late, forgiven = 0.0, 0.0
+    for _ in range(20 * 300):
+        late += 1.0  # a drift of 2 %
+        if clock.sends(late) == "set":
+            forgiven = late
+    total = clock.freshness.forgiven_ns / NS_PER_S
+    assert 5.0 <= total <= 6.0, "300 s have 1 s, and 1 s more for each minute"
+    assert forgiven / 1000 == pytest.approx(total, abs=0.5)
+
+
+@pytest.mark.parametrize("step", [1100.0, 8000.0])
+def test_a_jump_of_over_a_second_is_forgiven_only_where_the_clock_shows_it(
+    step: float,
+) -> None:
+    held = Clock()
+    held.now += step  # nothing arrives during the step, and afterwards everything is late
+    waited = 58 * (step - 1000) - 1000  # the budget starts at 1 s and grows by 1 s each minute
+    assert set(held.steadily(step, waited)) == {"stale"}
+    assert "set" in held.steadily(step, 20_000), "it is never locked out for ever"
+    shown = Clock()
+    assert "set" in shown.steadily(step, 2000), "stamps that go back are no network's"
+
+
+def test_a_pause_by_its_own_stamps_lets_a_foreign_clock_have_been_set() -> None:
+    clock = Clock()
+    clock.sends(5000.0, after=7100.0)
+    assert clock.steadily(5000.0, 1600)[-1] in ("set", "fresh")
+    assert clock.freshness.forgiven_ns == pytest.approx(5e9, rel=0.01), "it is told all the same"
+
+
+def test_a_clock_that_stands_until_it_is_caught_up_was_set_back() -> None:
+    clock = Clock()
+    for late in range(0, 3000, 50):
+        clock.sends(float(late))
+    assert "set" in clock.steadily(3000.0, 2300)
+    assert clock.freshness.forgiven_ns <= NS_PER_S // 4
+
+
+def test_the_budget_is_never_more_than_its_limit() -> None:
+    clock = Clock()
+    clock.steadily(0.0, 200_000, 200.0)
+    clock.now += FORGIVE_NS / MS + 100
+    assert set(clock.steadily(FORGIVE_NS / MS + 100, 5000)) == {"stale"}
+
+
+def test_a_minimum_that_fell_for_a_moment_still_bounds_a_steady_clock() -> None:
+    """An earlier version accepted a plateau of 30 s in this case.
+
+    It followed first contact at 70 ms and three commands at 5 ms.
+    """
+    clock = Clock(known=False, steady=True)
+    clock.steadily(70.0, 1000)
+    clock.steadily(5.0, 150)
+    clock.now += 30_000
+    assert set(clock.steadily(30_000.0, 20_000)) == {"stale"}
+    assert "fresh" in clock.steadily(5.0, 500)
+
+
+def test_adjustments_that_showed_are_forgotten_once_the_clock_is_prompt_again() -> None:
+    clock = Clock()
+    for _ in range(50):
+        clock.sends(100.0)
+        assert clock.sends(0.0) == "fresh"
+    clock.now += 5000
+    assert set(clock.steadily(5000.0, 5000)) == {"stale"}
+
+
+def test_a_clock_that_was_set_forward_by_minutes_is_not_new() -> None:
+    clock = Clock()
+    assert clock.sends(-300_000.0) == "stale"
+    assert "set" in clock.steadily(-300_000.0, 2000)
+
+
+@pytest.mark.parametrize("steady", [True, False])
+def test_a_network_that_holds_all_back_for_minutes_does_not_make_a_clock_new(steady: bool) -> None:
+    clock = Clock(steady=steady)
+    clock.now += 251_000
+    assert set(clock.steadily(251_000.0, 20_000)) == {"stale"}
+
+
+def test_commands_that_come_twice_or_in_another_order_show_no_adjustment() -> None:
+    for second in (0.0, 50.0):
+        clock = Clock()
+        clock.now += 8000
+        for _ in range(400):
+            assert clock.sends(8000.0, after=25.0) == "stale"
+            assert clock.sends(8025.0 + second, after=25.0) == "stale"
+            clock.now += 1e-6
+
+
+# order
+
+
+def test_a_command_behind_a_newer_one_is_stale_and_refreshes_nothing() -> None:
+    clock = Clock()
+    assert clock.sends(0.0) == "fresh"
+    assert clock.sends(100.0) == "stale"
+    assert clock.sends(50.0, after=0.0) == "fresh", "the same stamp once more, without a number"
+    assert clock.sends(0.0) == "fresh"
+
+
+@pytest.mark.parametrize(
+    ("stamp", "number", "fresh"),
+    [(0, 8, True), (0, 7, False), (0, 6, False), (1, 1, True), (-1, 9, False)],
+)
+def test_of_equal_stamps_the_number_decides(stamp: int, number: int, fresh: bool) -> None:
+    clock = Clock()
+    at_ns = round(clock.now * MS) + 50 * MS
+    for after, sent, count in ((0, 0, 7), (10 * MS, stamp, number)):
+        command = Command("high", GO, at_ns + after, at_ns + sent, "a", sequence=count)
+        verdict = clock.freshness.judge(command, 250 * MS)
+    assert verdict == ("fresh" if fresh else "stale")
+
+
+def test_numbers_without_stamps_keep_their_order_until_the_sender_pauses() -> None:
+    freshness = Freshness()
+
+    def judged(at_ms: int, number: int, sender: str = "a") -> Verdict:
+        command = Command("high", GO, at_ms * MS, sender=sender, sequence=number)
+        return freshness.judge(command, 250 * MS)
+
+    assert [judged(0, 5), judged(10, 6), judged(20, 6), judged(30, 4)] == [
+        "fresh", "fresh", "stale", "stale",
+    ]  # fmt: skip
+    assert judged(40, 1, "b") == "fresh"
+    assert judged(2011, 1) == "fresh", "a program that started again"
+    for number in range(1025):
+        judged(2012, 1, f"stranger {number}")
+    assert judged(2013, 1) == "fresh"

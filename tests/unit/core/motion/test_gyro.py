@@ -1,0 +1,419 @@
+"""Gyro samples and feedback lines give the turn of each line, or none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.motion.gyro import SILENT_NS, WORDS, Gyro, Turn
+from acsard.core.motion.learned_track import LEAST
+from acsard.core.simulator.noise import gauss
+from acsard.core.values import NS_PER_S, GyroDoes, GyroSample
+
+MS = 1_000_000
+LINE_NS = 10 * MS
+DT = 0.01
+
+Rate = Callable[[float], float]
+REST_FIRST = 1.0
+"""Time after which the bias is known, s."""
+
+
+class Bench:
+    """A robot that rests for a second and then turns as commanded.
+
+    Its wheels report `skid` times the true turn.
+    """
+
+    def __init__(
+        self,
+        *,
+        bias: float = 0.0,
+        noise: float = 0.0,
+        skid: float = 1.6,
+        sample_ms: int = 10,
+        late_ms: int = 0,
+        stamped: bool = False,
+        sign: float = 1.0,
+        first: int = 0,
+    ) -> None:
+        """`first` is the index of the first noise value."""
+        self.gyro = Gyro()
+        self.now_ns = 7 * NS_PER_S
+        self.bias, self.noise, self.skid, self.sign = bias, noise, skid, sign
+        self.sample_ns, self.late_ns, self.stamped = sample_ms * MS, late_ms * MS, stamped
+        self.true = self.told = self.variance = 0.0
+        self.none = 0
+        self.silent = False
+        self.does: list[GyroDoes] = []
+        self.other = False
+        """Whether the next sample is the first one of another sender."""
+        self._sampled_ns, self._sampled = self.now_ns, 0.0
+        self._samples = first
+        self._way: list[GyroSample] = []
+        self.held_back_ns = 0
+        """Time before which no sample arrives; the waiting samples then arrive together."""
+
+    def run(
+        self,
+        seconds: float,
+        rate: float | Rate = 0.0,
+        skid: float | None = None,
+        still: bool | None = None,
+    ) -> None:
+        begun = self.now_ns
+        for _ in range(round(seconds / DT)):
+            t = (self.now_ns - begun) / NS_PER_S
+            now = rate(t) if callable(rate) else rate
+            for _ in range(10):
+                self.now_ns += LINE_NS // 10
+                self.true += now * DT / 10
+                self._sample()
+            heard: tuple[GyroSample, ...] = ()
+            if self.now_ns > self.held_back_ns:
+                heard = tuple(one for one in self._way if one.at_ns <= self.now_ns)
+                heard = tuple(
+                    replace(one, at_ns=max(one.at_ns, self.held_back_ns)) for one in heard
+                )
+                self._way = [one for one in self._way if one.at_ns > self.now_ns]
+            self.gyro.hear(heard)
+            wheels = now * (self.skid if skid is None else skid) * DT
+            stands = now == 0.0 if still is None else still
+            turn = self.gyro.turn(self.now_ns, DT, wheels, stands)
+            self.told += wheels if turn is None else turn.angle
+            self.variance += 0.0 if turn is None else turn.variance
+            self.none += turn is None
+            self.does += [event.kind for event in self.gyro.events]  # type: ignore[misc]
+
+    def _sample(self) -> None:
+        span_ns = self.now_ns - self._sampled_ns
+        if span_ns < self.sample_ns:
+            return
+        mean = (self.true - self._sampled) * NS_PER_S / span_ns
+        said = self.sign * mean + self.bias + self.noise * gauss(3, self._samples)
+        at_ns = self.now_ns + self.late_ns
+        stamp_ns = self.now_ns + 10**18 if self.stamped else None
+        if not self.silent:
+            self._way.append(GyroSample(at_ns, stamp_ns, said, anew=self.other))
+            self.other = False
+        self._sampled_ns, self._sampled, self._samples = self.now_ns, self.true, self._samples + 1
+
+    def says(self) -> GyroDoes:
+        return self.gyro.status.does
+
+
+def stirring(t: float) -> float:
+    return 0.8 * math.sin(1.3 * t) + 0.5 * math.sin(3.1 * t + 1.0) + 1e-3
+
+
+def over_a_gap(bench: Bench, seconds: float, rate: float) -> Turn | None:
+    """Turn for this time without a line, then return the turn of a line that covers none of it."""
+    for _ in range(round(seconds / DT)):
+        bench.now_ns += LINE_NS
+        bench.true += rate * DT
+        bench._sample()
+    bench.gyro.hear(tuple(bench._way))
+    bench._way = []
+    return bench.gyro.turn(bench.now_ns, 0.0, 0.0, still=False)
+
+
+# a gyro in use
+
+
+@pytest.mark.parametrize("sample_ms", [2, 10, 50, 100])
+def test_the_turn_is_the_gyros_however_the_wheels_skid(sample_ms: int) -> None:
+    bench = Bench(bias=0.01, sample_ms=sample_ms)
+    bench.run(REST_FIRST)
+    bench.told = bench.true = 0.0
+    bench.run(20.0, stirring)
+    bench.run(1.0)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=2e-3 + 1e-3 * sample_ms)
+
+
+def test_before_it_has_stood_the_wheels_alone_tell() -> None:
+    bench = Bench()
+    bench.run(3.0, 0.5)
+    assert bench.none == 300
+    assert bench.told == pytest.approx(1.5 * 1.6)
+    assert bench.does == ["waiting for rest"]
+
+
+@pytest.mark.slow
+def test_at_rest_nothing_turns_whatever_its_bias_and_noise() -> None:
+    bench = Bench(bias=-0.03, noise=0.01)
+    bench.run(REST_FIRST)
+    bench.told = 0.0
+    bench.run(600.0)
+    assert bench.told == 0.0
+    assert bench.gyro.status.bias == pytest.approx(-0.03, abs=0.002)
+
+
+def test_a_robot_that_is_turned_by_hand_while_its_wheels_stand_is_followed() -> None:
+    bench = Bench()
+    bench.run(2.0)
+    begun = bench.told
+    for _ in range(100):
+        bench.true += 0.5 * DT
+        bench.run(DT)
+    assert bench.told - begun == pytest.approx(0.5, abs=0.02)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.floats(0.01, 1.5), min_size=2, max_size=6), st.integers(0, 60))
+def test_in_the_end_the_turn_is_whole_however_late_it_came(
+    rates: list[float], late_ms: int
+) -> None:
+    bench = Bench(late_ms=late_ms)
+    bench.run(REST_FIRST)
+    bench.run(0.5, 1.0)
+    bench.run(1.0)
+    for rate in rates:
+        bench.run(0.5, rate)
+    bench.run(1.0)
+    assert bench.told == pytest.approx(bench.true, abs=5e-3)
+
+
+def test_a_gap_in_the_wheels_lines_is_no_gap_in_the_turn() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(1.0, 0.5)
+    turn = over_a_gap(bench, 0.3, 0.5)
+    assert turn is not None
+    assert turn.angle == pytest.approx(0.15, abs=1e-6)
+
+
+# delay and stamps
+
+
+@pytest.mark.parametrize("late_ms", [0, 20, 50])
+def test_how_late_it_tells_is_found_at_a_rest(late_ms: int) -> None:
+    bench = Bench(late_ms=late_ms)
+    bench.run(REST_FIRST)
+    bench.run(20.0, stirring)
+    bench.run(1.0)
+    assert bench.gyro.status.delay == pytest.approx(late_ms / 1000, abs=0.012)
+
+
+def test_stamps_take_the_jitter_of_the_way_out() -> None:
+    bench, worst = Bench(stamped=True), 0.0
+    bench.run(REST_FIRST)
+    for n in range(500):
+        bench.late_ns = (n * 7 % 5) * 4 * MS if n % 9 else 0
+        before = bench.told
+        bench.run(DT, 1.0)
+        if n > 50:
+            worst = max(worst, abs(bench.told - before - DT))
+    assert worst < 2e-3
+
+
+def test_a_clock_that_is_set_costs_nothing() -> None:
+    bench = Bench(stamped=True)
+    bench.run(REST_FIRST)
+    bench.run(1.0, 0.5)
+    early = GyroSample(bench.now_ns + MS, 5, 0.5)
+    bench.gyro.hear((early,))
+    bench.run(2.0, 0.5)
+    assert bench.told == pytest.approx(bench.true, rel=0.02)
+
+
+# silence, slip, contradictions
+
+
+def test_a_gyro_that_falls_silent_leaves_the_wheels_alone_and_comes_back() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(1.0, 0.5)
+    bench.silent = True
+    bench.run(2.0, 0.5)
+    assert bench.says() == "silent"
+    begun, true, none = bench.told, bench.true, bench.none
+    bench.run(1.0, 0.5)
+    assert bench.none - none == 100
+    assert bench.told - begun == pytest.approx((bench.true - true) * 1.6)
+    bench.silent = False
+    bench.run(0.1, 0.5)
+    begun, true = bench.told, bench.true
+    bench.run(1.0, 0.5)
+    assert bench.told - begun == pytest.approx(bench.true - true)
+    assert bench.does == ["waiting for rest", "used", "silent", "used"]
+
+
+@pytest.mark.parametrize("back_ms", [150, 210, 230, 290, 400])
+@pytest.mark.parametrize("rate", [1.0, -2.0])
+def test_what_was_told_of_a_silence_is_not_told_again(back_ms: int, rate: float) -> None:
+    bench = Bench(stamped=True, skid=1.0)
+    bench.run(REST_FIRST)
+    bench.run(1.0, rate)
+    bench.held_back_ns = bench.now_ns + back_ms * MS
+    bench.run(2.0, rate)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=0.01 * abs(rate))
+
+
+@pytest.mark.parametrize("late_ms", [150, 250])
+def test_one_that_is_late_is_not_silent(late_ms: int) -> None:
+    bench = Bench(late_ms=late_ms, sample_ms=100)
+    bench.run(REST_FIRST)
+    for _ in range(5):
+        bench.run(math.tau, lambda t: 0.6 * math.sin(t))
+        bench.run(1.0)
+    assert bench.gyro.status.delay == pytest.approx(late_ms / 1000, abs=0.08)
+    bench.does.clear()
+    none, begun, true = bench.none, bench.told, bench.true
+    bench.run(5.0, 0.5)
+    bench.run(1.0)
+    assert bench.none == none
+    assert "silent" not in bench.does
+    assert bench.told - begun == pytest.approx(bench.true - true, abs=0.03)
+
+
+def test_for_a_moment_without_samples_it_turns_on_as_it_did() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(1.0, 0.5)
+    bench.silent = True
+    bench.run(SILENT_NS / NS_PER_S - DT, 0.5)
+    assert bench.says() == "used"
+    assert bench.told == pytest.approx(bench.true, abs=1e-6)
+
+
+def test_wheels_that_slip_are_told_and_the_gyro_is_believed() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(20.0, stirring)
+    assert bench.says() == "used"
+    bench.run(1.0, 1.0)
+    begun, true = bench.told, bench.true
+    bench.run(0.3, 0.1, skid=16.0)
+    assert bench.says() == "disagrees"
+    assert bench.told - begun == pytest.approx(bench.true - true, abs=1e-3)
+    bench.run(2.0, 1.0)
+    assert bench.says() == "used"
+    assert bench.does[-2:] == ["disagrees", "used"]
+
+
+def test_a_gyro_that_is_mounted_upside_down_is_not_believed() -> None:
+    bench = Bench(sign=-1.0)
+    bench.run(REST_FIRST)
+    bench.run(20.0, stirring)
+    assert bench.says() == "reversed"
+    none = bench.none
+    bench.run(5.0, stirring)
+    assert bench.none - none == 500
+
+
+@pytest.mark.parametrize(("sign", "named"), [(-1.0, "reversed"), (0.0, "dead")])
+@pytest.mark.parametrize("rate", [0.02, 0.05, 0.1])
+def test_a_slow_turn_is_the_wheels_too_until_the_gyro_is_proved(
+    sign: float, named: GyroDoes, rate: float
+) -> None:
+    bench = Bench(sign=sign)
+    bench.run(REST_FIRST)
+    bench.run(60.0, rate)
+    assert bench.told == pytest.approx(60.0 * rate * 1.6)
+    # Wheels with unequal tyres report 0.08 rad/s on a straight, where a good gyro reports nothing.
+    assert (bench.says() == named) == (rate > (0.02 if sign else 0.05))
+    bench.run(1.0)
+    assert bench.told == pytest.approx(60.0 * rate * 1.6, abs=1e-6), "nor is it owed at rest"
+
+
+def test_a_slow_turn_proves_a_gyro_and_what_it_had_to_say_is_made_up_for() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(5.0, 0.02)
+    assert bench.told == pytest.approx(bench.true * 1.6)
+    bench.run(5.0, 0.05)
+    assert bench.told == pytest.approx(bench.true, abs=1e-3)
+
+
+def test_a_gap_on_trial_is_the_wheels_until_the_gyro_is_proved() -> None:
+    reversed_one = Bench(sign=-1.0)
+    reversed_one.run(REST_FIRST)
+    assert over_a_gap(reversed_one, 0.3, 0.5) is None
+    bench = Bench()
+    bench.run(REST_FIRST)
+    assert over_a_gap(bench, 0.3, 0.5) is None
+    bench.run(1.0, 0.5)
+    assert bench.told == pytest.approx(bench.true, abs=1e-3)
+
+
+def test_where_the_pose_is_set_it_owes_nothing_of_what_was_before() -> None:
+    bench = Bench()
+    bench.run(REST_FIRST)
+    bench.run(0.1, 0.5)
+    assert bench.gyro.owes
+    bench.gyro.forgive()
+    begun, true = bench.told, bench.true
+    bench.run(1.0, 0.5)
+    assert bench.says() == "used"
+    assert bench.told - begun == pytest.approx(bench.true - true, abs=1e-6)
+
+
+def test_another_gyro_stands_first_and_proves_itself() -> None:
+    bench = Bench(bias=0.05)
+    bench.run(REST_FIRST)
+    bench.run(20.0, stirring)
+    bench.run(1.0)
+    learned = bench.gyro.learned
+    assert learned is not None
+    bench.bias, bench.sign, bench.other = -0.1, -1.0, True
+    bench.does.clear()
+    begun, true = bench.told, bench.true
+    bench.run(1.0, 0.5)
+    assert bench.told - begun == pytest.approx((bench.true - true) * 1.6)
+    assert bench.gyro.status.bias is None
+    assert bench.gyro.learned == learned, "of the floor, whoever told it"
+    bench.run(REST_FIRST)
+    bench.run(2.0, 0.5)
+    assert bench.does == ["waiting for rest", "used", "reversed"]
+
+
+def test_the_track_it_implies_is_shown_once_it_has_turned_enough() -> None:
+    bench = Bench(skid=1.7)
+    bench.run(REST_FIRST)
+    assert bench.gyro.status.track is None
+    assert bench.gyro.learned is None
+    bench.run(20.0, stirring)
+    assert bench.gyro.status.track == pytest.approx(1.7, rel=0.02)
+
+
+def test_how_well_it_knows_the_track_is_a_share_of_that() -> None:
+    even, uneven = Bench(skid=1.7), Bench(skid=1.7)
+    for bench in (even, uneven):
+        bench.run(REST_FIRST)
+        for n in range(12):
+            bench.run(5.0, 0.8, skid=None if bench is even else 1.5 if n % 2 else 1.9)
+    one, other = even.gyro.learned, uneven.gyro.learned
+    assert one is not None
+    assert other is not None
+    assert one.deviation == LEAST
+    assert other.share == pytest.approx(1.7, rel=0.05)
+    assert other.deviation == pytest.approx(0.2 / 1.7, rel=0.3)
+
+
+# uncertainty
+
+
+@pytest.mark.slow
+def test_its_variance_is_that_of_its_errors() -> None:
+    """Heading errors divided by their claimed deviations are about normal."""
+    squares = []
+    for seed in range(60):
+        bench = Bench(noise=0.02, bias=0.01, first=10_000 * seed)
+        bench.run(2.0)
+        bench.run(0.5, 0.5)
+        bench.run(2.0)
+        bench.told = bench.variance = 0.0
+        bench.run(10.0, still=False)
+        squares.append(bench.told**2 / bench.variance)
+    assert 0.5 < sum(squares) / 60 < 2.0
+
+
+def test_every_state_has_its_words() -> None:
+    assert set(WORDS) == set(GyroDoes.__args__)  # type: ignore[attr-defined]

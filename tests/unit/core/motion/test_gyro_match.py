@@ -1,0 +1,140 @@
+"""Tests that compare gyro and wheels: turn ratio, delay and contradiction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acsard.core.motion.gyro_match import FINE, ROUGH, Match
+
+DT = 0.01
+QUANTUM = math.tau / 3200 * 0.05 / 0.30
+"""Turn of the robot for one encoder count on both wheels of one side, rad."""
+
+Rate = Callable[[float], float]
+
+
+def stirring(t: float) -> float:
+    """Return a turn rate of the wheels that varies on several time scales, rad/s."""
+    return math.sin(1.3 * t) + 0.6 * math.sin(3.1 * t + 1.0)
+
+
+def matched(seconds: float, ratio: float = 0.6, delay: float = 0.0, rate: Rate = stirring) -> Match:
+    match, said = Match(), 0.0
+    turned = 0.0
+    for n in range(round(seconds / DT)):
+        turned += rate(n * DT) * DT
+        wheels = round(turned / QUANTUM) * QUANTUM - said
+        said += wheels
+        match.add(wheels, ratio * rate(n * DT - delay) * DT, DT, slips=False)
+    return match
+
+
+def test_at_first_the_robot_turns_by_and_large_as_its_wheels_say() -> None:
+    assert (Match().ratio, Match().deviation) == (1.0, ROUGH)
+    assert Match().delay() is None
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.4, 1.5), st.floats(-0.04, 0.1))
+def test_the_ratio_is_found_whatever_the_delay(ratio: float, delay: float) -> None:
+    match = matched(20.0, ratio, delay)
+    assert match.ratio == pytest.approx(ratio, rel=0.03)
+    assert match.deviation == FINE
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.4, 1.5), st.floats(-0.05, 0.05))
+def test_the_delay_is_found_to_a_few_milliseconds(ratio: float, delay: float) -> None:
+    found = matched(20.0, ratio, delay).delay()
+    assert found is not None
+    assert found == pytest.approx(delay, abs=0.006)
+
+
+def test_a_delay_that_was_told_is_not_told_again() -> None:
+    match = matched(20.0, delay=0.05)
+    assert match.delay() is not None
+    assert match.delay() is None
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.8], ids=["standing", "turning steadily"])
+def test_without_a_change_of_rate_there_is_no_delay_to_be_found(rate: float) -> None:
+    assert matched(30.0, rate=lambda t: rate).delay() is None
+
+
+def test_a_robot_that_stands_teaches_nothing() -> None:
+    match = matched(30.0, rate=lambda t: 0.0)
+    assert (match.ratio, match.blocks) == (1.0, 0.0)
+
+
+def slipping(match: Match, seconds: float, wheels: float, gyro: float) -> list[bool]:
+    found = []
+    for _ in range(round(seconds / DT)):
+        match.add(wheels * DT, gyro * DT, DT, slips=True)
+        found.append(match.contradiction(1e-6))
+    return found
+
+
+def test_wheels_that_turn_a_robot_that_does_not_are_contradicted_within_their_time() -> None:
+    match = matched(20.0)
+    slipping(match, 1.0, 1.0, 0.6)
+    found = slipping(match, 0.25, 1.0, 0.0)
+    assert found[-1]
+    assert not found[0]
+
+
+@pytest.mark.parametrize("share", [0.85, 1.0, 1.15])
+def test_a_floor_that_is_a_little_other_is_no_contradiction(share: float) -> None:
+    match = matched(20.0)
+    assert not any(slipping(match, 2.0, 1.0, 0.6 * share))
+
+
+def test_driving_with_a_gyro_that_is_late_contradicts_nothing() -> None:
+    match, found = Match(), 0
+    for n in range(3000):
+        t = n * DT
+        match.add(stirring(t) * DT, 0.6 * stirring(t - 0.05) * DT, DT, slips=False)
+        found += match.contradiction(1e-6)
+    assert found == 0
+
+
+def test_what_slips_is_not_learned() -> None:
+    match = matched(20.0)
+    before = match.ratio
+    slipping(match, 20.0, 1.0, 0.0)
+    assert match.ratio == before
+
+
+def test_a_delay_that_is_put_right_is_in_the_ratio_at_once() -> None:
+    match = matched(20.0, delay=0.02)
+    before = match.ratio
+    assert match.delay() is not None
+    assert match.ratio != before
+
+
+def test_the_spread_is_what_the_ratio_differs_by_from_one_turn_to_the_next() -> None:
+    mixed = Match()
+    for n in range(12000):
+        ratio = 0.66 if int(n * DT / 5.0) % 2 else 0.54
+        mixed.add(0.8 * DT, ratio * 0.8 * DT, DT, slips=False)
+    assert matched(60.0, rate=lambda t: 0.8).spread < 0.01
+    assert mixed.spread == pytest.approx(0.06, rel=0.3)
+
+
+def test_a_gyro_that_comes_by_fits_and_starts_makes_the_ratio_no_less_certain() -> None:
+    """The samples are up to 50 ms late, with a delay that changes each time."""
+    match, told, true = Match(), 0.0, 0.0
+    for n in range(6000):
+        late = (n * 7 % 11) * 0.005
+        true = 0.6 * (math.cos(0.0) - math.cos(0.4 * (n * DT - late))) / 0.4
+        match.add(math.sin(0.4 * n * DT) * DT, true - told, DT, slips=False)
+        told = true
+    assert match.spread < 0.05 * match.ratio
+
+
+def test_before_anything_is_learned_the_spread_is_the_deviation_of_what_is_assumed() -> None:
+    assert Match().spread == ROUGH

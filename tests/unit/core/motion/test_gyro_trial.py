@@ -1,0 +1,123 @@
+"""The first turn proves that a gyro works, or shows which fault it has."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.motion.gyro_trial import Trial, Verdict
+
+DT = 0.01
+
+
+def turned(trial: Trial, rate: float, share: float, seconds: float, late_s: float = 0.0) -> Verdict:
+    """Return the verdict after a turn.
+
+    The wheels report `rate` in rad/s, and the gyro reports `share` of that.
+    """
+    for line in range(round(seconds / DT)):
+        told = rate * share if line * DT >= late_s else 0.0
+        trial.add(rate * DT, told * DT, DT)
+    return trial.verdict
+
+
+@pytest.mark.parametrize("rate", [0.3, -2.0])
+@pytest.mark.parametrize(
+    ("share", "verdict"),
+    [
+        (1.0, "good"), (0.5, "good"), (-1.0, "reversed"), (-0.6, "reversed"),
+        (57.3, "in degrees"), (35.8, "in degrees"), (-57.3, "in degrees"),
+        (0.0, "dead"), (0.05, "dead"), (5.0, "not believed"), (-9.0, "not believed"),
+    ],
+)  # fmt: skip
+def test_it_is_named_by_what_it_says_of_the_wheels_turn(
+    rate: float, share: float, verdict: Verdict
+) -> None:
+    assert turned(Trial(), rate, share, 2.0) == verdict
+
+
+@given(st.floats(0.15, 4.0), st.floats(0.3, 2.4), st.floats(0.0, 0.25))
+def test_a_good_one_is_never_refuted_however_late_it_tells(
+    rate: float, share: float, late_s: float
+) -> None:
+    trial, seen = Trial(), set()
+    for line in range(round(8.0 / rate / DT)):
+        told = rate * share if line * DT >= late_s else 0.0
+        trial.add(rate * DT, told * DT, DT)
+        seen.add(trial.verdict)
+    assert seen - {"none yet", "dead"} == {"good"}
+
+
+def test_a_tenth_of_a_radian_proves_it() -> None:
+    assert turned(Trial(), 1.0, 0.6, 0.11) == "good"
+    assert turned(Trial(), 1.0, 0.6, 0.09) == "none yet"
+
+
+def test_one_that_was_refuted_may_still_prove_itself() -> None:
+    trial = Trial()
+    assert turned(trial, 1.0, 0.0, 1.0) == "dead"
+    assert trial.open
+    assert turned(trial, -1.0, 0.6, 1.0) == "good"
+    assert not trial.open
+
+
+def test_slow_turns_and_the_end_of_the_one_before_tell_nothing() -> None:
+    trial = Trial()
+    assert turned(trial, 0.04, -1.0, 60.0) == "none yet"
+    for _ in range(10):
+        turned(trial, 1.0, 0.0, 0.09)
+        turned(trial, -1.0, 0.0, 0.09)
+    assert trial.verdict == "none yet"
+
+
+@pytest.mark.parametrize(
+    ("rate", "share", "verdict"),
+    [(0.08, 0.6, "good"), (0.08, -0.6, "reversed"), (0.12, 0.0, "dead"), (0.08, 0.0, "none yet")],
+)
+def test_slow_lines_add_up_to_a_verdict(rate: float, share: float, verdict: Verdict) -> None:
+    """A silent gyro at 0.08 rad/s gives no verdict.
+
+    Wheels with unequal tyres report that rate on a straight, where a good gyro reports nothing.
+    """
+    assert turned(Trial(), rate, share, 6.0) == verdict
+
+
+@pytest.mark.parametrize("seconds", [6.0, 60.0])
+def test_a_turn_behind_a_straight_of_unequal_tyres_proves_a_gyro(seconds: float) -> None:
+    trial = Trial()
+    turned(trial, 0.08, 0.0, seconds)
+    told = [turned(trial, 0.5, 1.0, DT) for _ in range(1000)]
+    assert set(told) == {"none yet", "good"}
+
+
+def test_lines_that_are_slow_in_turns_are_no_fast_ones() -> None:
+    trial = Trial()
+    for _ in range(1000):
+        trial.add(0.04 * DT, 0.0, DT)
+        trial.add(0.08 * DT, 0.0, DT)
+    assert trial.verdict == "none yet"
+
+
+def test_a_straight_between_two_turns_begins_anew() -> None:
+    trial = Trial()
+    for _ in range(20):
+        turned(trial, 1.0, 0.0, 0.09)
+        turned(trial, 0.01, 0.0, 1.1)
+    assert trial.verdict == "none yet"
+
+
+def test_to_stand_is_no_turning() -> None:
+    """A late gyro has reported nothing yet, no matter how long the robot stood before."""
+    trial = Trial()
+    turned(trial, 1.0, 0.0, 0.05)
+    turned(trial, 0.0, 0.0, 0.4)
+    assert turned(trial, 4.0, 0.0, 0.1) == "none yet"
+
+
+def test_without_a_bias_degrees_are_seen_and_nothing_else() -> None:
+    for share, verdict in ((57.3, "in degrees"), (-1.0, "none yet"), (1.0, "none yet")):
+        trial = Trial()
+        for _ in range(100):
+            trial.add(DT, share * DT, DT, certain=False)
+        assert trial.verdict == verdict

@@ -1,0 +1,216 @@
+"""Tests of odometry with a gyro.
+
+Each part of the wheels' turn is compared and corrected exactly once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from msgspec import Struct
+
+from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gyro import Gyro, Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.uncertainty import GYRO_SCALE
+from acsard.core.values import NS_PER_S, GyroSample, Instant, Twist, WheelSpeeds
+
+KINEMATICS = Kinematics(DriveConfig())
+
+PERIOD_NS = NS_PER_S // 100
+
+
+class Listening:
+    """A gyro that records the wheels' turn and never corrects it."""
+
+    owes = False
+
+    def __init__(self) -> None:
+        self.turned = 0.0
+        self.seconds: list[float] = []
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None:
+        self.turned += wheels
+        self.seconds.append(dt)
+        return None
+
+    def taken_back(self, turn: float) -> float:
+        raise AssertionError("it owes nothing")
+
+
+class One(Struct):
+    """One feedback line: its speeds, its missing time, and whether it is skipped."""
+
+    left: float
+    right: float
+    bridged: float = 0.0
+    gap: float = 0.0
+    counts: bool = False
+    skipped: bool = False
+
+
+def said(one: One, dt: float = 0.01) -> Feedback:
+    speeds = WheelSpeeds(one.right, one.left, one.left, one.right)
+    if one.gap:
+        return Feedback(Instant(0, 0), speeds, 0.0, one.gap)
+    if one.counts:
+        turned = (one.right * dt, one.left * dt, one.left * dt, one.right * dt)
+        return Feedback(Instant(0, 0), speeds, dt, turned=turned)
+    return Feedback(Instant(0, 0), speeds, dt + one.bridged, bridged=one.bridged)
+
+
+WHEEL = st.floats(1.0, 20.0)  # never at rest, because counts are held back there
+
+LINES = st.lists(
+    st.builds(
+        One,
+        WHEEL,
+        WHEEL,
+        st.sampled_from([0.0, 0.0, 0.3]),
+        st.sampled_from([0.0, 0.0, 0.0, 0.5]),
+        st.booleans(),
+        st.booleans(),
+    ),
+    max_size=30,
+)
+
+
+@given(LINES)
+def test_what_a_gyro_hears_of_the_wheels_is_what_the_heading_turned(lines: list[One]) -> None:
+    robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
+    for one in lines:
+        if one.skipped:
+            robot.skip(said(one))
+        else:
+            robot.fold(said(one), listening)
+    off = math.remainder(robot.pose.yaw - listening.turned, math.tau)
+    assert off == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_line_passed_over_leaves_the_gap_before_it_to_the_next() -> None:
+    robot = Odometry(OdometryConfig(), KINEMATICS)
+    robot.fold(said(One(10.0, 10.0)))
+    robot.skip(said(One(10.0, 10.0, gap=0.5)))
+    robot.fold(said(One(10.0, 10.0)))
+    assert robot.missed() == {"gaps": 1, "gap_ms": 500}
+
+
+def test_over_a_way_that_is_unknown_there_is_nothing_to_compare() -> None:
+    robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
+    for one in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
+        robot.fold(said(one), listening)
+    assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
+
+
+class Turning:
+    """A robot with an accurate gyro that rests for a second and then moves as commanded."""
+
+    def __init__(self, scale: float = 1.0) -> None:
+        """The gyro reports `scale` times the true turn."""
+        self.scale = scale
+        self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
+        self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
+        self.does: list[str] = []
+        self.run(1.0, Twist())
+
+    def run(self, seconds: float, twist: Twist, dead: bool = False, gap: bool = False) -> None:
+        """Move at this twist; `dead` stops the front left wheel.
+
+        With `gap` no line arrives until the robot has reached the twist, and the last line reports
+        it.
+        """
+        told = KINEMATICS.wheel_speeds(twist)
+        speeds = told if not dead else WheelSpeeds(told.front_right, 0.0, *told.as_tuple()[2:])
+        lines = round(100 * seconds)
+        before, dt, bridged = self.rate, 0.01, 0.0
+        if gap:
+            dt, bridged = seconds, seconds - 0.01
+        for number in range(1, lines + 1):
+            self.now_ns += PERIOD_NS
+            share = min(1.0, number / (lines - 1)) if gap else 1.0
+            rate = before + (twist.angular - before) * share
+            self.true += (rate + self.rate) / 200 if gap else rate / 100
+            self.rate = rate
+            self.gyro.hear((GyroSample(self.now_ns, None, rate * self.scale),))
+            if gap and number < lines:
+                continue
+            at = Instant(self.now_ns, self.now_ns)
+            line = Feedback(at, speeds, dt, bridged=bridged)
+            self.yaw_variance = self.robot.fold(line, self.gyro, told).covariance.yawyaw
+            self.does += [event.kind for event in self.gyro.events]
+
+    @property
+    def off(self) -> float:
+        """Return the error of the heading, rad."""
+        return math.remainder(self.robot.pose.yaw - self.true, math.tau)
+
+
+def test_a_gap_that_is_bridged_is_no_slip() -> None:
+    bench = Turning()
+    bench.run(2.0, Twist(0.0, 1.0))
+    for rate in (-1.0, 1.0, 0.0, 1.0, -1.0):
+        bench.run(0.3, Twist(0.0, rate), gap=True)
+        bench.run(1.0, Twist(0.0, rate))
+    assert "disagrees" not in bench.does
+    assert bench.off == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_gap_that_is_bridged_while_the_gyro_is_on_trial_costs_nothing() -> None:
+    bench = Turning()
+    bench.run(0.1, Twist(0.0, 0.5), gap=True)
+    bench.run(0.1, Twist(0.0, 0.9), gap=True)
+    bench.run(2.0, Twist(0.0, 0.9))
+    assert bench.gyro.status.does == "used"
+    assert bench.off == pytest.approx(0.0, abs=0.006)  # the robot treats its samples as steps
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.0, 0.4), st.floats(0.4, 2.0), st.floats(0.2, 1.0))
+def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
+    before: float, turning: float, ahead: float
+) -> None:
+    # If the dead wheel should hardly turn, it does not contradict the others.
+    assume(abs(KINEMATICS.wheel_speeds(Twist(ahead, turning)).front_left) > 1.0)
+    bench = Turning()
+    bench.run(1.0, Twist(ahead, 0.0))
+    bench.run(before, Twist(ahead, turning))
+    bench.run(0.3, Twist(ahead, turning), dead=True)
+    assert bench.robot.doubt.left_out
+    bench.run(2.0, Twist(ahead, turning), dead=True)
+    assert bench.gyro.status.does == "used"
+    assert bench.off == pytest.approx(0.0, abs=2e-3)
+
+
+def proved(scale: float) -> Turning:
+    """Return a robot whose gyro is proven and supplies the turns from now on."""
+    bench = Turning(scale)
+    bench.run(0.5, Twist(0.0, 1.0))
+    bench.run(1.0, Twist())
+    assert bench.gyro.status.does == "used"
+    return bench
+
+
+@pytest.mark.parametrize("turns", [2, 20])
+def test_the_error_of_a_gyros_scale_grows_with_the_turns(turns: int) -> None:
+    bench = proved(1 + GYRO_SCALE)
+    off, variance = bench.off, bench.yaw_variance
+    bench.run(turns * math.tau / 2.0, Twist(0.0, 2.0))
+    bench.run(1.0, Twist())
+    off, variance = bench.off - off, bench.yaw_variance - variance
+    assert off == pytest.approx(GYRO_SCALE * turns * math.tau, rel=0.05)
+    assert off**2 / variance == pytest.approx(1.0, rel=0.25)
+
+
+def test_the_error_of_a_gyros_scale_is_turned_back() -> None:
+    bench = proved(1 + GYRO_SCALE)
+    off, variance = bench.off, bench.yaw_variance
+    for rate in (2.0, -2.0):
+        bench.run(10.0, Twist(0.0, rate))
+    bench.run(1.0, Twist())
+    assert bench.off == pytest.approx(off, abs=0.01)
+    assert bench.yaw_variance - variance < (GYRO_SCALE * 20.0) ** 2 / 20

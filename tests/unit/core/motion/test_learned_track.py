@@ -1,0 +1,110 @@
+"""Tests of the effective track in use.
+
+It is the configured one until another is learned, and it stays within bounds.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.motion.learned_track import (
+    BOUNDS,
+    CERTAIN,
+    CONFIGURED,
+    UNCERTAIN,
+    LearnedTrack,
+    Track,
+    tracks,
+)
+from acsard.core.values import GyroStatus, TrackUse
+
+SURE = CERTAIN / 2
+
+
+def told(track: LearnedTrack) -> str | None:
+    return None if track.event is None else track.event.kind
+
+
+def test_until_something_is_learned_the_configured_one_is_used_and_nothing_is_told() -> None:
+    track = LearnedTrack(1.0)
+    track.look(None)
+    track.look(Track(1.6, 2 * CERTAIN))
+    assert (track.used, track.use, track.event) == (CONFIGURED, "uncertain", None)
+
+
+def test_once_it_is_certain_the_learned_one_is_used_and_told_once() -> None:
+    track = LearnedTrack(1.5)
+    track.look(Track(1.2, CERTAIN))
+    assert track.used == Track(1.2, CERTAIN)
+    assert track.event is not None
+    assert (track.event.name, track.event.kind, track.event.level) == ("track", "used", "info")
+    assert track.event.text.endswith(": learned 1.800 ± 0.180 in use, configured 1.500")
+    track.look(Track(1.25, SURE))
+    assert track.used == Track(1.25, SURE)
+    assert told(track) is None
+
+
+def test_what_is_in_use_is_given_up_only_when_it_is_doubted_by_far() -> None:
+    track = LearnedTrack(1.0)
+    for deviation, use in (
+        (SURE, "used"), (1.5 * CERTAIN, "used"), (1.01 * UNCERTAIN, "uncertain"),
+        (1.5 * CERTAIN, "uncertain"), (CERTAIN, "used"),
+    ):  # fmt: skip
+        track.look(Track(1.6, deviation))
+        assert track.use == use
+        assert (track.used == CONFIGURED) is (use != "used")
+
+
+@pytest.mark.parametrize("share", [0.99 * BOUNDS[0], 1.01 * BOUNDS[1]])
+def test_one_that_is_too_far_from_the_configured_one_is_named_and_not_used(share: float) -> None:
+    track = LearnedTrack(1.0)
+    track.look(Track(share, SURE))
+    assert track.used == CONFIGURED
+    assert track.event is not None
+    assert track.event.level == "warning"
+    assert "(too far off), configured 1.000 in use" in track.event.text
+    track.look(Track(share, SURE))
+    assert told(track) is None
+
+
+@pytest.mark.parametrize(("bound", "inwards"), [(BOUNDS[0], 1.0), (BOUNDS[1], -1.0)])
+def test_at_a_bound_it_is_used_or_not_and_not_in_turns(bound: float, inwards: float) -> None:
+    """A learned track in use stays in use up to the bounds.
+
+    One not in use must come a little further inside first.
+    """
+    within, beyond = (Track(bound * (1.0 + inwards * off), SURE) for off in (0.001, -0.001))
+    track = LearnedTrack(1.0)
+    track.look(Track(1.0, SURE))
+    track.look(Track(bound, SURE))
+    assert track.use == "used"
+    seen = []
+    for _ in range(10):
+        for learned in (beyond, within):
+            track.look(learned)
+            seen.append(told(track))
+    assert seen == ["too far off", *[None] * 19]
+    track.look(Track(bound * (1.0 + inwards * 0.06), SURE))
+    assert told(track) == "used"
+
+
+def test_one_that_is_too_far_off_is_known_until_it_is_doubted_by_far() -> None:
+    track, seen = LearnedTrack(1.0), []
+    for _ in range(10):
+        for deviation in (0.99 * CERTAIN, 1.01 * CERTAIN):
+            track.look(Track(2 * BOUNDS[1], deviation))
+            seen.append(told(track))
+    assert seen == ["too far off", *[None] * 19]
+
+
+@pytest.mark.parametrize(
+    ("use", "says"),
+    [
+        ("shown", "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"),
+        ("uncertain", "learned 1.800 ± 0.090 (uncertain), configured 1.500 in use"),
+        ("used", "learned 1.800 ± 0.090 in use, configured 1.500"),
+    ],
+)
+def test_both_stand_beside_each_other_as_multipliers(use: TrackUse, says: str) -> None:
+    assert tracks(GyroStatus("used", track=1.2, track_deviation=0.05, track_use=use), 1.5) == says
+    assert tracks(GyroStatus("used", track_use=use), 1.5) == ""

@@ -1,0 +1,811 @@
+"""Tests of latches and mode: single sequences, and a model check of every reachable state."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from copy import copy
+from typing import NamedTuple
+
+import pytest
+
+from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle
+from acsard.core.motion.modes import Mode, RefusedError, mode_of
+from acsard.core.values import NS_PER_S, Instant, Latch, Latches
+
+WALL_NS = 1_800_000_000 * NS_PER_S
+AT = "2027-01-15 08:00"
+
+
+def at(seconds: float) -> Instant:
+    ns = int(seconds * NS_PER_S)
+    return Instant(ns, WALL_NS + ns)
+
+
+def ns(seconds: float) -> int:
+    return int(seconds * NS_PER_S)
+
+
+def ready(active: bool = True) -> Lifecycle:
+    life = Lifecycle(active)
+    life.link(up=True)
+    return life
+
+
+def stop(life: Lifecycle, seconds: float, by: str = "ann") -> str:
+    return life.stop(by, ns(seconds), at(seconds))
+
+
+def clear(life: Lifecycle, seconds: float, number: int | None = None) -> str:
+    return life.clear(number, ns(seconds), at(seconds))
+
+
+def activate(life: Lifecycle, seconds: float, number: int | None = None) -> bool:
+    return life.activate(number, ns(seconds), at(seconds))
+
+
+def number(life: Lifecycle) -> int:
+    assert life.latches.in_force is not None
+    return life.latches.in_force.number
+
+
+def mode(life: Lifecycle) -> Mode:
+    """Return the mode; a type checker would merge two asserts on the attribute."""
+    return life.mode
+
+
+# the start
+
+
+def test_the_robot_starts_waiting_for_its_link_or_switched_off() -> None:
+    assert Lifecycle(active=True).mode is Mode.WAITING
+    off = Lifecycle(active=False)
+    assert (off.mode, off.why) == (Mode.INACTIVE, "switched off; call srv/activate")
+    assert off.latches == Latches()
+
+
+def test_activate_reports_whether_the_robot_was_off() -> None:
+    life = ready(active=False)
+    assert activate(life, 1.0)
+    assert mode(life) is Mode.READY
+    assert not activate(life, 2.0)
+
+
+STOP = Latch(7, WALL_NS, "ann", "stopped by ann", kept=True)
+FAULT = Latch(8, WALL_NS, "", "a wheel is dead", kept=True)
+OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
+
+
+@pytest.mark.parametrize(
+    ("latches", "begins", "why"),
+    [
+        (
+            Latches(stop=STOP),
+            Mode.STOPPED,
+            f"was stopped by ann at {AT}:00 UTC, before the restart; call srv/clear",
+        ),
+        (
+            Latches(fault=FAULT),
+            Mode.FAULT,
+            f"a wheel is dead, latched at {AT}:00 UTC, before the restart; call srv/clear",
+        ),
+        (
+            Latches(inactive=OFF),
+            Mode.INACTIVE,
+            f"was switched off by joe at {AT}:00 UTC, before the restart; call srv/activate",
+        ),
+        (
+            Latches(STOP, FAULT, OFF),
+            Mode.FAULT,
+            f"a wheel is dead, latched at {AT}:00 UTC, before the restart; also was stopped by ann "
+            f"at {AT}:00 UTC, before the restart; call srv/clear twice",
+        ),
+        (
+            Latches(stop=Latch(7, WALL_NS, "acsard", "stopped at the start, because", kept=True)),
+            Mode.STOPPED,
+            f"stopped at the start, because (latched at {AT}:00 UTC, before the restart); "
+            "call srv/clear",
+        ),
+    ],
+)
+def test_the_robot_starts_as_its_latches_say(latches: Latches, begins: Mode, why: str) -> None:
+    life = Lifecycle(active=True, latches=latches)
+    life.link(up=True)
+    life.command(fresh=True)
+    assert (life.mode, life.why) == (begins, why)
+    assert life.latches is latches
+
+
+def test_after_restart_marks_every_latch_as_kept_and_changes_nothing_else() -> None:
+    fresh = [Latch(x.number, x.at_ns, x.by, x.why) for x in (STOP, FAULT, OFF)]
+    lowered = {"limits.linear_speed": 0.3}
+    assert Latches(fresh[0], fresh[1], fresh[2], lowered).after_restart() == Latches(
+        STOP, FAULT, OFF, lowered
+    )
+    assert Latches().after_restart() == Latches()
+
+
+# one stop
+
+
+def test_a_stop_latches_until_a_later_clear() -> None:
+    life = ready()
+    assert stop(life, 1.0) == "stopped and latched; srv/clear releases it"
+    assert mode(life) is Mode.STOPPED
+    assert life.why == f"stopped by ann at {AT}:01 UTC; call srv/clear"
+    done = clear(life, 1.5, number(life))
+    assert done == "cleared; each sender must send a zero before it drives"
+    assert (life.mode, life.latches) == (Mode.READY, Latches())
+
+
+def test_a_number_is_the_wall_time_in_ms_and_grows_even_if_that_does_not() -> None:
+    life = ready()
+    stop(life, 1.0)
+    assert number(life) == (WALL_NS + NS_PER_S) // 1_000_000
+    first = number(life)
+    life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
+    assert number(life) == first + 1
+    early = ready()
+    early.stop("ann", ns(1.0), Instant(ns(1.0), 0))
+    assert number(early) == 1  # 0 means that there is no stop
+    kept = Lifecycle(active=True, latches=Latches(stop=STOP, inactive=OFF))
+    kept.stop("ann", ns(1.0), Instant(ns(1.0), 0))
+    assert number(kept) == OFF.number + 1
+
+
+def test_a_number_is_not_used_again_after_its_latch_is_released() -> None:
+    life = ready()
+    stop(life, 1.0)
+    first = number(life)
+    clear(life, 1.5, first)
+    life.stop("ann", ns(2.0), Instant(ns(2.0), 0))
+    assert number(life) == first + 1
+
+
+def test_the_same_stop_arriving_twice_has_one_number() -> None:
+    life = ready()
+    life.stop("ann", ns(1.0), at(1.001))
+    life.stop("joe", ns(1.1), at(1.101))
+    latched = life.latches
+    life.stop("ann", ns(1.0), at(1.102))
+    life.stop("joe", ns(1.1), at(1.103))
+    assert life.latches is latched
+    assert latched.stop is not None
+    assert latched.stop.by == "joe"
+
+
+def test_a_stop_after_a_clear_counts_even_if_it_arrived_before_the_last_stop() -> None:
+    life = ready()
+    stop(life, 1.0)
+    clear(life, 4.0, number(life))
+    life.stop("joe", ns(0.5), at(4.1))
+    assert mode(life) is Mode.STOPPED
+
+
+# clear
+
+
+@pytest.mark.parametrize("asked_s", [0.5, 1.0])
+@pytest.mark.parametrize("named", [True, False])
+def test_a_clear_that_arrived_before_the_stop_is_refused(asked_s: float, named: bool) -> None:
+    life = ready()
+    stop(life, 1.0)
+    with pytest.raises(RefusedError):
+        life.clear(number(life) if named else None, ns(asked_s), at(9.0))
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_of_the_same_step_as_the_stop_is_refused() -> None:
+    life = ready()
+    life.stop("ann", ns(0.9), at(1.0))
+    with pytest.raises(RefusedError, match="at the same time or later"):
+        life.clear(number(life), ns(1.001), at(1.0))
+
+
+@pytest.mark.parametrize("since_s", [0.1, 0.4, 1.999])
+def test_a_clear_without_a_number_is_refused_right_after_a_stop(since_s: float) -> None:
+    life = ready()
+    stop(life, 1.0)
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 1.0 + since_s)
+    age = {0.1: "0.1", 0.4: "0.4", 1.999: "1.9"}[since_s]
+    assert str(caught.value) == (
+        f"the robot was stopped by ann {age} s ago: look at the robot, then call srv/clear again "
+        "2 s after that, or with the latch of the state that you have looked at"
+    )
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_without_a_number_releases_a_stop_of_two_seconds_ago() -> None:
+    life = ready()
+    stop(life, 1.0)
+    clear(life, 1.0 + LOOK_FIRST_S)
+    assert mode(life) is Mode.READY
+
+
+def test_the_two_seconds_count_from_the_last_stop() -> None:
+    life = ready()
+    stop(life, 1.0)
+    stop(life, 4.0, "joe")
+    with pytest.raises(RefusedError, match=r"stopped by joe 0\.5 s ago"):
+        clear(life, 4.5)
+
+
+def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
+    life = ready()
+    stop(life, 1.0)
+    with pytest.raises(RefusedError, match=r"stopped by ann 0\.5 s ago"):
+        life.clear(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
+
+
+@pytest.mark.parametrize("wall_s", [-3e8, 0.0, 1.5, 3e8])
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
+    kept: bool, wall_s: float
+) -> None:
+    """The clock of a booting computer may be years away from the time of the stop."""
+    stop_at_start = Latch(7, WALL_NS, "ann", "stopped by ann", kept)
+    life = Lifecycle(active=True, latches=Latches(stop=stop_at_start))
+    for step_s in (10.0, 10.01, 11.5):
+        life.begin(Instant(ns(step_s), WALL_NS + ns(wall_s)))
+    for asked_s, age in ((9.9, "0.1"), (11.5, "1.5")):
+        with pytest.raises(RefusedError) as caught:
+            life.clear(None, ns(asked_s), Instant(ns(11.5), WALL_NS + ns(wall_s)))
+        assert str(caught.value) == (
+            f"the daemon started {age} s ago and the robot is still stopped by ann: look at the "
+            "robot, then call srv/clear again 2 s after that, or with the latch of the state that "
+            "you have looked at"
+        )
+    assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
+
+
+def test_a_stop_that_comes_with_the_first_step_is_none_from_the_start() -> None:
+    life = ready()
+    life.begin(at(10.0))
+    stop(life, 10.0)
+    with pytest.raises(RefusedError, match=r"stopped by ann 1\.0 s ago"):
+        clear(life, 11.0)
+
+
+def test_a_named_clear_releases_a_stop_from_the_start_at_once() -> None:
+    life = Lifecycle(active=True, latches=Latches(stop=STOP))
+    life.begin(at(10.0))
+    assert life.clear(STOP.number, ns(9.9), at(10.0))
+
+
+def test_a_clear_that_names_an_earlier_stop_is_refused_by_name_of_the_later_one() -> None:
+    life = ready()
+    stop(life, 1.0)
+    seen = number(life)
+    stop(life, 10.0, "joe")
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 20.0, seen)
+    assert str(caught.value) == (
+        f"latch {seen} is not in force; the robot is still stopped by joe: look at it, then call "
+        "srv/clear again"
+    )
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_that_has_seen_no_latch_is_refused() -> None:
+    life = ready()
+    stop(life, 1.0)
+    with pytest.raises(RefusedError, match="still stopped by ann"):
+        clear(life, 20.0, 0)
+
+
+def test_a_clear_of_nothing_changes_nothing() -> None:
+    life = ready()
+    life.command(fresh=True)
+    before = life.latches
+    assert clear(life, 1.0) == clear(life, 2.0, 5) == ""
+    assert mode(life) is Mode.DRIVING
+    assert life.latches is before
+
+
+def test_a_clear_without_a_link_waits_for_it() -> None:
+    life = ready()
+    stop(life, 1.0)
+    life.link(up=False)
+    clear(life, 4.0)
+    assert mode(life) is Mode.WAITING
+
+
+# a fault and a stop
+
+
+def both() -> Lifecycle:
+    life = ready()
+    stop(life, 1.0)
+    assert life.fault("a wheel is dead", at(2.0))
+    return life
+
+
+def test_the_first_fault_stays() -> None:
+    life = ready()
+    assert life.fault("first", at(1.0))
+    assert not life.fault("second", at(2.0))
+    assert mode(life) is Mode.FAULT
+    assert life.why == f"first, latched at {AT}:01 UTC; call srv/clear"
+
+
+def test_a_stop_is_cleared_two_seconds_after_its_fault() -> None:
+    life = both()
+    clear(life, 5.0)
+    clear(life, 5.0 + LOOK_FIRST_S)
+    assert mode(life) is Mode.READY
+
+
+def test_a_fault_keeps_the_stop_and_each_is_cleared_by_itself() -> None:
+    life = both()
+    assert mode(life) is Mode.FAULT
+    assert life.why == (
+        f"a wheel is dead, latched at {AT}:02 UTC; also stopped by ann at {AT}:01 UTC; "
+        "call srv/clear twice"
+    )
+    assert clear(life, 5.0) == "fault cleared; still stopped by ann: call srv/clear again"
+    assert mode(life) is Mode.STOPPED
+    with pytest.raises(RefusedError, match="a latch was cleared less than 2 s ago"):
+        clear(life, 6.9)  # the same clear request, delivered twice by the network
+    assert clear(life, 7.1) == "cleared; each sender must send a zero before it drives"
+    assert mode(life) is Mode.READY
+
+
+def test_a_stop_keeps_the_fault() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(1.0))
+    said = stop(life, 2.0)
+    assert said == "stopped and latched; srv/clear releases the fault first, then the stop"
+    assert mode(life) is Mode.FAULT
+    clear(life, 5.0)
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_named_clear_of_a_fault_does_not_release_a_stop_that_came_meanwhile() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(1.0))
+    seen = number(life)
+    stop(life, 2.0)
+    life.clear(seen, ns(2.1), at(2.1))
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_named_for_a_stop_is_refused_when_a_fault_has_come() -> None:
+    life = ready()
+    stop(life, 1.0)
+    seen = number(life)
+    life.fault("a wheel is dead", at(2.0))
+    with pytest.raises(RefusedError, match=r"still in fault \(a wheel is dead\)"):
+        clear(life, 9.0, seen)
+    assert life.latches.stop is not None
+
+
+def test_a_second_clear_of_the_same_fault_does_not_release_the_stop_under_it() -> None:
+    life = both()
+    fault = number(life)
+    clear(life, 5.0, fault)
+    with pytest.raises(RefusedError) as caught:
+        clear(life, 5.1, fault)
+    assert str(caught.value) == (
+        f"latch {fault} is not in force; the robot is still stopped by ann: look at it, then call "
+        "srv/clear again"
+    )
+    assert mode(life) is Mode.STOPPED
+
+
+def test_a_clear_that_arrived_before_the_fault_does_not_release_it() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(3.0))
+    with pytest.raises(RefusedError, match="call it again"):
+        life.clear(None, ns(2.0), at(3.1))
+    life.clear(None, ns(4.0), at(4.0))
+    assert mode(life) is Mode.READY
+
+
+def test_a_fault_that_goes_on_does_not_put_its_clear_off() -> None:
+    life = ready()
+    life.fault("a wheel is dead", at(3.0))
+    assert not life.fault("a wheel is dead", at(5.0))
+    life.clear(None, ns(4.0), at(5.0))
+    assert mode(life) is Mode.READY
+
+
+# switched off
+
+
+def test_a_robot_that_was_off_is_off_after_stop_and_clear() -> None:
+    life = ready()
+    life.deactivate("joe", at(1.0))
+    stop(life, 2.0)
+    clear(life, 9.0)
+    assert mode(life) is Mode.INACTIVE
+    assert life.why == f"switched off by joe at {AT}:01 UTC; call srv/activate"
+
+
+def off(seconds: float = 1.0, by: str = "joe") -> Lifecycle:
+    life = ready()
+    life.deactivate(by, at(seconds))
+    return life
+
+
+def test_each_deactivate_has_a_new_number_and_the_last_is_the_one_that_is_reported() -> None:
+    life = off()
+    first = number(life)
+    life.deactivate("ann", at(2.0))
+    assert number(life) > first
+    assert life.why == f"switched off by ann at {AT}:02 UTC; call srv/activate"
+
+
+@pytest.mark.parametrize("since_s", [0.1, 0.4, 1.999])
+def test_an_activate_without_a_number_is_refused_right_after_a_deactivate(since_s: float) -> None:
+    life = off()
+    age = {0.1: "0.1", 0.4: "0.4", 1.999: "1.9"}[since_s]
+    with pytest.raises(RefusedError) as caught:
+        activate(life, 1.0 + since_s)
+    assert str(caught.value) == (
+        f"the robot was switched off by joe {age} s ago: look at the robot, then call srv/activate "
+        "again 2 s after that, or with the latch of the state that you have looked at"
+    )
+    assert mode(life) is Mode.INACTIVE
+    assert activate(life, 1.0 + LOOK_FIRST_S)
+    assert (mode(life), life.latches) == (Mode.READY, Latches())
+
+
+def test_the_two_seconds_of_a_plain_activate_count_from_the_first_step() -> None:
+    life = Lifecycle(active=True, latches=Latches(inactive=OFF))
+    life.begin(Instant(ns(10.0), 0))
+    with pytest.raises(RefusedError, match=r"the daemon started 1\.5 s ago and the robot is still"):
+        activate(life, 11.5)
+    assert activate(life, 12.0)
+
+
+def test_an_activate_with_the_number_switches_the_robot_on_at_once() -> None:
+    life = off()
+    assert activate(life, 1.1, number(life))
+    assert mode(life) is Mode.READY
+
+
+@pytest.mark.parametrize("by", ["the number before", "0"])
+def test_an_activate_that_names_another_latch_is_refused(by: str) -> None:
+    life = off()
+    seen = number(life) if by != "0" else 0
+    life.deactivate("ann", at(5.0))
+    with pytest.raises(RefusedError) as caught:
+        activate(life, 20.0, seen)
+    assert str(caught.value) == (
+        f"latch {seen} is not in force; the robot is still switched off by ann: look at it, then "
+        "call srv/activate again"
+    )
+    assert mode(life) is Mode.INACTIVE
+
+
+@pytest.mark.parametrize("asked_s", [0.5, 1.0])
+@pytest.mark.parametrize("named", [True, False])
+def test_an_activate_that_arrived_before_the_deactivate_is_refused(
+    asked_s: float, named: bool
+) -> None:
+    life = off()
+    with pytest.raises(RefusedError):
+        life.activate(number(life) if named else None, ns(asked_s), at(9.0))
+    assert mode(life) is Mode.INACTIVE
+
+
+def test_an_activate_of_the_same_step_as_the_deactivate_is_refused() -> None:
+    life = off()
+    with pytest.raises(RefusedError, match="at the same time or later"):
+        life.activate(number(life), ns(1.001), at(1.0))
+
+
+def test_an_activate_of_an_active_robot_changes_nothing_whatever_it_names() -> None:
+    life = ready()
+    before = life.latches
+    assert not activate(life, 1.0)
+    assert not activate(life, 1.0, 7)
+    assert life.latches is before
+
+
+def test_a_robot_that_starts_switched_off_has_the_number_0() -> None:
+    life = ready(active=False)
+    with pytest.raises(RefusedError, match="latch 7 is not in force; the robot is still switched"):
+        activate(life, 1.0, 7)
+    assert activate(life, 1.0, 0)
+
+
+def test_the_latch_in_force_is_the_fault_then_the_stop_then_the_switch() -> None:
+    assert Latches(STOP, FAULT, OFF).in_force is FAULT
+    assert Latches(STOP, None, OFF).in_force is STOP
+    assert Latches(None, None, OFF).in_force is OFF
+    assert Latches().in_force is None
+
+
+def test_a_robot_that_starts_switched_off_can_be_switched_off_by_a_client_too() -> None:
+    life = ready(active=False)
+    life.deactivate("joe", at(1.0))
+    assert life.latches.inactive is not None
+    assert activate(life, 9.0)
+    assert (life.mode, life.latches) == (Mode.READY, Latches())
+
+
+# shutdown
+
+
+def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start() -> None:
+    life = ready()
+    life.leave()
+    assert stop(life, 1.0) == "stopped and latched; the daemon is going down"
+    assert life.fault("a wheel is dead", at(2.0))
+    assert mode(life) is Mode.LEAVING
+    assert life.latches.stop is not None
+    assert life.latches.fault is not None
+    with pytest.raises(RefusedError, match="going down"):
+        clear(life, 9.0, number(life))
+
+
+def test_the_limits_are_kept_beside_the_latches() -> None:
+    life = both()
+    stopped = life.latches
+    life.lower({})
+    assert life.latches is stopped
+    life.lower({"limits.linear_speed": 0.3})
+    assert life.latches.lowered == {"limits.linear_speed": 0.3}
+    assert (life.latches.stop, life.latches.fault) == (stopped.stop, stopped.fault)
+
+
+# the model check
+
+
+class State(NamedTuple):
+    """All facts that decide the mode."""
+
+    leaving: bool
+    fault: bool
+    stopped: bool
+    inactive: bool
+    linked: bool
+    commanded: bool
+    dormant: bool
+
+
+Do = Callable[[Lifecycle, float], object]
+
+FACTS: dict[str, Do] = {
+    "link up": lambda life, _: life.link(up=True),
+    "link lost": lambda life, _: life.link(up=False),
+    "command": lambda life, _: life.command(fresh=True),
+    "no command": lambda life, _: life.command(fresh=False),
+    "fault": lambda life, now: life.fault("a wheel is dead", at(now)),
+    "leave": lambda life, _: life.leave(),
+}
+
+REQUESTS: dict[str, Do] = {
+    "stop": stop,
+    "the last stop again": lambda life, now: life.stop("ann", life._stop_asked_ns, at(now)),
+    "clear by number": lambda life, now: clear(
+        life, now, life.latches.next.number if life.latches.next else 0
+    ),
+    "clear without a number": clear,
+    "clear by the number before": lambda life, now: clear(
+        life, now, life.latches.next.number - 1 if life.latches.next else 0
+    ),
+    "clear by a later number": lambda life, now: clear(
+        life, now, life.latches.next.number + 1 if life.latches.next else 9
+    ),
+    "clear from before": lambda life, now: life.clear(
+        life.latches.next.number if life.latches.next else 0, 0, at(now)
+    ),
+    "activate by number": lambda life, now: activate(
+        life, now, life.latches.inactive.number if life.latches.inactive else 0
+    ),
+    "activate without a number": activate,
+    "activate by the number before": lambda life, now: activate(
+        life, now, life.latches.inactive.number - 1 if life.latches.inactive else 9
+    ),
+    "activate from before": lambda life, now: life.activate(
+        life.latches.inactive.number if life.latches.inactive else 9, 0, at(now)
+    ),
+    "deactivate": lambda life, now: life.deactivate("joe", at(now)),
+}
+
+TRIGGERS = FACTS | REQUESTS
+PAUSES = (0.5, LOOK_FIRST_S + 1.0)
+"""Seconds before a trigger: one while a plain clear is still refused, and one after that."""
+
+
+def state_of(life: Lifecycle) -> State:
+    latches = life.latches
+    return State(
+        life._leaving,
+        latches.fault is not None,
+        latches.stop is not None,
+        latches.inactive is not None,
+        life._linked,
+        life._commanded,
+        life._dormant,
+    )
+
+
+class Edge(NamedTuple):
+    before: State
+    trigger: str
+    pause_s: float
+    after: State
+    refused: bool
+    latches: tuple[Latches, Latches]
+    mode: Mode
+
+
+def explore() -> list[Edge]:
+    """Return every edge of the machine: each trigger, soon and late, in each reachable state."""
+    edges: list[Edge] = []
+    seen: set[tuple[State, bool, bool]] = set()
+    queue = deque((Lifecycle(active), 10.0) for active in (True, False))
+    while queue:
+        life, now = queue.popleft()
+        # A latch older than two seconds is a separate state, because a plain clear is accepted
+        # there.
+        stopped = now - life._stopped_ns / NS_PER_S < LOOK_FIRST_S
+        switched_off = now - life._off_ns / NS_PER_S < LOOK_FIRST_S
+        if (state_of(life), stopped, switched_off) in seen:
+            continue
+        seen.add((state_of(life), stopped, switched_off))
+        for name, do in TRIGGERS.items():
+            for pause_s in PAUSES:
+                after, then, refused = copy(life), now + pause_s, False
+                try:
+                    do(after, then)
+                except RefusedError:
+                    refused = True
+                latches = (life.latches, after.latches)
+                edges.append(
+                    Edge(state_of(life), name, pause_s, state_of(after), refused, latches,
+                         after.mode)
+                )  # fmt: skip
+                queue.append((after, then))
+    return edges
+
+
+EDGES = explore()
+
+
+def test_every_combination_of_facts_and_latches_is_reached() -> None:
+    states = {edge.before for edge in EDGES}
+    assert len(states) == 2**7
+    assert len({(e.before, e.trigger, e.pause_s) for e in EDGES}) == 2**7 * len(TRIGGERS) * 2
+
+
+def test_the_mode_always_follows_from_the_list() -> None:
+    for edge in EDGES:
+        *held, inactive, linked, commanded, dormant = edge.after
+        leaving, fault, stopped = held
+        assert edge.mode is mode_of(
+            leaving=leaving, fault=fault, stopped=stopped, inactive=inactive or dormant,
+            linked=linked, commanded=commanded,
+        )  # fmt: skip
+
+
+def test_nothing_but_clear_releases_a_stop_or_a_fault() -> None:
+    releases = {
+        edge.trigger
+        for edge in EDGES
+        if edge.before.stopped > edge.after.stopped or edge.before.fault > edge.after.fault
+    }
+    assert releases == {"clear by number", "clear without a number"}
+
+
+def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
+    cleared = 0
+    for edge in EDGES:
+        if not edge.trigger.startswith("clear") or edge.refused:
+            continue
+        before, after = edge.before, edge.after
+        assert before._replace(fault=False, stopped=False) == after._replace(
+            fault=False, stopped=False
+        )
+        if before.fault or before.stopped:
+            assert (after.fault, after.stopped) == (False, before.fault and before.stopped)
+            cleared += 1
+        else:
+            assert before == after
+    assert cleared > 100
+
+
+def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down() -> None:
+    for edge in EDGES:
+        if edge.trigger == "clear by number":
+            assert edge.refused == edge.before.leaving
+
+
+def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -> None:
+    wrong = {"clear by the number before", "clear by a later number", "clear from before"}
+    for edge in EDGES:
+        if edge.trigger in wrong:
+            assert edge.before == edge.after
+            held = edge.before.fault or edge.before.stopped or edge.before.leaving
+            assert edge.refused == held
+
+
+def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
+    for edge in EDGES:
+        if edge.trigger == "clear without a number" and edge.pause_s > LOOK_FIRST_S:
+            assert edge.refused == edge.before.leaving
+
+
+def test_nothing_but_activate_ends_inactive() -> None:
+    ends = {
+        edge.trigger
+        for edge in EDGES
+        if edge.before.inactive > edge.after.inactive or edge.before.dormant > edge.after.dormant
+    }
+    assert ends == {"activate by number", "activate without a number"}
+
+
+def test_an_activate_that_names_another_latch_or_came_before_it_switches_nothing_on() -> None:
+    for edge in EDGES:
+        if edge.trigger in ("activate by the number before", "activate from before"):
+            assert edge.before == edge.after
+
+
+def test_a_plain_activate_is_refused_until_two_seconds_after_a_deactivate() -> None:
+    soon = {
+        edge.refused
+        for edge in EDGES
+        if edge.trigger == "activate without a number" and edge.mode is Mode.INACTIVE
+    }
+    assert soon == {True}
+
+
+def test_a_refused_request_changes_nothing() -> None:
+    for edge in EDGES:
+        if edge.refused:
+            assert edge.latches[0] is edge.latches[1]
+            assert edge.before == edge.after
+
+
+def test_a_fact_and_a_stop_are_never_refused() -> None:
+    refused = {edge.trigger for edge in EDGES if edge.refused}
+    assert not refused & {*FACTS, "stop", "the last stop again"}
+
+
+def test_a_stop_always_ends_in_a_latched_stop() -> None:
+    for edge in EDGES:
+        if edge.trigger == "stop":
+            assert edge.after.stopped
+            (before, after) = (latches.stop for latches in edge.latches)
+            assert after is not None
+            assert before is None or after.number > before.number
+
+
+def test_the_shutdown_is_for_good() -> None:
+    assert all(edge.after.leaving for edge in EDGES if edge.before.leaving)
+
+
+def test_driving_begins_only_without_any_latch() -> None:
+    driving = [edge for edge in EDGES if edge.mode is Mode.DRIVING]
+    assert driving
+    for edge in driving:
+        assert edge.after == State(False, False, False, False, True, True, False)
+
+
+def test_latches_stay_the_same_object_until_one_changes() -> None:
+    for edge in EDGES:
+        before, after = edge.latches
+        assert (before is after) == (before == after)
+
+
+def test_switching_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> None:
+    for edge in EDGES:
+        if edge.trigger == "deactivate":
+            before = edge.before
+            assert edge.refused == (before.leaving or before.fault or before.stopped)
+            assert edge.refused or edge.after.inactive
+
+
+def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_daemon_leaves() -> (
+    None
+):
+    for edge in EDGES:
+        late = edge.trigger == "activate without a number" and edge.pause_s > LOOK_FIRST_S
+        if edge.trigger == "activate by number" or late:
+            before = edge.before
+            assert edge.refused == (before.leaving or before.fault or before.stopped)
+            assert edge.refused or not (edge.after.inactive or edge.after.dormant)

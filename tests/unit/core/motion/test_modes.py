@@ -1,0 +1,71 @@
+"""Tests of the ordered list of modes, and of the requests that a mode refuses."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import get_args
+
+import pytest
+
+from acsard.core.motion.modes import REFUSALS, Mode, RefusedError, mode_of, require_allowed
+from acsard.core.values import Verb
+
+FACTS = ("leaving", "fault", "stopped", "inactive", "linked", "commanded")
+
+ALL = [dict(zip(FACTS, values, strict=True)) for values in product((False, True), repeat=6)]
+
+DRAWN = """
+    1.....  leaving
+    01....  fault
+    001...  stopped
+    0001..  inactive
+    00000.  waiting
+    000011  driving
+    000010  ready
+"""
+"""The whole list of modes drawn by hand. A dot matches both values, in the order of `FACTS`."""
+
+
+def drawn(facts: dict[str, bool]) -> list[str]:
+    bits = "".join(str(int(facts[name])) for name in FACTS)
+    rows = [line.split() for line in DRAWN.strip().splitlines()]
+    return [
+        mode
+        for pattern, mode in rows
+        if all(cell in (".", bit) for cell, bit in zip(pattern, bits, strict=True))
+    ]
+
+
+@pytest.mark.parametrize("facts", ALL, ids=str)
+def test_the_mode_is_the_one_row_of_the_drawing_that_matches(facts: dict[str, bool]) -> None:
+    assert drawn(facts) == [mode_of(**facts)]
+
+
+def test_every_mode_can_be_reached() -> None:
+    assert {mode_of(**facts) for facts in ALL} == set(Mode)
+
+
+def test_only_a_linked_commanded_robot_without_any_latch_drives() -> None:
+    drives = [facts for facts in ALL if mode_of(**facts) is Mode.DRIVING]
+    assert drives == [dict.fromkeys(FACTS[:4], False) | dict.fromkeys(FACTS[4:], True)]
+
+
+@pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
+def test_a_refused_request_says_why(mode: Mode, verb: Verb) -> None:
+    with pytest.raises(RefusedError) as caught:
+        require_allowed(mode, verb)
+    assert str(caught.value) == REFUSALS[mode, verb]
+
+
+@pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
+def test_a_refusal_names_clear_only_where_clear_helps(mode: Mode, verb: Verb) -> None:
+    assert ("call srv/clear first" in REFUSALS[mode, verb]) == (mode is not Mode.LEAVING)
+
+
+def test_every_other_request_is_allowed() -> None:
+    cells = set(product(Mode, get_args(Verb)))
+    for mode, verb in cells - set(REFUSALS):
+        require_allowed(mode, verb)
+    held = (Mode.FAULT, Mode.STOPPED, Mode.LEAVING)
+    refused = {(mode, verb) for mode in held for verb in ("activate", "deactivate")}
+    assert set(REFUSALS) == refused | {(Mode.LEAVING, "clear")}

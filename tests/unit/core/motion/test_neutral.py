@@ -1,0 +1,447 @@
+"""Tests of the neutral-first rule: a zero arms a sender, and nothing else does."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import CommandsConfig, Source
+from acsard.core.motion.arbiter import Arbiter
+from acsard.core.motion.neutral import Sender
+from acsard.core.values import REST, Command, Twist, Wait
+from tests.unit.core.motion.commanders import GO, HIGH, HOUR_NS, LEFT, LOW, MS, RIGHT, Bench
+
+# one sender
+
+
+def sender() -> Sender:
+    return Sender(250 * MS, 1000 * MS, neutral_first=True)
+
+
+def sent(twist: Twist, at_ms: float, shared: bool = False) -> Command:
+    return Command("high", twist, int(at_ms * MS), shared=shared)
+
+
+def test_a_zero_of_its_own_arms_at_once_right_behind_a_speed() -> None:
+    one = sender()
+    one.take(sent(GO, 0), 0)
+    assert not one.armed(0)
+    one.take(sent(REST, 0), 0)
+    assert one.armed(0)
+    one.take(sent(GO, 1), 0)
+    assert one.armed(MS)
+
+
+@pytest.mark.parametrize("after_ms", [1, 250, 999.999])
+def test_a_shared_zero_that_a_speed_follows_too_soon_arms_nobody(after_ms: float) -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    one.take(sent(GO, after_ms, shared=True), 0)
+    assert not one.armed(int(after_ms * MS))
+    assert not one.armed(HOUR_NS)
+
+
+def test_a_shared_zero_that_no_speed_follows_for_the_pause_arms() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    assert not one.armed(1000 * MS - 1)
+    assert one.armed(1000 * MS)
+    one.take(sent(GO, 1001, shared=True), 0)
+    assert one.armed(1001 * MS)
+
+
+def test_more_zeros_do_not_begin_the_pause_again() -> None:
+    one = sender()
+    for at_ms in range(0, 1000, 100):
+        one.take(sent(REST, at_ms, shared=True), 0)
+    one.take(sent(GO, 1000, shared=True), 0)
+    assert one.armed(1000 * MS)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_zero_that_arrived_before_it_was_required_arms_nobody(shared: bool) -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared), since_ns=1)
+    assert not one.armed(HOUR_NS)
+    assert (one.arrived_ns, one.noticed_ns) == (0, 0)
+    one.take(sent(REST, 0, shared), since_ns=0)
+    assert one.armed(1000 * MS)
+
+
+@pytest.mark.parametrize("pause_ms", [1, 2000, 3_600_000])
+def test_a_pause_of_any_length_arms_nobody(pause_ms: int) -> None:
+    for shared in (False, True):
+        one = sender()
+        for number in range(10):
+            one.take(sent(GO, number * pause_ms, shared), 0)
+            assert not one.armed(number * pause_ms * MS)
+
+
+def test_a_message_that_may_have_been_a_speed_ends_the_wait_of_a_shared_zero() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    one.notice(500 * MS)
+    assert not one.armed(HOUR_NS)
+    one.take(sent(REST, 600, shared=True), 0)
+    one.notice(1600 * MS)  # the zero has armed the sender by then
+    assert one.armed(1600 * MS)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_an_unproven_zero_arms_unless_its_clock_proves_wrong(shared: bool) -> None:
+    for wrong in (False, True):
+        one = sender()
+        one.take(sent(REST, 0, shared), 0, "unproven")
+        if wrong:
+            one.unlearn()
+        if not shared:
+            one.take(sent(GO, 500, shared), 0, "unproven")
+        one.take(sent(GO, 1100, shared), 0)
+        assert one.armed(1100 * MS) is not wrong
+        one.unlearn()
+        assert one.armed(1100 * MS) is not wrong, "a proven zero is never forgotten"
+
+
+def test_a_shared_zero_that_was_proven_arms_after_the_pause_whatever_proves_wrong_later() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    one.take(sent(REST, 900, shared=True), 0, "unproven")
+    one.take(sent(REST, 1100, shared=True), 0, "unproven")
+    one.unlearn()
+    assert one.armed(1100 * MS)
+
+
+def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wrong() -> None:
+    for refused in (False, True):
+        one = sender()
+        one.take(sent(REST, 0, shared=True), 0)
+        if refused:
+            one.refuse(sent(GO, 1100, shared=True), "stale")
+        else:
+            one.take(sent(GO, 1100, shared=True), 0, "unproven")
+        one.unlearn()
+        assert one.armed(1100 * MS)
+
+
+def test_a_shared_zero_that_armed_unproven_is_forgotten_when_its_clock_proves_wrong() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0, "unproven")
+    assert one.armed(1100 * MS)
+    one.unlearn()
+    assert not one.armed(HOUR_NS)
+
+
+def test_a_sender_keeps_the_twist_the_name_and_the_kind_of_its_last_command() -> None:
+    one = sender()
+    for ros, shared in ((True, False), (False, True)):
+        command = Command("high", GO, 5 * MS, sender="joe", ros=ros, shared=shared)
+        one.take(command, 0)
+        assert (one.twist, one.name, one.ros, one.shared) == (GO, "joe", ros, shared)
+        assert (one.arrived_ns, one.noticed_ns) == (5 * MS, 5 * MS)
+
+
+def test_the_first_zero_after_a_speed_is_remembered_while_the_sender_is_not_silent() -> None:
+    one, zeros = sender(), []
+    for at_ms, twist in ((0, GO), (100, REST), (200, REST), (300, GO), (400, REST), (900, REST)):
+        one.take(sent(twist, at_ms), 0)
+        zeros.append(one.zeros_ns)
+    assert zeros == [None, 100 * MS, 100 * MS, None, 400 * MS, 900 * MS]
+
+
+def test_asking_for_a_zero_again_forgets_zeros_that_wait() -> None:
+    one = sender()
+    one.take(sent(REST, 0, shared=True), 0)
+    one.require_neutral()
+    assert not one.armed(HOUR_NS)
+    one.take(sent(REST, 0), 0)
+    one.require_neutral()
+    one.unlearn()
+    assert not one.armed(HOUR_NS)
+
+
+def test_without_neutral_first_every_sender_is_armed() -> None:
+    one = Sender(250 * MS, 1000 * MS, neutral_first=False)
+    assert one.armed(0)
+    one.require_neutral()
+    assert one.armed(0)
+
+
+def test_a_command_counts_until_its_timeout_unless_its_stamp_is_in_doubt() -> None:
+    one = sender()
+    one.take(sent(GO, 600), 0, "unproven")
+    assert not one.live(600 * MS)
+    assert one.doubtful(850 * MS)
+    assert not one.doubtful(850 * MS + 1)
+    one.take(sent(GO, 610), 0)
+    assert one.live(860 * MS)
+    assert not one.live(860 * MS + 1)
+    assert not one.doubtful(610 * MS)
+    one.refuse(sent(GO, 620), "stale")
+    assert (one.doubtful(620 * MS), one.doubt, one.noticed_ns) == (True, "stale", 620 * MS)
+    assert one.live(860 * MS)
+
+
+# neutral first
+
+
+def test_a_source_that_was_never_neutral_does_not_drive() -> None:
+    bench = Bench(HIGH, armed=False)
+    for _ in range(100):
+        assert bench.send(HIGH) == ""
+        assert bench.driver() == ""
+        bench.wait(50)
+
+
+def test_a_new_arbiter_asks_for_neutral_unasked() -> None:
+    arbiter = Arbiter(CommandsConfig(sources=(HIGH,)))
+    assert arbiter.accept(Command("high", GO, 0)) == ""
+    assert arbiter.choose(0).twist is None
+
+
+def test_a_negative_zero_is_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, Twist(-0.0, -0.0))
+    bench.send(HIGH, GO)
+    assert bench.driver() == "high"
+
+
+@pytest.mark.parametrize("twist", [Twist(0.0, 1e-9), Twist(1e-9, 0.0)])
+def test_hardly_moving_is_not_neutral(twist: Twist) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, twist)
+    bench.send(HIGH, GO)
+    assert bench.driver() == ""
+
+
+def test_silence_from_the_start_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.wait(60_000).send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_a_refused_zero_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.known(HIGH).arbiter.require_neutral(bench.now_ns + 1)
+    bench.wait(300).send(HIGH, Twist(0.0, math.nan))
+    stamp_ns = bench.now_ns + bench.offset_ns - HOUR_NS
+    zero = Command("high", REST, bench.now_ns, stamp_ns)
+    assert bench.arbiter.accept(zero) == "stale"
+    bench.send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_a_refused_command_is_not_heard_so_its_silence_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH, Twist(math.nan, 0.0))
+    bench.wait(1000).send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_a_source_that_was_neutral_stays_so_through_its_own_silence() -> None:
+    bench = Bench(HIGH)
+    bench.send(HIGH)
+    bench.wait(60_000).send(HIGH)
+    assert bench.driver() == "high"
+
+
+def test_the_neutral_of_one_source_is_not_that_of_another() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST)
+    bench.send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_requiring_neutral_forgets_every_command() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(LOW)
+    bench.arbiter.require_neutral()
+    assert bench.driver() == ""
+    assert bench.status(LOW).age_s is None
+
+
+def test_requiring_neutral_forgets_what_was_neutral() -> None:
+    bench = Bench(HIGH)
+    bench.arbiter.require_neutral()
+    bench.send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_requiring_neutral_forgets_what_was_heard() -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.send(HIGH)
+    bench.arbiter.require_neutral()
+    bench.wait(1000).send(HIGH)
+    assert bench.driver() == ""
+
+
+def test_requiring_neutral_forgets_who_came_first() -> None:
+    bench = Bench(LEFT, RIGHT)
+    bench.send(RIGHT)
+    assert bench.driver() == "right"
+    bench.arbiter.require_neutral()
+    bench.wait(10).send(LEFT, REST)
+    assert bench.driver() == "left"
+    bench.wait(10).send(RIGHT, REST)
+    assert bench.driver() == "left"
+
+
+def test_a_waiting_source_holds_its_place_with_zero() -> None:
+    bench = Bench(HIGH, LOW, armed=False)
+    bench.send(LOW, REST)
+    bench.send(LOW, GO)
+    assert bench.driver() == "low"
+    bench.send(HIGH, GO)
+    choice = bench.choice()
+    assert (choice.source, choice.twist, choice.arrived_ns) == ("high", None, None)
+    assert choice.wait == Wait("neutral", "high", 1.0)
+
+
+def test_without_neutral_first_the_first_command_drives() -> None:
+    bench = Bench(HIGH, neutral_first=False, armed=False)
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+    bench.arbiter.require_neutral()
+    assert bench.driver() == ""
+    bench.send(HIGH)
+    assert bench.driver() == "high"
+
+
+def test_a_zero_that_did_not_count_yet_never_does_once_its_delay_proved_wrong() -> None:
+    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench.arbiter.require_neutral(bench.now_ns + 1)
+    bench.wait(50).stamped(HIGH)
+    bench.wait(300_000)  # long enough that its clock counts as new
+    for age in range(3000, -1, -50):
+        bench.wait(10).stamped(HIGH, age, twist=REST if age == 3000 else GO)
+    for _ in range(20):
+        bench.wait(50).stamped(HIGH)
+    assert bench.choice().wait.what == "neutral"
+
+
+# events that are not a silence
+
+
+def test_what_a_network_held_back_and_then_lets_in_arms_nobody() -> None:
+    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench.wait(50).arbiter.require_neutral(bench.now_ns)
+    assert bench.stamped(HIGH) == ""
+    bench.wait(400)
+    answers = [bench.stamped(HIGH, late_ms=late) for late in (350, 300, 250, 200, 100, 0)]
+    assert answers == ["stale", "stale", "", "", "", ""]
+    assert bench.driver() == ""
+
+
+def test_what_pours_in_soon_after_a_clear_arms_nobody_however_late_each_came() -> None:
+    bench = Bench(HIGH, armed=False).known(HIGH)
+    bench.wait(600).arbiter.require_neutral(bench.now_ns)
+    assert [bench.wait(5).stamped(HIGH, late_ms=late) for late in (500, 400, 100)] == [
+        "stale",
+        "stale",
+        "",
+    ]
+    assert bench.driver() == ""
+    assert bench.wait(200).stamped(HIGH) == ""
+    assert bench.driver() == ""
+
+
+@pytest.mark.parametrize("source", [Source("stranger", 1), HIGH])
+def test_what_cannot_be_read_is_nothing_of_one_who_was_never_heard(source: Source) -> None:
+    bench = Bench(HIGH, armed=False)
+    bench.unreadable(source, "a")
+    bench.wait(1000).send(HIGH, GO, "a")
+    assert bench.driver() == ""
+    assert bench.status(HIGH).waits_for == Wait("neutral", "high", 1.0)
+
+
+def test_a_refused_command_is_no_sign_of_one_who_may_drive() -> None:
+    bench = Bench(HIGH, LOW)
+    bench.send(LOW)
+    assert bench.send(HIGH, Twist(math.nan, 0.0), "a") == "not_finite"
+    bench.unreadable(HIGH, "a")
+    assert bench.driver() == "low"
+
+
+def test_a_twist_that_is_zero_because_opposites_cancel_is_not_neutral() -> None:
+    bench = Bench(HIGH, armed=False)
+    cancelled = Command("high", REST, bench.now_ns, cancelled=True)
+    assert bench.arbiter.accept(cancelled) == ""
+    assert bench.driver() == ""
+    bench.send(HIGH, GO)
+    assert bench.driver() == ""
+
+
+def test_a_twist_that_cancels_out_is_followed_of_one_who_may_drive() -> None:
+    bench = Bench(HIGH)
+    assert bench.arbiter.accept(Command("high", REST, bench.now_ns, cancelled=True)) == ""
+    assert bench.choice().twist == REST
+
+
+# the rule as a model
+
+TWISTS = {"a": Twist(0.1, 0.0), "b": Twist(0.2, 0.0), "shared": Twist(0.3, 0.0)}
+"""One twist per sender; the followed twist shows which sender drives."""
+
+KINDS = ("go", "zero", "cancelled", "nan", "unreadable", "stamped", "neutral")
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([0, 20, 100, 249, 251, 300, 600, 999, 1000, 4000]),
+            st.sampled_from([*TWISTS]),
+            st.sampled_from(KINDS),
+            st.sampled_from([0, 60, 200, 249, 260, 400]),
+        ),
+        max_size=30,
+    )
+)
+def test_no_twist_is_followed_of_a_sender_that_no_zero_has_armed(
+    story: list[tuple[int, str, str, int]],
+) -> None:
+    bench = Bench(HIGH, armed=False)
+    for name in TWISTS:
+        bench.known(HIGH, name, name)
+    bench.arbiter.require_neutral(bench.now_ns + 1)
+    bench.wait(1)
+    armed: set[str] = set()
+    waiting_ns: int | None = None
+    for wait_ms, name, kind, late_ms in story:
+        now_ns, refused, shared = bench.wait(wait_ms).now_ns, "", name == "shared"
+        if waiting_ns is not None and now_ns - waiting_ns >= 1000 * MS:
+            armed.add("shared")
+        if kind == "neutral":
+            bench.arbiter.require_neutral(now_ns)
+            armed, waiting_ns = set(), None
+            assert bench.driver() == ""
+            continue
+        if kind == "unreadable":
+            bench.unreadable(HIGH, name)
+            refused = kind
+        elif kind == "stamped":
+            refused = bench.stamped(HIGH, late_ms, name, TWISTS[name], name)
+        else:
+            twists = {"go": TWISTS[name], "nan": Twist(math.nan, 0.0)}
+            refused = bench.arbiter.accept(
+                Command(
+                    "high",
+                    twists.get(kind, REST),
+                    now_ns,
+                    sender=name,
+                    cancelled=kind == "cancelled",
+                    shared=shared,
+                )
+            )
+        zero = kind == "zero" and not refused
+        if zero and not shared:
+            armed.add(name)
+        elif shared:
+            waiting_ns = (now_ns if waiting_ns is None else waiting_ns) if zero else None
+        followed = bench.choice().twist
+        if followed == REST:
+            assert armed
+        for other, twist in TWISTS.items():
+            if followed == twist:
+                assert other in armed

@@ -1,0 +1,803 @@
+"""Tests that integrate wheel speeds into pose, wheel angles and their uncertainty."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gyro import Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.learned_track import Track
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.path import arc
+from acsard.core.motion.uncertainty import MAX_VARIANCE, NOWHERE
+from acsard.core.values import Estimate, Instant, Pose, PoseCovariance, Twist, WheelSpeeds
+from tests.vectors.drive import (
+    PATHS,
+    SEED_STEP,
+    SEED_STEP_ARC,
+    SEED_STEP_POSE,
+    SEED_STEP_TWIST,
+)
+
+AT = Instant(5_000_000_000, 1_800_000_000_000_000_000)
+Three = tuple[float, float, float]
+
+START = PoseCovariance(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
+"""The default covariance of a pose that was just set."""
+
+wheel_speed = st.floats(-40.0, 40.0)
+moves = st.tuples(wheel_speed, wheel_speed, st.floats(0.0, 0.1))
+"""One move as left and right (rad/s) and dt (s)."""
+
+
+def odometry(settings: OdometryConfig | None = None) -> Odometry:
+    return Odometry(settings or OdometryConfig(), Kinematics(DriveConfig()))
+
+
+def feedback(left: float, right: float, dt: float, gap: float = 0.0) -> Feedback:
+    return Feedback(AT, WheelSpeeds(right, left, left, right), dt, gap)
+
+
+def same_pose(got: Pose, expected: Three, tolerance: float = 1e-9) -> bool:
+    """Return whether poses are equal within `tolerance`, ignoring whole turns of yaw."""
+    turn = math.remainder(got.yaw - expected[2], math.tau)
+    return (got.x, got.y, turn) == pytest.approx((*expected[:2], 0.0), abs=tolerance)
+
+
+def matrix(p: PoseCovariance) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    return np.array(
+        [[p.xx, p.xy, p.xyaw], [p.xy, p.yy, p.yyaw], [p.xyaw, p.yyaw, p.yawyaw]], dtype=np.float64
+    )
+
+
+# the path
+
+
+@pytest.mark.parametrize("steps", [1, 2, 10, 314])
+@pytest.mark.parametrize(
+    ("left", "right", "seconds", "pose"), [pytest.param(*path[1:], id=path[0]) for path in PATHS]
+)
+def test_a_path_ends_where_geometry_says_in_however_many_steps(
+    left: float, right: float, seconds: float, pose: Three, steps: int
+) -> None:
+    robot = odometry()
+    for _ in range(steps):
+        robot.fold(feedback(left, right, seconds / steps))
+    assert same_pose(robot.pose, pose)
+
+
+def test_a_step_gives_the_twist_of_the_seed_equations() -> None:
+    estimate = odometry().fold(feedback(*SEED_STEP))
+    assert (estimate.twist.linear, estimate.twist.angular) == pytest.approx(SEED_STEP_TWIST)
+
+
+def test_a_step_ends_on_the_arc() -> None:
+    estimate = odometry().fold(feedback(*SEED_STEP))
+    assert same_pose(estimate.pose, SEED_STEP_ARC, tolerance=1e-10)
+
+
+def test_the_seed_equations_end_less_than_a_millimetre_beside_the_arc() -> None:
+    assert not same_pose(odometry().fold(feedback(*SEED_STEP)).pose, SEED_STEP_POSE, 1e-4)
+    assert same_pose(odometry().fold(feedback(*SEED_STEP)).pose, SEED_STEP_POSE, 1e-3)
+
+
+@settings(max_examples=25)
+@given(distance=st.floats(-2.0, 2.0), turn=st.floats(-7.0, 7.0), yaw=st.floats(-3.0, 3.0))
+def test_the_arc_is_the_limit_of_many_small_steps_of_the_seed_equations(
+    distance: float, turn: float, yaw: float
+) -> None:
+    x, y, heading, steps = 0.0, 0.0, yaw, 4000
+    for _ in range(steps):
+        x += distance / steps * math.cos(heading)
+        y += distance / steps * math.sin(heading)
+        heading += turn / steps
+    # the error of small steps is of second order per step
+    error = abs(distance * turn) / steps + 1e-9
+    assert same_pose(arc(Pose(0.0, 0.0, yaw), distance, turn), (x, y, heading), error)
+
+
+@given(
+    pose=st.builds(Pose, st.floats(-9, 9), st.floats(-9, 9), st.floats(-3.1, 3.1)),
+    distance=st.floats(-2.0, 2.0),
+    turn=st.floats(-7.0, 7.0),
+)
+def test_an_arc_driven_back_ends_where_it_began(pose: Pose, distance: float, turn: float) -> None:
+    there = arc(pose, distance, turn)
+    assert same_pose(arc(there, -distance, -turn), (pose.x, pose.y, pose.yaw))
+
+
+@given(distance=st.floats(-2.0, 2.0), turn=st.floats(-7.0, 7.0), share=st.floats(0.0, 1.0))
+def test_an_arc_in_two_parts_is_the_same_arc(distance: float, turn: float, share: float) -> None:
+    whole = arc(Pose(), distance, turn)
+    first = arc(Pose(), distance * share, turn * share)
+    second = arc(first, distance * (1 - share), turn * (1 - share))
+    assert same_pose(second, (whole.x, whole.y, whole.yaw))
+
+
+@pytest.mark.parametrize("turn", [0.0, 5e-324, 1e-300, 1e-20, 1e-12, 1e-9, -1e-9])
+def test_an_arc_of_hardly_any_turn_is_a_straight_line(turn: float) -> None:
+    assert same_pose(arc(Pose(), 1.0, turn), (1.0, 0.0, turn))
+
+
+@given(path=st.lists(moves, max_size=30))
+def test_there_and_back_the_same_way_ends_where_it_began(
+    path: list[tuple[float, float, float]],
+) -> None:
+    robot = odometry()
+    for left, right, dt in path:
+        robot.fold(feedback(left, right, dt))
+    for left, right, dt in reversed(path):
+        robot.fold(feedback(-left, -right, dt))
+    assert same_pose(robot.pose, (0.0, 0.0, 0.0))
+    assert robot.fold(feedback(0.0, 0.0, 0.0)).positions == pytest.approx((0.0,) * 4, abs=1e-9)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 10, 1000, -1, -10, -1000])
+def test_yaw_is_wrapped_however_many_turns_one_step_makes(turns: int) -> None:
+    # Turning in place at 3 rad/s gives a yaw rate of 1 rad/s.
+    wheel = 3.0 * (1.0 + turns * math.tau)
+    estimate = odometry().fold(feedback(-wheel, wheel, 1.0))
+    assert estimate.pose.yaw == pytest.approx(1.0, abs=1e-9)
+
+
+@given(turns=st.lists(st.floats(-10.0, 10.0), max_size=50))
+def test_yaw_stays_within_half_a_turn(turns: list[float]) -> None:
+    robot = odometry()
+    for turn in turns:
+        assert abs(robot.fold(feedback(-3.0 * turn, 3.0 * turn, 1.0)).pose.yaw) <= math.pi
+    assert same_pose(robot.pose, (0.0, 0.0, sum(turns)))
+
+
+# the estimate
+
+
+def test_a_sample_has_the_stamp_the_speeds_and_the_twist_of_its_line() -> None:
+    speeds = WheelSpeeds(4.0, 1.0, 3.0, 8.0)
+    estimate = odometry().fold(Feedback(AT, speeds, 0.01))
+    assert (estimate.at, estimate.speeds) == (AT, speeds)
+    assert (estimate.twist.linear, estimate.twist.angular) == pytest.approx((0.2, 2 / 3))
+
+
+def test_each_wheel_turns_by_its_own_speed() -> None:
+    robot = odometry()
+    robot.fold(Feedback(AT, WheelSpeeds(1.0, 2.0, -3.0, 4.0), 0.5))
+    estimate = robot.fold(Feedback(AT, WheelSpeeds(1.0, 0.0, -1.0, 0.0), 0.25))
+    assert estimate.positions == (0.75, 1.0, -1.75, 2.0)
+
+
+def test_wheel_angles_are_continuous_past_a_turn() -> None:
+    robot = odometry()
+    estimate = robot.fold(feedback(10.0, 10.0, 100.0))
+    assert estimate.positions == (1000.0,) * 4
+
+
+def test_the_last_twist_and_speeds_can_be_asked_for() -> None:
+    robot = odometry()
+    assert (robot.twist, robot.speeds) == (Twist(), WheelSpeeds())
+    estimate = robot.fold(feedback(3.0, 9.0, 0.01))
+    assert (robot.twist, robot.speeds, robot.pose) == (
+        estimate.twist,
+        estimate.speeds,
+        estimate.pose,
+    )
+
+
+def test_the_first_line_moves_nothing() -> None:
+    estimate = odometry().fold(feedback(10.0, 10.0, 0.0))
+    assert (estimate.pose, estimate.positions) == (Pose(), (0.0,) * 4)
+    assert estimate.covariance == START
+
+
+def test_a_gap_moves_neither_pose_nor_wheels() -> None:
+    robot = odometry()
+    before = robot.fold(feedback(10.0, 10.0, 0.1))
+    after = robot.fold(feedback(10.0, 10.0, 0.0, gap=5.0))
+    assert (after.pose, after.positions) == (before.pose, before.positions)
+    assert after.speeds == before.speeds
+
+
+def test_setting_the_pose_moves_the_robot_and_leaves_the_wheels() -> None:
+    robot = odometry()
+    wheels = robot.fold(feedback(4.5, 7.5, 1.0)).positions
+    robot.set_pose(Pose(1.0, 2.0, math.pi / 2))
+    estimate = robot.fold(feedback(10.0, 10.0, 1.0))
+    assert same_pose(estimate.pose, (1.0, 2.5, math.pi / 2))
+    assert estimate.positions[0] == wheels[0] + 10.0
+
+
+def test_setting_the_pose_wraps_its_yaw() -> None:
+    robot = odometry()
+    robot.set_pose(Pose(1.0, 2.0, 7.0))
+    assert robot.pose == Pose(1.0, 2.0, math.remainder(7.0, math.tau))
+    assert robot.pose.yaw == pytest.approx(7.0 - 2 * math.pi)
+
+
+def test_setting_the_pose_makes_it_as_certain_as_at_the_start() -> None:
+    robot = odometry()
+    assert robot.fold(feedback(4.5, 7.5, 10.0)).covariance != START
+    robot.set_pose(Pose(5.0, 5.0, 1.0))
+    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance == START
+
+
+# the covariance
+
+
+def approx(p: PoseCovariance) -> object:
+    # The equations hold to first order; second order adds some millionths to these variances.
+    return pytest.approx(matrix(p), rel=1e-4, abs=1e-15)
+
+
+def test_at_the_start_the_pose_is_as_certain_as_configured() -> None:
+    robot = odometry(OdometryConfig(pose_covariance_diagonal=(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)))
+    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance == PoseCovariance(1, 0, 0, 2, 0, 6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_straight_metre_adds_the_variance_worked_by_hand(sign: float) -> None:
+    # F shears y by d x yaw: yy += d2 x 1e-6, yyaw = d x 1e-6. The noise is 1e-4 per metre along x
+    # and 1e-4 per metre of yaw.
+    covariance = odometry().fold(feedback(sign * 10.0, sign * 10.0, 2.0)).covariance
+    expected = PoseCovariance(1.01e-4, 0.0, 0.0, 2e-6, sign * 1e-6, 1.01e-4)
+    assert matrix(covariance) == approx(expected)
+
+
+def test_two_straight_metres_shear_y_by_the_yaw_noise_of_the_first() -> None:
+    # After 1 m: yy 2e-6, yyaw 1e-6, yawyaw 1.01e-4. The second metre adds yy += 2 x 1e-6 + 1.01e-4
+    # = 1.03e-4, which makes 1.05e-4, and yyaw += 1.01e-4, yawyaw += 1e-4, xx += 1e-4.
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 2.0))
+    covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
+    expected = PoseCovariance(2.01e-4, 0.0, 0.0, 1.05e-4, 1.02e-4, 2.01e-4)
+    assert matrix(covariance) == approx(expected)
+
+
+def test_facing_left_the_roles_of_x_and_y_change() -> None:
+    # With cos = 0 and sin = 1, the noise along the path affects y, and the shear is -d x yaw on x.
+    robot = odometry()
+    robot.set_pose(Pose(0.0, 0.0, math.pi / 2))
+    covariance = robot.fold(feedback(10.0, 10.0, 2.0)).covariance
+    expected = PoseCovariance(2e-6, 0.0, -1e-6, 1.01e-4, 0.0, 1.01e-4)
+    assert matrix(covariance) == approx(expected)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_turn_in_place_makes_only_the_yaw_less_certain(sign: float) -> None:
+    # 1 rad x 1e-2 per radian, less the play of a 400th of a turn: 2 pi / 400 x 0.05 / 0.3 rad. Each
+    # side rolls 0.15 m. The side noise k = 1e-4 x 0.3 x 0.3 / 2 = 4.5e-6 makes up all of the yaw's
+    # variance per metre. It gives 4.5e-6 x 0.3 / 0.09 = 1.5e-5 of yaw, and 4.5e-6 x 0.3 / 4 =
+    # 3.375e-7 of position, a thousandth of the yaw's.
+    robot = odometry(OdometryConfig(yaw_variance_per_metre=0.0))
+    covariance = robot.fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
+    yaw = 1e-6 + 1e-2 * (1 - math.pi / 1200)
+    assert matrix(covariance) == approx(PoseCovariance(1e-6, 0, 0, 1e-6, 0, yaw))
+    covariance = odometry().fold(feedback(-3.0 * sign, 3.0 * sign, 1.0)).covariance
+    assert covariance.yawyaw == pytest.approx(yaw + 1.5e-5)
+    assert covariance.xx + covariance.yy == pytest.approx(2e-6 + 3.375e-7)
+
+
+def test_an_arc_noises_along_its_chord() -> None:
+    # From yaw -pi/4 through pi/2 the chord, 0.6 x sqrt(2) = 0.848528 m, points along x: F shears y
+    # by 0.848528 x yaw, its square is 0.72. d = 0.3 x pi = 0.942478: along = 0.942478e-4,
+    # yaw = 0.942478e-4 + 1e-2 x (pi / 2 - pi / 1200) = 0.0157760. The right side rolls further by
+    # 0.15 x pi = 0.471239 m: xyaw = 4.5e-6 x 0.471239 / 0.6 = 3.53429e-6.
+    robot = odometry()
+    robot.set_pose(Pose(0.0, 0.0, -math.pi / 4))
+    covariance = robot.fold(feedback(4.5, 7.5, math.pi)).covariance
+    expected = PoseCovariance(0.952478e-4, 0.0, 3.53429e-6, 1.72e-6, 0.848528e-6, 0.0157770)
+    # This holds to first order, see `approx`; heading errors of 0.13 rad change it by 3e-4.
+    assert matrix(covariance) == pytest.approx(matrix(expected), rel=3e-3, abs=1e-9)
+
+
+def test_standing_adds_no_uncertainty() -> None:
+    robot = odometry()
+    for _ in range(100):
+        estimate = robot.fold(feedback(0.0, 0.0, 0.01))
+    assert estimate.covariance == START
+
+
+def gone(gap: float, linear: float, angular: float) -> PoseCovariance:
+    """Return the covariance after a gap that ended at this twist.
+
+    The gap began at 0.3 m/s and 0.5 rad/s.
+    """
+    robot = odometry()
+    robot.fold(feedback(4.5, 7.5, 0.0))
+    left, right = (linear - 0.15 * angular) / 0.05, (linear + 0.15 * angular) / 0.05
+    return robot.fold(feedback(left, right, 0.0, gap=gap)).covariance
+
+
+@pytest.mark.parametrize("gap", [0.15, 0.5])
+def test_a_gap_adds_the_way_between_the_speeds_before_and_after(gap: float) -> None:
+    # The speed goes from 0.3 to 0.1 m/s at a constant 0.5 rad/s. The mean is 0.2 m/s and 0.5 rad/s,
+    # and the bound is twice that.
+    grown = matrix(gone(gap, 0.1, 0.5)) - matrix(START)
+    assert (0.2 * gap) ** 2 <= grown[0, 0] <= 2 * (0.3 * gap) ** 2
+    assert (0.5 * gap) ** 2 <= grown[2, 2] <= 2 * (0.5 * gap) ** 2
+
+
+def test_the_longer_a_gap_the_less_is_known_of_it() -> None:
+    ways = [gone(gap, 0.3, 0.5) for gap in (0.1, 0.2, 0.5, 1.0, 2.0)]
+    for cell in ("xx", "yy", "yawyaw"):
+        grown = [getattr(way, cell) for way in ways]
+        assert grown == sorted(grown)
+        assert len(set(grown)) == 5
+
+
+def test_gaps_all_err_to_the_same_side() -> None:
+    # Ten gaps of 0.1 s at 0.5 m/s miss 0.5 m of the path, not 0.05 m x sqrt(10).
+    robot = odometry()
+    for _ in range(10):
+        robot.fold(feedback(10.0, 10.0, 0.01))
+        estimate = robot.fold(feedback(10.0, 10.0, 0.0, gap=0.1))
+    assert math.sqrt(estimate.covariance.xx) == pytest.approx(0.5, rel=0.01)
+
+
+def test_a_gap_of_a_robot_that_stood_before_and_after_adds_nothing() -> None:
+    robot = odometry()
+    robot.fold(feedback(0.0, 0.0, 0.01))
+    assert robot.fold(feedback(0.0, 0.0, 0.0, gap=2.0)).covariance == START
+
+
+def bridged(seconds: float, pieces: int) -> float:
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 0.01))
+    before = robot.fold(feedback(10.0, 10.0, 0.01)).covariance.xx
+    for _ in range(pieces):
+        dt = seconds / pieces
+        line = Feedback(AT, WheelSpeeds(*(10.0,) * 4), dt, bridged=dt)
+        estimate = robot.fold(line)
+    return estimate.covariance.xx - before - 0.5 * seconds * 1e-4
+
+
+def test_what_was_bridged_is_less_certain_the_longer_it_was() -> None:
+    short, longer = bridged(0.2, 1), bridged(0.4, 1)
+    # With s_a = 0.125 m/s2, (0.125 x 0.2 x 0.2 / 2)^2 = 6.25e-6, and it grows by the fifth power of
+    # time.
+    assert short == pytest.approx(6.25e-6, rel=1e-3)
+    assert longer == pytest.approx(32 * short, rel=1e-3)
+
+
+def test_a_gap_bridged_in_pieces_is_one_gap() -> None:
+    assert bridged(0.3, 30) == pytest.approx(bridged(0.3, 1), rel=1e-3)
+
+
+def test_what_counts_bridge_is_certain() -> None:
+    by_counts, by_lines = odometry(), odometry()
+    turned = (5.0,) * 4
+    line = Feedback(AT, WheelSpeeds(*(10.0,) * 4), 0.5, turned=turned, bridged=0.49)
+    plain = Feedback(AT, WheelSpeeds(*(10.0,) * 4), 0.5, turned=turned)
+    assert by_counts.fold(line).covariance == by_lines.fold(plain).covariance
+
+
+def fold_all(robot: Odometry, path: list[tuple[float, float, float]]) -> list[Estimate]:
+    """Fold each (left, right, dt); a dt above 0.09 s is a gap ten times as long."""
+    return [
+        robot.fold(
+            feedback(left, right, 0.0, gap=dt * 10) if dt > 0.09 else feedback(left, right, dt)
+        )
+        for left, right, dt in path
+    ]
+
+
+@given(path=st.lists(moves, min_size=1, max_size=50))
+def test_the_covariance_is_always_positive(path: list[tuple[float, float, float]]) -> None:
+    for estimate in fold_all(odometry(), path):
+        eigenvalues = np.linalg.eigvalsh(matrix(estimate.covariance))
+        assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
+
+
+@given(path=st.lists(moves, min_size=1, max_size=50))
+def test_moving_never_makes_the_pose_more_certain(
+    path: list[tuple[float, float, float]],
+) -> None:
+    # The path has no gaps, because motion lost on the way out may cancel motion lost on the way
+    # back.
+    yaw, volume = START.yawyaw, float(np.linalg.det(matrix(START)))
+    for estimate in fold_all(odometry(), [(le, r, min(dt, 0.09)) for le, r, dt in path]):
+        grown = float(np.linalg.det(matrix(estimate.covariance)))
+        assert estimate.covariance.yawyaw >= yaw
+        assert grown >= volume * (1 - 1e-6)
+        yaw, volume = estimate.covariance.yawyaw, grown
+
+
+def test_the_further_the_robot_drives_the_less_certain_it_is() -> None:
+    near, far = odometry(), odometry()
+    for step in range(1000):
+        far_sample = far.fold(feedback(9.0, 10.0, 0.01))
+        if step < 500:
+            near_sample = near.fold(feedback(9.0, 10.0, 0.01))
+    near_p, far_p = near_sample.covariance, far_sample.covariance
+    assert far_p.xx > near_p.xx
+    assert far_p.yy > near_p.yy
+    assert far_p.yawyaw > near_p.yawyaw
+
+
+def test_who_drives_on_from_nowhere_knows_nothing() -> None:
+    robot = odometry(OdometryConfig(distance_variance_per_metre=10.0))
+    before = robot.fold(feedback(40.0, 40.0, 1e9)).covariance
+    assert before.xx == 1e9 > before.yawyaw
+    assert robot.fold(feedback(40.0, 40.0, 0.0, gap=5.0)).covariance == NOWHERE
+
+
+def test_who_has_no_heading_knows_the_place_until_it_moves() -> None:
+    start = (1e-6, 1e-6, 1e6, 1e6, 1e6, 1e9)
+    robot = odometry(OdometryConfig(pose_covariance_diagonal=start))
+    assert robot.fold(feedback(0.0, 0.0, 0.01)).covariance.xx == pytest.approx(1e-6)
+    assert robot.fold(feedback(4.0, 4.0, 0.01)).covariance == NOWHERE
+
+
+def test_a_gap_of_years_leaves_a_variance_of_1e9_and_no_more() -> None:
+    robot = odometry()
+    robot.fold(feedback(4.5, 7.5, 0.0))
+    covariance = robot.fold(feedback(4.5, 7.5, 0.0, gap=1e9)).covariance
+    assert (covariance.xx, covariance.yy, covariance.yawyaw) == (1e9, 1e9, 1e9)
+    assert robot.fold(feedback(4.5, 7.5, 1.0, gap=1.0)).covariance == NOWHERE
+
+
+@pytest.mark.variations(2)
+@pytest.mark.parametrize("gap", [0.0, 1e6], ids=["driving", "gaps"])
+def test_the_covariance_stays_finite_for_years(gap: float) -> None:
+    robot = odometry(
+        OdometryConfig(
+            distance_variance_per_metre=10.0,
+            yaw_variance_per_metre=10.0,
+            yaw_variance_per_radian=10.0,
+        )
+    )
+    for _ in range(20_000):
+        estimate = robot.fold(feedback(40.0, 40.0, 0.0 if gap else 100.0, gap))
+        robot.fold(feedback(40.0, 40.0, 1.0))
+    values = matrix(estimate.covariance)
+    assert np.isfinite(values).all()
+    assert np.diag(values).max() >= MAX_VARIANCE
+    assert np.abs(values).max() < 1e15
+
+
+# counts
+
+
+def counted(*turned: float, dt: float = 0.01, gap: float = 0.0, speed: float = 0.0) -> Feedback:
+    """Return a line whose wheels turned by these angles, rad; one number applies to all wheels."""
+    a, b, c, d = turned if len(turned) == 4 else turned * 4
+    return Feedback(AT, WheelSpeeds(*(speed,) * 4), dt, gap, (a, b, c, d))
+
+
+def test_counts_move_the_robot_and_its_wheels_by_what_they_say() -> None:
+    estimate = odometry().fold(counted(2.0, dt=99.0, speed=50.0))
+    assert same_pose(estimate.pose, (0.1, 0.0, 0.0))
+    assert estimate.positions == (2.0, 2.0, 2.0, 2.0)
+    assert estimate.twist.linear == pytest.approx(2.5)
+
+
+@given(path=st.lists(moves, max_size=30))
+def test_counts_that_agree_with_the_speeds_make_the_same_path(
+    path: list[tuple[float, float, float]],
+) -> None:
+    by_speed, by_counts = odometry(), odometry()
+    for left, right, dt in path:
+        by_speed.fold(feedback(left, right, dt))
+        by_counts.fold(counted(right * dt, left * dt, left * dt, right * dt))
+    pose = by_speed.pose
+    assert same_pose(by_counts.pose, (pose.x, pose.y, pose.yaw))
+
+
+def test_counts_bridge_a_gap_without_a_doubt_of_their_own() -> None:
+    by_gap, at_once = odometry(), odometry()
+    by_gap.fold(counted(0.0, speed=10.0))
+    bridged = by_gap.fold(counted(5.0, dt=0.0, gap=0.5))
+    whole = at_once.fold(counted(5.0))
+    assert same_pose(bridged.pose, (whole.pose.x, whole.pose.y, whole.pose.yaw))
+    assert bridged.covariance == whole.covariance
+
+
+def test_a_skipped_line_leaves_its_time_to_the_next() -> None:
+    robot = odometry()
+    robot.skip(feedback(90.0, 90.0, 0.01))
+    estimate = robot.fold(feedback(10.0, 10.0, 0.01))
+    assert estimate.pose.x == pytest.approx(0.01)
+    assert robot.fold(feedback(10.0, 10.0, 0.01)).pose.x == pytest.approx(0.015)
+
+
+def test_more_than_50_ms_of_skipped_lines_are_a_gap() -> None:
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 0.0))
+    for _ in range(6):
+        robot.skip(feedback(90.0, 90.0, 0.01))
+    estimate = robot.fold(feedback(10.0, 10.0, 0.01))
+    assert estimate.pose.x == pytest.approx(0.005)
+    assert estimate.covariance.xx > 0.03**2
+
+
+@pytest.mark.parametrize("after", [counted(1.0), feedback(20.0, 20.0, 0.05)])
+def test_the_counts_of_a_skipped_line_stay_true(after: Feedback) -> None:
+    robot = odometry()
+    for _ in range(10):
+        robot.skip(counted(1.0, speed=99.0))
+    assert robot.fold(after).pose.x == pytest.approx(0.05 * 11)
+    assert robot.fold(counted(0.0)).positions == pytest.approx((11.0,) * 4)
+
+
+def test_what_no_line_reported_is_linear_from_one_report_to_the_next() -> None:
+    robot = odometry()
+    robot.fold(feedback(10.0, 10.0, 0.01))
+    before = robot.pose.x
+    robot.fold(Feedback(AT, WheelSpeeds(20.0, 20.0, 20.0, 20.0), 0.03, bridged=0.02))
+    assert robot.pose.x - before == pytest.approx((15.0 * 0.02 + 20.0 * 0.01) * 0.05)
+
+
+# the turn of a gyro
+
+
+class Says:
+    """A gyro that always reports the same turn."""
+
+    owes = False
+
+    def __init__(self, turn: Turn) -> None:
+        self._turn = turn
+
+    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn:
+        return self._turn
+
+    def taken_back(self, turn: float) -> float:
+        raise AssertionError("it owes nothing")
+
+
+def line(seconds: float, dt: float, speeds: WheelSpeeds, **more: Any) -> Feedback:
+    return Feedback(Instant(int(seconds * 1e9), 0), speeds, dt, **more)
+
+
+@pytest.mark.parametrize("turned", [None, (0.2, 0.1, 0.1, 0.2)])
+def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
+    turned: tuple[float, float, float, float] | None,
+) -> None:
+    speeds, kinematics = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Kinematics(DriveConfig())
+    wheels, gyro = (Odometry(OdometryConfig(), kinematics) for _ in range(2))
+    by_wheels = wheels.fold(line(1.0, 0.01, speeds, turned=turned))
+    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Says(Turn(0.05, 1e-4, 4.0, 1e-3)))
+    assert by_gyro.pose.yaw == pytest.approx(0.05)
+    assert by_gyro.pose.yaw != pytest.approx(by_wheels.pose.yaw, rel=0.1)
+    assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
+    assert by_gyro.positions == by_wheels.positions
+    assert gyro.travelled == pytest.approx(wheels.travelled)
+    more = by_gyro.covariance.yawyaw - OdometryConfig().pose_covariance_diagonal[5]
+    assert more == pytest.approx(1e-4, rel=1e-3)  # the gyro's scale adds 0.2 mrad
+
+
+def test_over_a_gap_the_gyro_knows_the_turn() -> None:
+    odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+    estimate = odometry.fold(
+        line(1.0, 0.0, WheelSpeeds(), gap=0.4), Says(Turn(0.3, 1e-4, 0.7, 1e-3))
+    )
+    assert estimate.pose == Pose(0.0, 0.0, 0.3)
+
+
+# at rest
+
+
+def at_rest(robot: Odometry) -> Estimate:
+    for _ in range(25):
+        estimate = robot.fold(counted(0.0))
+    return estimate
+
+
+def test_a_robot_at_rest_knows_its_twist() -> None:
+    robot = odometry()
+    for _ in range(19):
+        moving = robot.fold(feedback(0.0, 0.0, 0.01)).twist_variances
+    rest = robot.fold(feedback(0.0, 0.0, 0.02)).twist_variances
+    assert moving.lateral == 1e-3
+    assert (rest.linear, rest.lateral, rest.angular) == (1e-8, 1e-8, 1e-8)
+    assert robot.fold(feedback(0.0, 0.1, 0.01)).twist_variances.angular > 1e-8
+
+
+def test_a_count_to_and_fro_at_rest_moves_nothing() -> None:
+    robot = odometry()
+    before = at_rest(robot)
+    for _ in range(1000):
+        robot.fold(counted(0.002))
+        after = robot.fold(counted(-0.002))
+    assert (after.pose, after.covariance, after.positions) == (
+        before.pose,
+        before.covariance,
+        before.positions,
+    )
+
+
+def test_a_count_that_has_come_back_is_not_driven_later() -> None:
+    robot = odometry()
+    at_rest(robot)
+    for turned in (0.002, -0.002):
+        robot.fold(counted(turned))
+    assert robot.fold(counted(0.1, speed=10.0)).positions == pytest.approx((0.1,) * 4)
+
+
+def test_a_wheel_that_creeps_back_count_by_count_is_not_held() -> None:
+    robot = odometry()
+    at_rest(robot)
+    robot.fold(counted(0.002))
+    for _ in range(100):
+        estimate = robot.fold(counted(-0.002))
+    assert estimate.positions == pytest.approx((-0.198,) * 4, abs=0.01)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.21])
+def test_counts_that_only_the_steps_of_the_speeds_show_make_a_twist_doubtful(
+    seconds: float,
+) -> None:
+    robot, steps = odometry(), (31.4, 31.4, 31.4, math.inf)
+    zeros = replace(feedback(0.0, 0.0, 0.01), steps=steps)
+    for _ in range(1 + round(seconds / 0.01)):
+        variances = robot.fold(zeros).twist_variances
+    # One count of 20 within 10 ms, or within the whole rest. Each side is the mean of two wheels.
+    count = 0.05 * 31.4 * 0.01 / max(0.01, seconds)
+    assert variances.linear == pytest.approx(count**2 / 48, rel=0.1)
+
+
+def test_no_count_of_a_rest_is_lost() -> None:
+    robot = odometry()
+    at_rest(robot)
+    for _ in range(10):
+        robot.fold(counted(0.002))
+    estimate = robot.fold(counted(0.002, speed=1.0))
+    assert estimate.positions == pytest.approx((0.022,) * 4)
+    assert estimate.pose.x == pytest.approx(0.022 * 0.05)
+
+
+def test_a_robot_that_creeps_too_slowly_for_two_decimals_moves() -> None:
+    robot = odometry()
+    at_rest(robot)
+    for _ in range(1000):
+        estimate = robot.fold(counted(0.001))
+    assert estimate.pose.x == pytest.approx(1.0 * 0.05, abs=0.05 * 0.04)
+
+
+def test_the_counts_of_the_encoders_are_a_doubt_of_the_pose() -> None:
+    coarse = Odometry(OdometryConfig(), Kinematics(DriveConfig()), 20)
+    covariance = coarse.fold(feedback(0.0, 0.0, 0.01)).covariance
+    # A count is 15.7 mm, and a wheel may be anywhere in it at the start and now. Each side is the
+    # mean of two wheels.
+    count = 0.05 * math.tau / 20
+    assert covariance.xx == pytest.approx(1e-6 + 2 * count**2 / 12 / 4)
+    assert covariance.yawyaw == pytest.approx(1e-6 + 2 * count**2 / 12 / 0.3**2)
+
+
+def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
+    odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
+    at, moving = Instant(0, 0), WheelSpeeds(5.0, 5.0, 5.0, 5.0)
+    odometry.fold(Feedback(at, WheelSpeeds(), 0.0, gap=2.0))
+    assert odometry.missed() == {}
+    odometry.fold(Feedback(at, moving, 0.01))
+    odometry.fold(Feedback(at, moving, 0.0, gap=0.25))
+    odometry.fold(Feedback(at, moving, 0.04, bridged=0.03))
+    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}
+
+
+# whole counts of a single line
+
+
+def snapped(turned: float, dt: float = 0.01, speed: float = 9.99, bridged: float = 0.0) -> Feedback:
+    speeds = WheelSpeeds(speed, speed, speed, speed)
+    return Feedback(AT, speeds, dt, bridged=bridged, counted=(turned,) * 4)
+
+
+def test_what_a_line_counted_is_how_far_it_went_whatever_its_speed_and_time_say() -> None:
+    robot = odometry()
+    for dt in (0.01, 0.003, 0.017):
+        robot.fold(snapped(0.1, dt))
+    assert robot.pose.x == pytest.approx(3 * 0.1 * 0.05)
+
+
+def test_what_was_bridged_comes_on_top_of_what_a_line_counted() -> None:
+    robot = odometry()
+    robot.fold(snapped(0.1, dt=0.02, speed=10.0))
+    robot.fold(snapped(0.1, dt=0.03, speed=10.0, bridged=0.02))
+    assert robot.pose.x == pytest.approx((0.1 + 0.2 + 0.1) * 0.05)
+
+
+def test_a_line_that_was_dropped_is_made_up_for_by_the_next_ones_speed() -> None:
+    robot = odometry()
+    robot.skip(snapped(5.0, speed=99.0))
+    robot.fold(snapped(0.1, speed=10.0))
+    assert robot.pose.x == pytest.approx((0.1 + 0.1) * 0.05)
+
+
+def test_the_twist_of_a_line_is_as_uncertain_as_its_counts_are_coarse() -> None:
+    coarse, fine = (
+        odometry().fold(msgspec.structs.replace(snapped(0.1), steps=(step,) * 4))
+        for step in (31.4, 0.3)
+    )
+    assert coarse.twist_variances.angular > 100 * fine.twist_variances.angular
+
+
+def test_an_encoder_that_is_unknown_makes_no_twist_infinitely_uncertain() -> None:
+    robot, steps = odometry(), (math.inf, 31.4, 31.4, math.inf)
+    some = robot.fold(msgspec.structs.replace(snapped(0.1), steps=steps))
+    assert math.isfinite(some.twist_variances.linear)
+
+
+def test_rounding_made_good_to_one_wheel_is_no_lie_and_no_slip() -> None:
+    robot, speeds = odometry(), WheelSpeeds(10.0, 10.0, 10.0, 10.0)
+    steady, owing = (0.1,) * 4, (2.0, 0.1, 0.1, 0.1)
+    for i in range(100):
+        line = Feedback(AT, speeds, 0.01, counted=owing if i == 50 else steady)
+        robot.fold(line, None, speeds)
+        assert robot.doubt.text == ""
+        assert robot.events == []
+
+
+# a track that was learned
+
+
+@pytest.mark.parametrize("share", [0.7, 1.6])
+def test_by_another_track_only_the_turns_to_come_are_others(share: float) -> None:
+    asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
+    for robot in (asked, plain):
+        robot.fold(feedback(4.0, 9.0, 1.0))
+    pose = asked.pose
+    asked.turn_by(Track(share, 0.02))
+    assert asked.pose == pose == plain.pose
+    came, would = asked.fold(feedback(4.0, 9.0, 0.1)), plain.fold(feedback(4.0, 9.0, 0.1))
+    assert came.twist.linear == would.twist.linear
+    assert came.twist.angular == pytest.approx(would.twist.angular / share)
+    assert came.pose.yaw - pose.yaw == pytest.approx((would.pose.yaw - pose.yaw) / share)
+    assert asked.travelled == plain.travelled
+
+
+def test_a_learned_track_that_is_asked_for_and_not_known_changes_no_bit() -> None:
+    asked, plain = odometry(OdometryConfig(learned_track=True)), odometry()
+    for n in range(200):
+        line = feedback(math.sin(n), 9.0 + math.cos(n), 0.01)
+        came, would = asked.fold(line), plain.fold(line)
+        assert (came.pose, came.twist, came.covariance) == (
+            would.pose,
+            would.twist,
+            would.covariance,
+        )
+
+
+def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
+    """The front left wheel is dead, and the learned track changes before that is found."""
+    asked = OdometryConfig(learned_track=True)
+    liar, honest = (Odometry(asked, Kinematics(DriveConfig()), 3200) for _ in range(2))
+    told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
+    dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
+    for n in range(60):
+        honest.fold(Feedback(AT, told, 0.01), told=told)
+        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), told=told)
+        if n == 51:
+            assert not liar.doubt.left_out
+            for robot in (liar, honest):
+                robot.turn_by(Track(1.6, 0.02))
+    assert liar.doubt.left_out == ("front_left",)
+    assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.5, 1.6])
+def test_by_a_learned_track_it_is_as_uncertain_as_if_that_were_configured(share: float) -> None:
+    """A learned track affects more than its own error.
+
+    Wheel noise, counts and their play depend on it as well.
+    """
+    asked = Odometry(OdometryConfig(learned_track=True), Kinematics(DriveConfig()), 400)
+    asked.turn_by(Track(share, 0.02))
+    asked.use(OdometryConfig(learned_track=True))
+    asked.set_pose(Pose())
+    such = Kinematics(DriveConfig(wheel_separation_multiplier=share))
+    plain = Odometry(OdometryConfig(wheel_separation_multiplier_std=0.02 * share), such, 400)
+    for n in range(300):
+        line = feedback(5.0 + 4.0 * math.sin(n), 9.0 + 4.0 * math.cos(n), 0.01, 0.05 * (n == 150))
+        came, would = asked.fold(line), plain.fold(line)
+        got, expected = came.twist_variances, would.twist_variances
+        assert (got.linear, got.angular) == pytest.approx((expected.linear, expected.angular))
+        assert matrix(came.covariance) == pytest.approx(matrix(would.covariance), rel=1e-6)

@@ -1,0 +1,354 @@
+"""NEES of the published covariance over many robots whose wheels err as declared.
+
+If the true mean is 3, the mean of 1000 runs is within 2.85 to 3.15 nineteen times in twenty. Here
+the seeds are fixed. `-m soak -s` prints all figures.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import DriveConfig, McuConfig, OdometryConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.link.session import McuSession
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.learned_track import CONFIGURED, Track
+from acsard.core.motion.odometry import Odometry
+from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
+from acsard.core.values import Instant, Received, WheelSpeeds
+from tests.unit.core.link.counted import RADIUS, TRACK, angles
+from tests.unit.core.link.counted import lines as counted_lines
+from tests.unit.core.motion.nees import (
+    AT,
+    DEFAULT,
+    PERIOD,
+    REGION,
+    SCENARIOS,
+    WHEELS,
+    Array,
+    Heard,
+    Legs,
+    Model,
+    Scenario,
+    fold,
+    nees,
+    plain,
+    random,
+    reports,
+    study,
+    true_ends,
+)
+
+CALIBRATED = {"radius_std": 0.002, "track_std": 0.01}
+MODELS = {
+    "wheels": WHEELS,
+    "default": DEFAULT,
+    "wheels, parameters": replace(WHEELS, **CALIBRATED),
+    "default, parameters": replace(DEFAULT, **CALIBRATED),
+}
+
+FAR = {"straight", "there and back"}
+"""Scenarios in which the error along the path depends only on the square of the heading error.
+
+No Gaussian has both its variance and its tails. The published variance is right.
+"""
+
+
+def check(values: Array, name: str, low: float = 0.93, spare: float = 0.0) -> None:
+    inside = float((values < REGION).mean())
+    print(f"{name}: NEES {values.mean():.2f}, 95 % region holds {100 * inside:.1f} %")
+    assert 2.85 - spare < values.mean() < 3.15 + spare
+    assert low - spare / 10 <= inside <= 0.97 + spare / 10
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_the_covariance_tells_the_truth(scenario: str, model: str) -> None:
+    drives = 50 if scenario == "random" else 1
+    chosen = MODELS[model]
+    if scenario == "straight" and chosen.radius_std:
+        # An error of 0.2 % in each radius gives 0.57 rad at the end of 60 m. To fourth order that
+        # is NEES 3.2.
+        chosen = replace(chosen, radius_std=0.001)
+    values = study(SCENARIOS[scenario], chosen, runs=4000, drives=drives)
+    check(values, f"{scenario}, {model}", 0.905 if scenario in FAR else 0.93)
+
+
+def lap(_: np.random.Generator) -> Legs:
+    return [(0.8, 0.6, 10.0)]
+
+
+def corner(_: np.random.Generator) -> Legs:
+    return [(0.8, 0.0, 5.0), (0.0, 1.2, 1.3), (0.8, 0.0, 5.0)]
+
+
+@pytest.mark.variations(2)
+@pytest.mark.parametrize("model", ["default", "wheels, parameters"])
+@pytest.mark.parametrize("legs", [lap, corner])
+def test_the_covariance_of_a_short_drive_tells_the_truth(legs: Scenario, model: str) -> None:
+    check(study(legs, MODELS[model], runs=1500), f"{legs.__name__}, {model}", spare=0.05)
+
+
+# bursts of lost lines
+
+
+def bursts(a_minute: float) -> Heard:
+    """Return a function that loses 0.1 to 0.5 s of lines this many times a minute.
+
+    Values between the neighbouring lines replace the lost ones.
+    """
+
+    def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
+        lost, at = np.zeros(len(drive), dtype=bool), 0
+        while (at := at + 10 + int(rng.exponential(6000 / a_minute))) < len(drive) - 60:
+            length = int(rng.uniform(10, 50))
+            lost[at : at + length] = True
+            at += length
+        lines = np.arange(len(drive))
+        heard = drive.copy()
+        for side in heard.T:
+            side[lost] = np.interp(lines[lost], lines[~lost], side[~lost])
+        return [
+            Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD, bridged=PERIOD * bool(gone))
+            for (le, r), gone in zip(heard.tolist(), lost, strict=True)
+        ]
+
+    return heard
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("model", MODELS)
+def test_bridged_bursts_get_the_covariance_they_deserve(model: str) -> None:
+    values = study(random, MODELS[model], runs=1000, drives=100, heard=bursts(2.0))
+    check(values, f"bursts, {model}")
+
+
+@pytest.mark.slow
+def test_fifty_gaps_at_cruise_are_no_seven_sigma() -> None:
+    """The drive has 50 gaps of 150 ms in which the pose does not move."""
+    rng = np.random.default_rng(5)
+    drive = reports([(0.5, 0.02, 60.0)])
+    lines, at = [], 0
+    for start in range(100, 5900, 116):
+        lines += plain(drive[at:start])
+        after = drive[start + 14]
+        speeds = WheelSpeeds(after[1], after[0], after[0], after[1])
+        lines.append(Feedback(AT, speeds, 0.0, gap=0.15))
+        at = start + 15
+    lines += plain(drive[at:])
+    ends = true_ends([drive], 500, DEFAULT, rng)
+    values = nees(*fold(lines, DEFAULT), ends[:, 0])
+    inside = float((values < REGION).mean())
+    print(f"50 gaps: NEES {values.mean():.2f}, 95 % region holds {100 * inside:.1f} %")
+    assert 2.75 < values.mean() < 3.25
+    assert 0.92 < inside < 0.98
+
+
+# encoders
+
+
+def counting(counts: int) -> Heard:
+    """Return a function that makes lines from wheel counters.
+
+    Each counter starts anywhere within a count.
+    """
+
+    def heard(drive: Array, rng: np.random.Generator) -> list[Feedback]:
+        wheels = drive[:, [1, 0, 0, 1]] * PERIOD / math.tau * counts
+        counted = np.floor(np.cumsum(wheels, axis=0) + rng.random(4))
+        turned = np.diff(counted, axis=0, prepend=counted[:1]) * math.tau / counts
+        rows = zip(drive.tolist(), turned.tolist(), strict=True)
+        return [
+            Feedback(AT, WheelSpeeds(r, le, le, r), PERIOD, turned=tuple(row))
+            for (le, r), row in rows
+        ]
+
+    return heard
+
+
+DRIVES = SCENARIOS | {"minute": lambda rng: random(rng, 60.0)}
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("counts", [20, 96, 400, 3200])
+@pytest.mark.parametrize("scenario", ["square", "minute", "circle"])
+def test_coarse_encoders_are_not_the_covariances_trouble(scenario: str, counts: int) -> None:
+    values = study(
+        DRIVES[scenario], DEFAULT, 1000, drives=40, heard=counting(counts), counts=counts
+    )
+    check(values, f"{scenario}, {counts} counts")
+
+
+@pytest.mark.parametrize("counts", [400, 3200])
+def test_a_straight_that_encoders_count_is_no_turn(counts: int) -> None:
+    rng = np.random.default_rng(1)
+    drive = reports([(0.5, 0.0, 20.0)])
+    _, by_counts = fold(counting(counts)(drive, rng), DEFAULT, counts)
+    _, exact = fold(plain(drive), DEFAULT)
+    assert by_counts[2, 2] == pytest.approx(exact[2, 2], rel=0.05)
+
+
+# the parts
+
+
+def uncertainty(model: Model = DEFAULT, **changes: float) -> PoseUncertainty:
+    config = replace(model.config(), **changes)
+    return PoseUncertainty(config, Kinematics(DriveConfig()), 0)
+
+
+def test_what_is_known_by_calibration_makes_the_pose_less_certain_by_its_deviation() -> None:
+    # After 10 m straight with the right wheels' radius off by 0.2 %, 0.01 m of length and 20 mm /
+    # 0.3 m of yaw are wrong.
+    one = PoseUncertainty(
+        OdometryConfig(
+            distance_variance_per_metre=0.0,
+            yaw_variance_per_metre=0.0,
+            yaw_variance_per_radian=0.0,
+            right_wheel_radius_multiplier_std=0.002,
+            pose_covariance_diagonal=(0.0,) * 6,
+        ),
+        Kinematics(DriveConfig()),
+        0,
+    )
+    for _ in range(1000):
+        one.advance(0.01, 0.0, 0.01, 0.0, 0.0)
+    p = one.covariance
+    assert math.sqrt(p.yawyaw) == pytest.approx(0.02 / 0.3)
+    assert math.sqrt(p.yy) == pytest.approx(0.02 / 0.3 * 10.0 / 2, rel=1e-3)
+    # The length is off by 0.01 m. A circle of 1/15 rad differs from its chord by 10 m x yaw2 / 12:
+    # sqrt(3) x 3.7 mm.
+    bent = 10.0 * (0.02 / 0.3) ** 2 / 12
+    assert math.sqrt(p.xx) == pytest.approx(math.hypot(0.01, math.sqrt(3) * bent), rel=1e-2)
+
+
+def test_the_error_of_a_radius_is_driven_back_with_the_way() -> None:
+    one = uncertainty(left_wheel_radius_multiplier_std=0.01)
+    for step in [0.01] * 500 + [-0.01] * 500:
+        one.advance(step, 0.0, step, 0.0, 0.0)
+    two = uncertainty()
+    for step in [0.01] * 500 + [-0.01] * 500:
+        two.advance(step, 0.0, step, 0.0, 0.0)
+    assert one.covariance.yawyaw == pytest.approx(two.covariance.yawyaw)
+
+
+def test_a_heading_error_that_comes_and_goes_shortens_a_straight() -> None:
+    # 60 m at k = 1e-5 gives q = 2 k / L2 of yaw per metre. The area between path and chord has the
+    # variance q2 s4 / 48.
+    drive = reports([(1.0, 0.0, 60.5), (0.0, 0.0, 1.0)])
+    length = float(drive.mean(axis=1).sum()) * 0.05 * PERIOD
+    q = WHEELS.yaw
+    _, p = fold(plain(drive), WHEELS)
+    expected = 1e-6 + WHEELS.distance * length + q**2 * length**4 / 48
+    assert p[0, 0] == pytest.approx(expected, rel=0.03)
+    assert p[0, 0] > 30 * WHEELS.distance * length
+
+
+@pytest.mark.parametrize("turns", [1.0, -1.0])
+def test_turning_to_and_fro_counts_both_ways(turns: float) -> None:
+    one = uncertainty()
+    for turn in [0.01 * turns] * 100 + [-0.01 * turns] * 100:
+        one.advance(0.0, turn, 0.0, 0.0, 0.0)
+    # The robot turns by 2 rad, less the play at the start and twice that at the reversal.
+    assert one.covariance.yawyaw == pytest.approx(2e-2, rel=0.01)
+
+
+def test_trembling_within_a_count_is_no_turning() -> None:
+    one = uncertainty()
+    start = one.covariance.yawyaw
+    for _ in range(10_000):
+        one.advance(0.0, 0.001, 0.0, 0.0, 0.0)
+        one.advance(0.0, -0.001, 0.0, 0.0, 0.0)
+    # The wheels' path of 2 x 1000 m counts as such: 1.5e-5 per radian.
+    assert one.covariance.yawyaw - start < 1e-1 * 20.0 * 1e-2
+
+
+@pytest.mark.parametrize("counts", [16, 96, 400, 4000])
+def test_counts_that_the_lines_show_are_as_uncertain_as_configured_ones(counts: int) -> None:
+    config, kinematics = OdometryConfig(), Kinematics(DriveConfig())
+    told, shown = (PoseUncertainty(config, kinematics, known) for known in (counts, 0))
+    shown.show_count(math.tau / counts)
+    for one in (told, shown):
+        for _ in range(100):
+            one.advance(0.01, 0.02 / counts, 0.01, 0.0, 0.0)
+    ours, theirs = shown.covariance, told.covariance
+    assert (ours.xx, ours.yy, ours.yawyaw) == pytest.approx(
+        (theirs.xx, theirs.yy, theirs.yawyaw), rel=1e-4
+    )
+
+
+def test_what_is_configured_counts_before_what_the_lines_show() -> None:
+    told, plain_one = (
+        PoseUncertainty(OdometryConfig(), Kinematics(DriveConfig()), 400) for _ in range(2)
+    )
+    told.show_count(math.tau / 16)
+    for one in (told, plain_one):
+        one.advance(0.01, 0.0, 0.01, 0.0, 0.0)
+    assert told.covariance == plain_one.covariance
+
+
+@pytest.mark.parametrize("counts", [16, 96, 400])
+def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_they_make_it(
+    counts: int,
+) -> None:
+    """The session finds the counts in the bytes; nothing is configured."""
+    session, odometry = (
+        McuSession(McuConfig(), 100.0),
+        Odometry(OdometryConfig(), Kinematics(DriveConfig())),
+    )
+    variances = []
+    for n, line in enumerate(counted_lines(angles(np.random.default_rng(1), 20.0), counts)):
+        now = Instant(10**9 + n * 10**7, n * 10**7)
+        for feedback in session.update(now, True, 1, (Received(now, line),)):
+            variances.append(odometry.fold(feedback).covariance.yawyaw)
+    before, after = variances[:-1], variances[1:]
+    count = RADIUS * math.tau / counts
+    leap = max(b - a for a, b in zip(before, after, strict=True))
+    assert session.snapping.counts == (counts,) * 4
+    assert leap >= 2 * count**2 / 24 * 2 / TRACK**2, "of where it started, and of where it is"
+
+
+def test_the_error_of_a_track_counts_for_the_turns_that_it_made() -> None:
+    none = replace(Model(0.0, 0.0, 0.0, track_std=0.05).config(), learned_track=True)
+    robot = Odometry(replace(none, pose_covariance_diagonal=(0.0,) * 6), Kinematics(DriveConfig()))
+
+    def turned(rad: float) -> tuple[float, float]:
+        before = robot.pose.yaw
+        speed = rad * TRACK / 2 / RADIUS
+        line = Feedback(AT, WheelSpeeds(speed, -speed, -speed, speed), 1.0)
+        covariance = robot.fold(line).covariance
+        return robot.pose.yaw - before, covariance.yawyaw
+
+    assert turned(1.0) == pytest.approx((1.0, 0.05**2))
+    robot.turn_by(Track(1.6, 0.02))
+    assert turned(1.0) == pytest.approx((1 / 1.6, 0.05**2 + (0.02 / 1.6) ** 2))
+    assert turned(0.5)[1] == pytest.approx(0.05**2 + (0.02 * 1.5 / 1.6) ** 2)
+    robot.turn_by(CONFIGURED)
+    assert turned(-1.0)[1] == pytest.approx((0.02 * 1.5 / 1.6) ** 2)
+
+
+def test_what_a_gyro_and_what_gaps_make_wrong_is_kept_apart_whichever_came_first() -> None:
+    gaps_first, gyro_first = uncertainty(), uncertainty()
+    before = gyro_first.covariance.yawyaw
+    gaps_first.stand(0.0, 0.0, 0.0, 0.0)
+    for one in (gaps_first, gyro_first):
+        one.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
+        one.stand(0.0, 0.2, 0.0, 0.0)
+        one.advance(0.0, 10.0, 0.0, 0.0, 0.0, variance=0.0)
+        one.stand(0.0, -0.2, 0.0, 0.0)
+    of_skidding = 0.4 * DEFAULT.skid
+    for one in (gaps_first, gyro_first):
+        grown = one.covariance.yawyaw - before
+        assert grown == pytest.approx((20.0 * GYRO_SCALE) ** 2 + of_skidding, rel=0.01)
+
+
+def test_wheels_that_tell_a_turn_bend_nothing_by_a_gyros_scale() -> None:
+    one, plain_one = uncertainty(), uncertainty()
+    one.advance(0.0, 0.0, 0.0, 0.0, 0.0, variance=0.0)
+    for each in (one, plain_one):
+        each.advance(0.0, 10.0, 0.0, 0.0, 0.0)
+    assert one.covariance == plain_one.covariance

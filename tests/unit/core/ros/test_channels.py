@@ -1,0 +1,134 @@
+"""Each channel's payload matches its definition.
+
+A program that knows only the definition reads it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from msgspec import Struct, inspect
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from acsard.core.messages.cdr_types import plain
+from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
+from acsard.core.ros.channels import (
+    BY_KEY,
+    CHANNELS,
+    CMD_VEL_IN,
+    DEFINITIONS,
+    LOG,
+    OURS,
+    RULE,
+    STATE,
+    Channel,
+    nested,
+    said,
+    schema_text,
+)
+from acsard.core.ros.names import TYPE_HASHES
+from acsard.core.ros.shapes import log
+from acsard.core.ros.transports import PUBLISHED
+from acsard.core.values import Event
+from tests.unit.core.ros.test_names import rihs01
+from tests.unit.core.ros.test_shapes import STATE as ROBOT_STATE
+
+
+def filled(cls: type[Struct]) -> Any:
+    """Return a message in which no two fields are equal."""
+    counted = iter(range(1, 1000))
+
+    def value(kind: inspect.Type) -> Any:
+        match plain(kind):
+            case inspect.StructType(cls=inner):
+                info = inspect.type_info(inner)
+                assert isinstance(info, inspect.StructType)
+                return inner(*[value(field.type) for field in info.fields])
+            case inspect.ListType(item_type=item, min_length=least):
+                return [value(item) for _ in range(least or 2)]
+            case inspect.FloatType():
+                return next(counted) / 8
+            case inspect.StrType():
+                return f"text {next(counted)}"
+            case _:
+                return next(counted)
+
+    return value(inspect.type_info(cls))
+
+
+def same(ours: Any, theirs: Any) -> bool:
+    """Return whether the fields of both are equal, by their order."""
+    if isinstance(ours, Struct):
+        fields = [getattr(ours, name) for name in ours.__struct_fields__]
+        others = [v for k, v in vars(theirs).items() if k != "__msgtype__"]
+        return len(fields) == len(others) and all(map(same, fields, others))
+    if isinstance(ours, list):
+        return len(ours) == len(theirs) and all(map(same, ours, theirs))
+    return bool(ours == theirs) or (isinstance(ours, float) and math.isnan(ours))
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
+def test_what_is_encoded_is_what_the_definition_says(channel: Channel) -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(channel.schema, channel.schema_name))
+    message = filled(channel.message)
+    assert same(message, store.deserialize_cdr(channel.encode(message), channel.schema_name))
+
+
+def test_a_robot_state_is_encoded_as_it_is() -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(STATE.schema, STATE.schema_name))
+    read: Any = store.deserialize_cdr(STATE.encode(ROBOT_STATE), STATE.schema_name)
+    assert (read.mode, read.x, read.header.stamp.sec) == ("driving", 1.0, 5)
+    assert [one.name for one in read.sources] == ["app", "nav"]
+
+
+def test_topics_are_called_as_in_the_ros_tree() -> None:
+    assert {row.native: row.name for row in PUBLISHED}.items() <= {
+        key: channel.name for key, channel in BY_KEY.items()
+    }.items()
+    assert BY_KEY["wheel_states"].topic("robot1") == "/robot1/joint_states"
+    assert CMD_VEL_IN.topic("", "app") == "/cmd_vel_in/app"
+
+
+def test_what_a_robot_has_nothing_to_say_on_has_no_channel() -> None:
+    assert set(CHANNELS) - set(said(frozenset({"tf"}))) == {BY_KEY["tf"]}
+
+
+def test_events_and_commands_have_a_channel_beside_the_keys() -> None:
+    twist = TwistStamped(Header(Time(1)), Twist(Vector3(x=0.5), Vector3()))
+    assert LOG.encode(log(Event("started", "up"), Time())).startswith(b"\0\1\0\0")
+    assert len(CMD_VEL_IN.encode(twist)) == 68
+
+
+THEIRS = [name for name in DEFINITIONS if not name.startswith(OURS)]
+
+
+@pytest.mark.parametrize("name", DEFINITIONS)
+def test_the_text_alone_is_enough_for_another_program(name: str) -> None:
+    assert {name, *nested(name)} == set(get_types_from_msg(schema_text(name), name))
+
+
+@pytest.mark.parametrize("name", THEIRS)
+def test_another_program_makes_the_same_hash_of_the_text(name: str) -> None:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema_text(name), name))
+    known = TYPE_HASHES.get(name, rihs01(name))
+    assert store.hash_rihs01(name) == known == get_typestore(Stores.ROS2_JAZZY).hash_rihs01(name)
+
+
+def test_a_text_has_each_type_once_after_the_type_itself() -> None:
+    text = schema_text("nav_msgs/msg/Odometry")
+    first, *others = text.split(f"{RULE}\nMSG: ")
+    assert first == (
+        "std_msgs/Header header\nstring child_frame_id\n"
+        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
+    )
+    assert [other.partition("\n")[0] for other in others] == [
+        "std_msgs/Header", "builtin_interfaces/Time",
+        "geometry_msgs/PoseWithCovariance", "geometry_msgs/Pose", "geometry_msgs/Point",
+        "geometry_msgs/Quaternion",
+        "geometry_msgs/TwistWithCovariance", "geometry_msgs/Twist", "geometry_msgs/Vector3",
+    ]  # fmt: skip

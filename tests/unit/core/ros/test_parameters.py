@@ -1,0 +1,243 @@
+"""Tests of the configuration as ROS parameters.
+
+They cover list, read, describe, and the answer to a set request.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
+
+from acsard.core.config.live import flat, live
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.messages.cdr import Cdr, CdrError
+from acsard.core.ros import parameters as rcl
+from acsard.core.ros.parameters import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    Parameters,
+    described,
+)
+from acsard.core.ros.transports import PARAMETER_SERVICES
+
+TABLES: dict[str, object] = {
+    "robot": {"id": "acsar"},
+    "mcu": {"baud_rate": 115200, "trailing_comma": False, "wheels": {"front_left": "+b"}},
+    "drive": {"wheel_radius": 0.05},
+    "odometry": {"diagonal": (1.0, 2.0)},
+    "bus": {"connect": [], "listen": ["tcp/127.0.0.1:7448"]},
+    "commands": {"sources": [{"name": "nav", "priority": 10}, {"name": "app", "priority": 50}]},
+}
+
+
+def ask(service: str, request: Any, reply: type[Any]) -> Any:
+    answer = Parameters(TABLES).answer(service, Cdr(type(request)).encode(request))
+    return Cdr(reply).decode(answer)
+
+
+def names(prefixes: list[str], depth: int = 0) -> list[str]:
+    found: rcl.ListReply = ask("list_parameters", rcl.ListRequest(prefixes, depth), rcl.ListReply)
+    return found.names
+
+
+def value(name: str) -> rcl.ParameterValue:
+    found: rcl.Values = ask("get_parameters", rcl.Names([name]), rcl.Values)
+    return found.values[0]
+
+
+ALL = [
+    "robot.id",
+    "mcu.baud_rate",
+    "mcu.trailing_comma",
+    "mcu.wheels.front_left",
+    "drive.wheel_radius",
+    "odometry.diagonal",
+    "bus.connect",
+    "bus.listen",
+    "commands.sources.nav.priority",
+    "commands.sources.app.priority",
+]
+
+
+def test_every_key_is_listed_with_the_tables_it_is_in() -> None:
+    found: rcl.ListReply = ask("list_parameters", rcl.ListRequest([], 0), rcl.ListReply)
+    assert found.names == ALL
+    assert found.prefixes == [
+        "bus",
+        "commands.sources.app",
+        "commands.sources.nav",
+        "drive",
+        "mcu",
+        "mcu.wheels",
+        "odometry",
+        "robot",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("prefixes", "depth", "expected"),
+    [
+        ([], 1, []),
+        ([], 2, [n for n in ALL if n.count(".") == 1]),
+        ([], 3, [n for n in ALL if n.count(".") <= 2]),
+        (["mcu"], 0, ["mcu.baud_rate", "mcu.trailing_comma", "mcu.wheels.front_left"]),
+        (["mcu"], 1, ["mcu.baud_rate", "mcu.trailing_comma"]),
+        (["mcu", "robot"], 1, ["robot.id", "mcu.baud_rate", "mcu.trailing_comma"]),
+        (["robot.id"], 0, ["robot.id"]),
+        (["mc"], 0, []),
+        (["nowhere"], 0, []),
+    ],
+)
+def test_prefixes_and_depth_choose_among_them(
+    prefixes: list[str], depth: int, expected: list[str]
+) -> None:
+    assert names(prefixes, depth) == expected
+
+
+def test_each_value_has_its_ros_type() -> None:
+    assert value("robot.id") == rcl.ParameterValue(rcl.STRING, string_value="acsar")
+    assert value("mcu.baud_rate") == rcl.ParameterValue(rcl.INTEGER, integer_value=115200)
+    assert value("mcu.trailing_comma") == rcl.ParameterValue(rcl.BOOL)
+    assert value("drive.wheel_radius") == rcl.ParameterValue(rcl.DOUBLE, double_value=0.05)
+    assert value("odometry.diagonal") == rcl.ParameterValue(
+        rcl.DOUBLE_ARRAY, double_array_value=[1.0, 2.0]
+    )
+    assert value("bus.listen") == rcl.ParameterValue(
+        rcl.STRING_ARRAY, string_array_value=["tcp/127.0.0.1:7448"]
+    )
+    assert value("bus.connect") == rcl.ParameterValue(rcl.STRING_ARRAY)
+    assert value("commands.sources.app.priority").integer_value == 50
+
+
+def test_a_name_that_is_not_there_has_no_value_and_no_type() -> None:
+    assert value("robot.weight") == rcl.ParameterValue()
+    asked = rcl.Names(["robot.weight", "robot.id"])
+    assert ask("get_parameter_types", asked, rcl.Types).types == [rcl.NOT_SET, rcl.STRING]
+
+
+def test_a_description_is_that_of_the_key() -> None:
+    asked = rcl.Names(["drive.wheel_radius", "no.such"])
+    found, nothing = ask("describe_parameters", asked, rcl.Descriptors).descriptors
+    assert found == described("drive.wheel_radius", rcl.DOUBLE)
+    assert nothing == ParameterDescriptor("no.such", rcl.NOT_SET)
+
+
+WISHES: list[tuple[rcl.ParameterValue, object]] = [
+    (rcl.ParameterValue(rcl.BOOL, bool_value=True), True),
+    (rcl.ParameterValue(rcl.INTEGER, integer_value=5), 5),
+    (rcl.ParameterValue(rcl.DOUBLE, double_value=0.8), 0.8),
+    (rcl.ParameterValue(rcl.STRING, string_value="debug"), "debug"),
+    (rcl.ParameterValue(rcl.INTEGER_ARRAY, integer_array_value=[1, 2]), [1.0, 2.0]),
+    (rcl.ParameterValue(rcl.DOUBLE_ARRAY, double_array_value=[0.5]), [0.5]),
+    (rcl.ParameterValue(rcl.STRING_ARRAY, string_array_value=["a"]), ["a"]),
+]
+
+
+@pytest.mark.parametrize(("value", "expected"), WISHES)
+def test_a_wish_is_a_value_by_its_name(value: rcl.ParameterValue, expected: object) -> None:
+    asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
+    assert rcl.wished(Cdr(rcl.SetRequest).encode(asked)) == {"limits.linear_speed": expected}
+
+
+@pytest.mark.parametrize("kind", [rcl.NOT_SET, 5, 6, 10])
+def test_a_parameter_cannot_be_unset_nor_made_of_bytes(kind: int) -> None:
+    asked = rcl.SetRequest([rcl.Parameter("log.level", rcl.ParameterValue(kind))])
+    with pytest.raises(CdrError, match=r"log\.level"):
+        rcl.wished(Cdr(rcl.SetRequest).encode(asked))
+
+
+def test_the_reply_has_a_result_for_each_or_one_for_all() -> None:
+    wish = rcl.Parameter("log.level", rcl.ParameterValue(rcl.STRING, string_value="debug"))
+    payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest([wish, wish]))
+    result = rcl.SetParametersResult(False, "why")
+    each = rcl.outcome("set_parameters", payload, False, "why")
+    assert Cdr(rcl.SetReply).decode(each) == rcl.SetReply([result, result])
+    one = rcl.outcome("set_parameters_atomically", payload, False, "why")
+    assert Cdr(rcl.SetAtomicallyReply).decode(one) == rcl.SetAtomicallyReply(result)
+
+
+@pytest.mark.parametrize("service", PARAMETER_SERVICES)
+def test_a_request_cut_anywhere_is_refused(service: str) -> None:
+    wish = rcl.Parameter("robot.id", rcl.ParameterValue(rcl.STRING, string_value="other"))
+    request: Any = {
+        "list_parameters": rcl.ListRequest(["mcu"], 0),
+        "set_parameters": rcl.SetRequest([wish]),
+        "set_parameters_atomically": rcl.SetRequest([wish]),
+    }.get(service, rcl.Names(["robot.id"]))
+    payload = Cdr(type(request)).encode(request)
+    serve: Callable[[bytes], object] = partial(Parameters(TABLES).answer, service)
+    if service in rcl.SETTING:
+        serve = rcl.wished
+    assert serve(payload)
+    for end in range(len(payload)):
+        with pytest.raises(CdrError):
+            serve(payload[:end])
+
+
+def test_the_whole_configuration_can_be_had() -> None:
+    serve = Parameters(effective(Config())).answer
+    listed = Cdr(rcl.ListReply).decode(
+        serve("list_parameters", Cdr(rcl.ListRequest).encode(rcl.ListRequest([], 0)))
+    )
+    got = Cdr(rcl.Values).decode(
+        serve("get_parameters", Cdr(rcl.Names).encode(rcl.Names(listed.names)))
+    )
+    assert "limits.linear_speed" in listed.names
+    assert all(one.type != rcl.NOT_SET for one in got.values)
+
+
+KEYS = [key for key, _ in flat(effective(Config()))]
+DOUBLE, INTEGER = 3, 2
+
+
+def test_what_can_be_set_says_what_it_is_its_range_and_when() -> None:
+    assert described("limits.linear_stop_deceleration", DOUBLE) == ParameterDescriptor(
+        "limits.linear_stop_deceleration",
+        DOUBLE,
+        "braking by a stop or a fault: a number from 0.01 to 100 m/s2",
+        "lowered only while the robot stands",
+        read_only=False,
+        floating_point_range=[FloatingPointRange(0.01, 100.0, 0.0)],
+    )
+
+
+def test_what_takes_a_start_is_read_only_and_says_so() -> None:
+    assert described("mcu.encoder_counts", INTEGER) == ParameterDescriptor(
+        "mcu.encoder_counts",
+        INTEGER,
+        "a whole number from 0 to 100000 per wheel turn (0 = do not ask for them)",
+        "acsard.toml and a start",
+        integer_range=[IntegerRange(0, 100_000, 1)],
+    )
+
+
+def test_a_source_is_described_by_its_name() -> None:
+    found = described("commands.sources.nav.timeout", DOUBLE)
+    assert found.floating_point_range == [FloatingPointRange(0.02, 10.0, 0.0)]
+    assert (found.read_only, found.additional_constraints) == (
+        False,
+        "only while the robot stands",
+    )
+
+
+def test_a_choice_names_what_there_is() -> None:
+    found = described("log.level", 4)
+    assert found.description == (
+        'the least that the log tells: one of "debug", "error", "info", "warning"'
+    )
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_every_key_has_words_and_is_read_only_unless_it_can_be_set(key: str) -> None:
+    found = described(key, DOUBLE)
+    assert found.description
+    assert found.read_only == (live(key) is None)
+
+
+def test_what_is_not_there_has_none() -> None:
+    assert described("no.such", 0) == ParameterDescriptor("no.such", 0)

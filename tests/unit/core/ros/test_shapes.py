@@ -1,0 +1,75 @@
+"""Tests of the log and `state` as ROS messages."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.messages.schema import Happening, RobotState, SourceState, Time
+from acsard.core.ros.shapes import Counter, Log, Source, log, state
+from acsard.core.values import Event
+
+STATE = RobotState(
+    stamp=Time(5, 6),
+    mode="driving",
+    reason="driving: app",
+    x=1.0,
+    y=2.0,
+    yaw=0.5,
+    linear=0.3,
+    angular=0.1,
+    wheels=[1.0, 2.0, 3.0, 4.0],
+    link="up",
+    source="app",
+    sources=[SourceState("app", 50, 0.1, ""), SourceState("nav", 10, None, "a command")],
+    refused="",
+    counters={"lines": 7, "commands": 2},
+    sender="joystick",
+    feedback_age=0.01,
+)
+
+
+def test_an_event_is_a_log_line_of_ros() -> None:
+    event = Event("command_refused", "too old", "warning", by="a phone", count=3)
+    assert log(event, Time(1, 500_000_000)) == Log(
+        Time(1, 500_000_000), 30, "command_refused", "too old (by a phone) (3 times)"
+    )
+
+
+@pytest.mark.parametrize("text", ["3 x stale; the last: late", "2 x stale, 1 x crowded", "3 times"])
+def test_what_begins_with_its_numbers_is_not_counted_twice(text: str) -> None:
+    assert log(Event("command_refused", text, count=3), Time()).msg == text
+
+
+def test_what_the_topic_says_of_an_event_is_the_same_line() -> None:
+    seen = Happening(Time(1), "fault", "error", "dead motor", "", 1)
+    assert log(seen, seen.stamp) == log(Event("fault", "dead motor", "error"), Time(1))
+
+
+def test_who_did_it_and_how_often_stand_there_only_if_there_is_something_to_say() -> None:
+    assert log(Event("started", "up"), Time()) == Log(Time(), 20, "started", "up")
+
+
+def test_a_source_never_heard_has_no_age() -> None:
+    heard, never = state(STATE).sources
+    assert heard == Source("app", 50, 0.1, "")
+    assert math.isnan(never.age)
+
+
+def test_what_is_null_in_state_is_not_a_number_in_ros() -> None:
+    told = state(replace(STATE, linear=None, angular=None, wheels=[], feedback_age=None))
+    assert all(map(math.isnan, (told.linear, told.angular, told.feedback_age)))
+    assert told.wheels == []
+
+
+def test_state_is_the_same_field_by_field() -> None:
+    told = state(STATE)
+    assert told.header.stamp == STATE.stamp
+    assert told.counters == [Counter("lines", 7), Counter("commands", 2)]
+    plain = set(told.__struct_fields__) - {"header", "sources", "counters"}
+    assert all(getattr(told, name) == getattr(STATE, name) for name in plain)
+    left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
+    # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
+    assert left_out == {"stamp", "figures", "encoders", "latch", "latch_file"}

@@ -1,0 +1,207 @@
+"""Each ROS name of the robot stands for a native key, in both trees."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.settings import (
+    CommandsConfig,
+    Config,
+    FootprintConfig,
+    LidarConfig,
+    McuConfig,
+    OdometryConfig,
+    RosConfig,
+)
+from acsard.core.messages.topics import TOPICS
+from acsard.core.ros.names import TYPE_HASHES
+from acsard.core.ros.transports import (
+    PARAMETERS,
+    Endpoint,
+    claims,
+    command_keys,
+    endpoints,
+    left_out,
+    node_tokens,
+    ros_names,
+)
+
+ZID = "abc"
+REAL = McuConfig(port="/dev/ttyACM0")
+
+
+def found(ros: RosConfig) -> list[Endpoint]:
+    return list(endpoints(ros, ZID))
+
+
+def keys(ros: RosConfig, transport: str) -> dict[str, str]:
+    """Return the key of each native name; twists appear only once."""
+    return {e.native: e.key for e in found(ros) if e.transport == transport}
+
+
+def test_both_trees_have_the_same_names() -> None:
+    assert set(keys(RosConfig(), "bridge")) == set(keys(RosConfig(), "rmw"))
+
+
+def test_the_bridge_s_keys_are_the_bare_names() -> None:
+    assert keys(RosConfig(), "bridge") == {
+        "odom": "odom",
+        "tf": "tf",
+        "tf_static": "tf_static",
+        "wheel_states": "joint_states",
+        "diagnostics": "diagnostics",
+        "cmd_vel_out": "cmd_vel_out",
+        "cmd/nav": "cmd_vel",
+        "cmd/teleop": "cmd_vel_teleop",
+        "wheel_cmd/ros2_control": "joint_commands",
+        "imu": "imu/data",
+        "srv/stop": "acsard/stop",
+        "srv/clear": "acsard/clear",
+        "srv/activate": "acsard/activate",
+        "srv/deactivate": "acsard/deactivate",
+        "srv/reset_odometry": "acsard/reset_odometry",
+        "parameters/describe_parameters": "acsard/describe_parameters",
+        "parameters/get_parameter_types": "acsard/get_parameter_types",
+        "parameters/get_parameters": "acsard/get_parameters",
+        "parameters/list_parameters": "acsard/list_parameters",
+        "parameters/set_parameters": "acsard/set_parameters",
+        "parameters/set_parameters_atomically": "acsard/set_parameters_atomically",
+    }
+
+
+def test_a_namespace_and_a_node_name_are_in_front_of_all_of_them() -> None:
+    ros = RosConfig(namespace="lab/robot1", node="base")
+    bridge = keys(ros, "bridge")
+    assert all(key.startswith("lab/robot1/") for key in bridge.values())
+    assert bridge["tf"] == "lab/robot1/tf"
+    assert bridge["srv/stop"] == "lab/robot1/base/stop"
+    assert keys(ros, "rmw")["tf"].startswith("0/lab/robot1/tf/tf2_msgs::msg::dds_::TFMessage_/")
+
+
+def test_over_rmw_a_topic_of_two_types_has_a_key_for_each() -> None:
+    twists = [e.key for e in found(RosConfig()) if e.transport == "rmw" and e.native == "cmd/nav"]
+    assert [key.split("/")[2] for key in twists] == [
+        "geometry_msgs::msg::dds_::Twist_",
+        "geometry_msgs::msg::dds_::TwistStamped_",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "types"),
+    [("twist", ["Twist_"]), ("twist_stamped", ["TwistStamped_"])],
+)
+def test_one_type_of_twist_can_be_chosen(kind: str, types: list[str]) -> None:
+    ros = RosConfig(cmd_vel_type=kind)  # type: ignore[arg-type]
+    rmw = [e for e in found(ros) if e.transport == "rmw" and e.native.startswith("cmd/")]
+    assert [e.key.split("/")[2].rpartition("::")[2] for e in rmw] == types * 2
+
+
+@pytest.mark.parametrize(("bridge", "rmw"), [(True, False), (False, True), (False, False)])
+def test_each_tree_can_be_switched_off(bridge: bool, rmw: bool) -> None:
+    ros = RosConfig(bridge=bridge, rmw=rmw)
+    transports = {e.transport for e in found(ros)}
+    assert transports == {name for name, on in (("bridge", bridge), ("rmw", rmw)) if on}
+    tokens = node_tokens(ros, ZID)
+    assert any(token.startswith("@ros2_lv/") for token in tokens) == rmw
+    assert any(token == "@/abc/@ros2_lv" for token in tokens) == bridge
+
+
+def test_two_claim_the_same_where_one_topic_would_drive_both() -> None:
+    def shared(one: RosConfig, two: RosConfig) -> bool:
+        return bool({*claims(one)} & {*claims(two)})
+
+    usual, named = RosConfig(), RosConfig(namespace="lab/robot1")
+    assert shared(usual, RosConfig(node="other", announce=False))
+    assert shared(named, RosConfig(namespace="lab/robot1", domain=7)), "the bridge knows no domain"
+    assert not shared(usual, named)
+    assert not shared(RosConfig(bridge=False), RosConfig(bridge=False, domain=7))
+    assert not shared(RosConfig(bridge=False), RosConfig(rmw=False)), "no commander reaches both"
+    assert claims(RosConfig(bridge=False, rmw=False)) == ()
+
+
+def test_every_name_stands_for_a_row_of_the_topic_table() -> None:
+    patterns = {topic.key.replace("<source>", ""): topic for topic in TOPICS}
+    sources = {source.name for source in CommandsConfig().sources}
+    for row in ros_names(RosConfig()):
+        if row.native.startswith(PARAMETERS):
+            continue
+        if row.direction == "in" and row.native != "imu":
+            head, _, source = row.native.partition("/")
+            assert source in sources
+            assert patterns[f"{head}/"].direction == "in"
+        else:
+            assert patterns[row.native].direction == row.direction
+            assert patterns[row.native].latched == row.qos.transient
+        assert row.type in TYPE_HASHES
+
+
+def test_only_what_is_latched_in_the_native_tree_is_latched() -> None:
+    assert {e.native for e in found(RosConfig()) if e.latched} == {"tf_static"}
+
+
+def test_every_endpoint_over_rmw_has_a_token_of_its_own() -> None:
+    tokens = [e.token for e in found(RosConfig()) if e.transport == "rmw"]
+    assert len(set(tokens)) == len(tokens)
+    numbers = [int(token.split("/")[4]) for token in tokens]
+    assert numbers == list(range(1, len(tokens) + 1))
+    kinds = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
+    for endpoint in found(RosConfig()):
+        if endpoint.transport == "rmw":
+            assert endpoint.token.split("/")[5] == kinds[endpoint.direction]
+
+
+def test_a_bridge_is_told_of_everything_that_has_one_type() -> None:
+    silent = {e.native for e in found(RosConfig()) if e.transport == "bridge" and not e.token}
+    assert silent == {"cmd/nav", "cmd/teleop"}
+    chosen = RosConfig(cmd_vel_type="twist_stamped")
+    assert all(e.token for e in found(chosen))
+    assert "/MS/cmd_vel/geometry_msgs§msg§TwistStamped/" in "".join(e.token for e in found(chosen))
+
+
+def test_a_bridge_is_told_nothing_when_announcing_is_off() -> None:
+    ros = RosConfig(announce=False)
+    assert not any(e.token for e in found(ros) if e.transport == "bridge")
+    assert node_tokens(ros, ZID) == ("@ros2_lv/0/abc/0/0/NN/%/%/acsard",)
+
+
+def test_the_keys_commands_come_in_on_are_those_of_both_trees() -> None:
+    rate_limited = command_keys(RosConfig())
+    assert set(rate_limited) == {e.key for e in found(RosConfig()) if e.direction == "in"}
+    assert len(rate_limited) == 4 + 6
+
+
+def test_transforms_that_are_switched_off_are_not_there_at_all() -> None:
+    odometry = OdometryConfig(publish_tf=False, gyro=True)
+    off = Config(mcu=REAL, odometry=odometry, lidar=LidarConfig(publish_tf=False))
+    assert left_out(off) == {"tf", "tf_static"}
+    kept = endpoints(RosConfig(), ZID, left_out(off))
+    assert not {e.native for e in kept} & {"tf", "tf_static"}
+    assert {e.native for e in endpoints(RosConfig(), ZID)} - {e.native for e in kept} == {
+        "tf",
+        "tf_static",
+    }
+
+
+def test_either_static_transform_keeps_tf_static() -> None:
+    assert "tf_static" not in left_out(Config())
+    footprint = FootprintConfig(publish_tf=True)
+    config = Config(lidar=LidarConfig(publish_tf=False), footprint=footprint)
+    assert "tf_static" not in left_out(config)
+
+
+def test_a_gyro_of_ros_is_listened_to_where_it_is_wanted_and_the_robot_has_none_itself() -> None:
+    wanted = OdometryConfig(gyro=True)
+    assert left_out(Config(mcu=REAL, odometry=wanted)) == set()
+    for other in (Config(mcu=REAL), Config(), Config(odometry=wanted)):
+        assert left_out(other) == {"imu"}
+        assert not [e for e in endpoints(RosConfig(), ZID, left_out(other)) if e.native == "imu"]
+
+
+def test_a_gyro_that_publishes_as_sensors_do_is_heard() -> None:
+    bridge, rmw = (
+        next(e for e in found(RosConfig()) if e.native == "imu" and e.transport == transport)
+        for transport in ("bridge", "rmw")
+    )
+    assert "/MS/imu§data/sensor_msgs§msg§Imu/:0:0:0,10:" in bridge.token
+    assert rmw.token.endswith("/2::,10:,:,:,,")
+    assert rmw.key.startswith("0/imu/data/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a00ff")

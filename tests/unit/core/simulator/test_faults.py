@@ -1,0 +1,91 @@
+"""The faults of the fake MCU are on inside their block and off after it."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+from acsard.core.config.named_faults import ARGUMENTS, FAULTS, named
+from acsard.core.config.settings import Config, SimConfig
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.faults import Faults
+
+
+def switches(faults: Faults) -> dict[str, object]:
+    return {k: v for k, v in vars(faults).items() if not k.startswith("_")}
+
+
+def test_every_fault_that_needs_no_argument_is_offered_by_its_name() -> None:
+    methods = vars(Faults) | vars(FakeMcu)
+    free = {
+        name
+        for name, method in methods.items()
+        if callable(method) and not name.startswith("_")
+        if inspect.signature(method).return_annotation in ("Fault", "Iterator[None]")
+        if all(
+            p.default is not p.empty
+            for p in list(inspect.signature(method).parameters.values())[1:]
+        )
+    }
+    assert sorted(FAULTS) == sorted(free)
+
+
+@pytest.mark.parametrize("name", [name for name in FAULTS if name != "unprompted"])
+def test_a_fault_turns_its_switch_and_turns_it_back(name: str) -> None:
+    faults = Faults()
+    before = switches(faults)
+    with getattr(faults, name)():
+        assert switches(faults) != before
+    assert switches(faults) == before
+
+
+def test_every_fifth_is_every_fifth() -> None:
+    faults = Faults()
+    with faults.lost_replies(every=5):
+        hits = [faults._hit("reply", faults.lose_reply) for _ in range(10)]
+    assert hits == [False, False, False, False, True] * 2
+    assert not any(faults._hit("reply", faults.lose_reply) for _ in range(10))
+
+
+def test_a_bit_error_turns_one_bit_and_another_each_time() -> None:
+    faults, data = Faults(), bytes(40)
+    with faults.bit_errors(every=1):
+        turned = [int.from_bytes(faults._damaged(data), "big") for _ in range(320)]
+    assert all(number.bit_count() == 1 for number in turned)
+    assert len(set(turned)) == 320
+    assert faults._damaged(data) == data
+
+
+def test_no_data_cannot_be_damaged() -> None:
+    faults = Faults()
+    with faults.bit_errors(every=1):
+        assert faults._damaged(b"") == b""
+
+
+EXAMPLE = {"m": "b", "mm": "b:c", "mn": "b:2", "n": "9600", "nn": "5:0.1"}
+EACH = (*FAULTS, *(f"{name}={EXAMPLE[kinds]}" for name, kinds in ARGUMENTS.items()))
+
+
+def test_each_fault_can_be_turned_on_and_back() -> None:
+    mcu = FakeMcu(Config())
+    before = dict(vars(mcu))
+    for text in EACH:
+        with mcu.having(named(text)):
+            assert vars(mcu) != before, text
+        assert vars(mcu) == before, text
+
+
+def test_what_the_configuration_names_it_has_from_its_start_on() -> None:
+    for text in EACH:
+        mcu, told = FakeMcu(Config()), FakeMcu(Config(sim=SimConfig(faults=(text,))))
+        with mcu.having(named(text)):
+            for switch in switches(Faults()):
+                assert getattr(told, switch) == getattr(mcu, switch), (text, switch)
+
+
+def test_it_has_all_of_them_at_once() -> None:
+    told = FakeMcu(Config(sim=SimConfig(faults=("ftdi", "stalls=5:0.15"))))
+    assert (told.latency_ns, told.stall_every_ns, told.stall_ns) == (
+        16_000_000, 5_000_000_000, 150_000_000,
+    )  # fmt: skip

@@ -1,0 +1,97 @@
+"""Tests of the lines that each firmware accepts as commands, and of its exact answers."""
+
+from __future__ import annotations
+
+import binascii
+
+import pytest
+
+from acsard.core.simulator import protocol
+from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, whole
+
+PLAIN = b"ap12.50,bn08.75,cp15.00,dn10.25"
+VALUES = {0: 12.5, 1: -8.75, 2: 15.0, 3: -10.25}
+END = b"\r\n"
+
+
+def closed(body: bytes) -> bytes:
+    """Return the body with its correct check and a line end."""
+    return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+
+
+@pytest.mark.parametrize("end", [END, b"\n", b",\r\n", b",\n"])
+def test_a_plain_line_is_a_command_to_all_of_them(end: bytes) -> None:
+    assert whole(PLAIN + end) == plain_only(PLAIN + end) == Command(VALUES)
+    assert prefix(PLAIN + end) == Command(VALUES)
+    assert latched(PLAIN + b",").values == VALUES
+
+
+@pytest.mark.parametrize(
+    ("suffix", "sequence", "sample"),
+    [
+        (b"#07", b"07", False),
+        (b"#FFS", b"FF", True),
+        (b"#00GSZ", b"00", True),
+        (b",#A0S", b"A0", True),
+    ],
+)
+def test_a_checked_line_has_a_sequence_and_requests(
+    suffix: bytes, sequence: bytes, sample: bool
+) -> None:
+    assert whole(closed(PLAIN + suffix)) == Command(VALUES, sequence, sample)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        PLAIN + b"#07" + END,
+        PLAIN + b"*0000" + END,
+        closed(PLAIN),
+        closed(PLAIN + b"#7"),
+        closed(PLAIN + b"#0a"),
+        closed(PLAIN + b"#07s"),
+        closed(PLAIN + b"#07A"),
+        closed(PLAIN + b"#07@"),
+        closed(PLAIN + b"#07*"),
+        closed(PLAIN[:-1] + b"#07"),
+        closed(b"#07"),
+        closed(PLAIN + b"#07")[:-3] + END,
+        closed(PLAIN + b"#07").replace(b"12.50", b"12.51"),
+        closed(PLAIN + b"#07").lower(),
+        b"\x00" + closed(PLAIN + b"#07"),
+    ],
+)
+def test_a_suffix_that_is_not_right_in_all_makes_it_no_line(line: bytes) -> None:
+    assert whole(line) is None
+
+
+def test_the_old_firmwares_run_a_checked_line_as_the_plain_one() -> None:
+    assert prefix(closed(PLAIN + b"#07S")) == Command(VALUES)
+    assert latched(closed(PLAIN + b",#07S")).values == VALUES
+    assert latched(closed(PLAIN + b"#07S")).values == {0: 12.5, 1: -8.75, 2: 15.0}
+    assert plain_only(closed(PLAIN + b"#07")) is None
+
+
+@pytest.mark.parametrize("line", [b"", b"\r\n", b"?", PLAIN[:30], PLAIN[1:], b"\xff" * 50])
+def test_what_is_no_line_is_none(line: bytes) -> None:
+    assert whole(line) is plain_only(line) is prefix(line) is None
+
+
+def test_a_reply_is_padded_or_not() -> None:
+    speeds = (12.5, -8.75, 0.0, -120.0)
+    assert protocol.speeds_text(speeds, ",", False) == b"ap12.50,bn08.75,cp00.00,dn99.99"
+    assert protocol.speeds_text(speeds, ", ", True) == b"ap12.50, bn8.75, cp0.00, dn99.99"
+
+
+def test_the_suffix_of_a_reply_closes_it_with_its_check() -> None:
+    assert PLAIN + protocol.suffix(PLAIN, b"07", ()) + END == closed(PLAIN + b"#07")
+    sample = (65536 + 4000, 1, -1, 32768, -32769)
+    assert PLAIN + protocol.suffix(PLAIN, b"07", sample) + END == closed(
+        PLAIN + b"#07@0FA00001FFFF80007FFF"
+    )
+
+
+def test_the_identity_names_the_firmware_and_is_no_command() -> None:
+    line = protocol.identity(3200, 300, sample=True)
+    assert line == b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1\r\n"
+    assert whole(line) is prefix(line) is plain_only(line) is None

@@ -1,0 +1,257 @@
+"""Tests of the simulated base: motors with a lag, and the path that their wheels make."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import DriveConfig, SimConfig
+from acsard.core.simulator.vehicle import Vehicle
+
+LAG = 0.1
+RADIUS, TRACK = 0.05, 0.30
+
+speed = st.floats(-50, 50)
+four = st.lists(speed, min_size=4, max_size=4)
+
+
+def vehicle(lag: float = LAG, drive: DriveConfig | None = None) -> Vehicle:
+    return Vehicle(SimConfig(motor_time_constant=lag), drive or DriveConfig())
+
+
+def moved(seconds: float, *set_points: float, lag: float = 0.0, **changes: float) -> Vehicle:
+    """Return a vehicle after this time from rest; a, b, c, d are right, left, left, right."""
+    made = vehicle(lag)
+    for name, value in changes.items():
+        setattr(made, name, value)
+    made.set_points[:] = set_points
+    made.advance(seconds)
+    return made
+
+
+def test_it_stands_still_until_it_is_asked_to_move() -> None:
+    made = vehicle()
+    made.advance(100.0)
+    assert made.speeds == made.angles == [0.0] * 4
+    assert (made.pose.x, made.pose.y, made.pose.yaw) == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("seconds", [0.001, 0.05, 0.1, 0.5, 3.0])
+def test_a_motor_approaches_its_set_point_exponentially(seconds: float) -> None:
+    made = moved(seconds, 10.0, -5.0, 0.0, 2.0, lag=LAG)
+    share = 1 - math.exp(-seconds / LAG)
+    assert made.speeds == pytest.approx([10.0 * share, -5.0 * share, 0.0, 2.0 * share])
+    turned = seconds - LAG * share
+    assert made.angles == pytest.approx([10.0 * turned, -5.0 * turned, 0.0, 2.0 * turned])
+
+
+def test_after_one_time_constant_63_percent_are_reached() -> None:
+    assert moved(LAG, 10.0, 10.0, 10.0, 10.0, lag=LAG).speeds == pytest.approx(
+        [6.3212] * 4, abs=1e-4
+    )
+
+
+def test_without_lag_the_speed_is_there_at_once() -> None:
+    made = moved(0.001, 1.0, 2.0, 3.0, 4.0)
+    assert made.speeds == [1.0, 2.0, 3.0, 4.0]
+    assert made.angles == pytest.approx([0.001, 0.002, 0.003, 0.004])
+
+
+@given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), four, four)
+def test_speeds_and_angles_do_not_depend_on_how_the_time_is_cut(
+    pieces: list[float], start: list[float], goal: list[float]
+) -> None:
+    whole, cut = vehicle(), vehicle()
+    for made in (whole, cut):
+        made.set_points[:] = start
+        made.advance(0.2)
+        made.set_points[:] = goal
+    for piece in pieces:
+        cut.advance(piece)
+    whole.advance(sum(pieces))
+    assert cut.speeds == pytest.approx(whole.speeds, abs=1e-6)
+    assert cut.angles == pytest.approx(whole.angles, abs=1e-6)
+
+
+@given(st.lists(st.floats(1e-4, 0.5), min_size=1, max_size=12), speed, speed)
+def test_a_path_from_rest_does_not_depend_on_how_the_time_is_cut(
+    pieces: list[float], left: float, right: float
+) -> None:
+    whole, cut = vehicle(), vehicle()
+    whole.set_points[:] = cut.set_points[:] = [right, left, left, right]
+    for piece in pieces:
+        cut.advance(piece)
+    whole.advance(sum(pieces))
+    assert (cut.pose.x, cut.pose.y) == pytest.approx((whole.pose.x, whole.pose.y), abs=1e-6)
+    assert math.remainder(cut.pose.yaw - whole.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0])
+def test_no_time_moves_nothing(dt: float) -> None:
+    made = moved(1.0, 5.0, 5.0, 5.0, 5.0, lag=LAG)
+    before = (list(made.speeds), list(made.angles), made.pose)
+    made.advance(dt)
+    assert (made.speeds, made.angles, made.pose) == before
+
+
+def test_a_stopped_motor_comes_to_rest_for_good() -> None:
+    made = moved(1.0, 5.0, 5.0, 5.0, 5.0, lag=LAG)
+    made.set_points[:] = [0.0] * 4
+    made.advance(10.0)
+    assert made.speeds == [0.0] * 4
+
+
+def test_straight_on_is_radius_times_angle() -> None:
+    made = moved(2.0, 10.0, 10.0, 10.0, 10.0)
+    assert made.pose.x == pytest.approx(10.0 * 2.0 * RADIUS)
+    assert (made.pose.y, made.pose.yaw) == (0.0, 0.0)
+    assert moved(2.0, -10.0, -10.0, -10.0, -10.0).pose.x == pytest.approx(-1.0)
+
+
+def test_motors_a_and_d_are_on_the_right() -> None:
+    assert moved(0.1, 1.0, -1.0, -1.0, 1.0).pose.yaw == pytest.approx(2 * 0.1 * RADIUS / TRACK)
+    assert moved(0.1, 1.0, 0.0, 0.0, 1.0).pose.yaw > 0
+    assert moved(0.1, 0.0, 1.0, 1.0, 0.0).pose.yaw < 0
+
+
+def test_a_turn_on_the_spot_does_not_leave_it() -> None:
+    made = moved(0.7, 3.0, -3.0, -3.0, 3.0)
+    assert (made.pose.x, made.pose.y) == pytest.approx((0.0, 0.0))
+
+
+def test_a_quarter_circle_ends_a_radius_ahead_and_a_radius_aside() -> None:
+    # v = 0.5 m/s and w = 0.5 rad/s give a circle of 1 m radius.
+    right, left = (0.5 + 0.5 * TRACK / 2) / RADIUS, (0.5 - 0.5 * TRACK / 2) / RADIUS
+    made = moved(math.pi, right, left, left, right)
+    assert (made.pose.x, made.pose.y) == pytest.approx((1.0, 1.0))
+    assert made.pose.yaw == pytest.approx(math.pi / 2)
+
+
+def test_the_mean_of_a_side_moves_it() -> None:
+    assert moved(0.5, 6.0, 1.0, 5.0, 2.0).pose == moved(0.5, 4.0, 3.0, 3.0, 4.0).pose
+
+
+def test_the_yaw_stays_within_half_a_turn() -> None:
+    made = moved(12.0, 3.0, -3.0, -3.0, 3.0)
+    assert made.pose.yaw == pytest.approx(math.remainder(12.0, math.tau))
+
+
+def test_the_radius_multipliers_and_the_effective_track_shape_the_path() -> None:
+    drive = DriveConfig(
+        wheel_radius=0.1,
+        wheel_separation=0.5,
+        wheel_separation_multiplier=2.0,
+        left_wheel_radius_multiplier=0.9,
+        right_wheel_radius_multiplier=1.1,
+    )
+    made = vehicle(0.0, drive)
+    made.set_points[:] = [1.0] * 4
+    made.advance(0.5)
+    assert made.pose.yaw == pytest.approx(0.5 * (0.11 - 0.09) / 1.0)
+    assert math.hypot(made.pose.x, made.pose.y) == pytest.approx(0.5 * 0.1, rel=1e-4)
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.25, 1.0])
+def test_slip_takes_its_share_of_the_turn_and_nothing_of_the_way(slip: float) -> None:
+    turned = moved(0.1, 3.0, -3.0, -3.0, 3.0, turn_slip=slip)
+    assert turned.pose.yaw == pytest.approx((1 - slip) * 0.1)
+    assert turned.angles == pytest.approx([0.3, -0.3, -0.3, 0.3])
+    assert moved(1.0, 3.0, 3.0, 3.0, 3.0, turn_slip=slip).pose.x == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("load", [0.0, 0.25, 1.0])
+def test_load_takes_its_share_of_every_speed(load: float) -> None:
+    made = moved(2.0, 10.0, 10.0, -10.0, 10.0, load=load)
+    assert made.speeds == pytest.approx([s * (1 - load) for s in (10.0, 10.0, -10.0, 10.0)])
+    assert made.angles == pytest.approx([s * (1 - load) * 2 for s in (10.0, 10.0, -10.0, 10.0)])
+
+
+@pytest.mark.parametrize("speed", [0.5, -0.12])
+def test_hands_move_it_whatever_its_motors_do(speed: float) -> None:
+    made = moved(1.0, 10.0, -10.0, 3.0, 0.0)
+    before = made.pose
+    made.advance(2.0, push=speed)
+    assert made.speeds == pytest.approx([speed / RADIUS] * 4, rel=1e-6)
+    made.set_points[:] = [0.0] * 4
+    made.advance(1.0)
+    assert made.speeds == [0.0] * 4
+    assert math.dist((made.pose.x, made.pose.y), (before.x, before.y)) > 1.5 * abs(speed)
+
+
+# properties that the host does not know
+
+SPIN = (3.0, -3.0, -3.0, 3.0)
+"""Set points that the host takes for 1 rad/s on the spot."""
+
+
+def turned(seconds: float, sim: SimConfig, *set_points: float, steps: int = 1) -> float:
+    made = Vehicle(sim, DriveConfig())
+    made.set_points[:] = set_points or SPIN
+    for _ in range(steps):
+        made.advance(seconds / steps)
+    return made.turned
+
+
+def test_a_wider_true_track_turns_it_less_than_it_is_believed_to() -> None:
+    sim = SimConfig(motor_time_constant=0.0, track_multiplier=1.6)
+    assert turned(10.0, sim) == pytest.approx(10.0 / 1.6)
+
+
+def test_each_sides_true_radius_counts() -> None:
+    sim = SimConfig(
+        motor_time_constant=0.0, left_radius_multiplier=0.98, right_radius_multiplier=1.01
+    )
+    made = Vehicle(sim, DriveConfig())
+    made.set_points[:] = [10.0] * 4
+    made.advance(2.0)
+    assert made.turned == pytest.approx(20.0 * RADIUS * 0.03 / TRACK)
+    assert made.angles == [20.0] * 4
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("dependence", [0.08, -0.3])
+def test_the_track_grows_by_its_share_at_1_rad_per_s_either_way(
+    direction: float, dependence: float
+) -> None:
+    sim = SimConfig(motor_time_constant=0.0, track_rate_dependence=dependence)
+    at_one = turned(1.0, sim, *(direction * wheel for wheel in SPIN))
+    assert at_one == pytest.approx(direction / (1 + dependence))
+    creeping = turned(1000.0, sim, *(direction * wheel / 1000 for wheel in SPIN))
+    assert creeping == pytest.approx(direction, rel=1e-3)
+
+
+@given(st.floats(-0.4, 2.0), st.floats(0.01, 20.0))
+def test_faster_wheels_never_turn_it_slower(dependence: float, rate: float) -> None:
+    sim = SimConfig(motor_time_constant=0.0, track_rate_dependence=dependence)
+    slow = turned(1.0, sim, *(rate * wheel for wheel in SPIN))
+    fast = turned(1.0, sim, *(1.1 * rate * wheel for wheel in SPIN))
+    assert fast > slow > 0.0
+
+
+def test_a_slippery_floor_takes_up_to_its_share_and_another_each_time() -> None:
+    sim = SimConfig(motor_time_constant=0.0, turn_slip=0.4)
+    made = Vehicle(sim, DriveConfig())
+    made.set_points[:] = SPIN
+    kept = []
+    for _ in range(400):
+        before = made.turned
+        made.advance(0.25)
+        kept.append((made.turned - before) / 0.25)
+    assert all(0.6 < share <= 1.0 for share in kept)
+    assert len(set(kept)) == 400
+    assert sum(kept) / 400 == pytest.approx(0.8, abs=0.03)
+
+
+def test_a_floor_of_the_same_seed_is_the_same_and_another_is_another() -> None:
+    one, other = (SimConfig(turn_slip=0.4, seed=seed) for seed in (1, 2))
+    assert turned(5.0, one, steps=500) == turned(5.0, one, steps=500)
+    assert turned(5.0, one, steps=500) != turned(5.0, other, steps=500)
+
+
+def test_whole_turns_are_counted_beside_the_pose() -> None:
+    made = moved(12.0, *SPIN)
+    assert made.turned == pytest.approx(12.0)
+    assert math.remainder(made.turned - made.pose.yaw, math.tau) == pytest.approx(0.0, abs=1e-9)

@@ -1,0 +1,112 @@
+"""Texts of unknown senders are harmless, and values are formatted alike in every message."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.formatting import (
+    json_line,
+    lasting,
+    lines,
+    listed,
+    many,
+    printable,
+    printable_bytes,
+    rough,
+    signed,
+)
+
+MOST = 64
+
+HOSTILE = "a\x1b]0;PWNED\x07b\x9b2J\u202ec\r\nd\te"
+
+
+def test_nothing_that_a_terminal_obeys_is_left() -> None:
+    assert printable(HOSTILE) == "a\ufffd]0;PWNED\ufffdb\ufffd2J\ufffdc  d e"
+    assert lines(HOSTILE) == "a\ufffd]0;PWNED\ufffdb\ufffd2J\ufffdc \nd e"
+    assert printable("Zürich, 8.5 °C") == "Zürich, 8.5 °C"
+
+
+@pytest.mark.parametrize("data", [bytes(range(256)), b"\r\n", "é→`".encode(), b""])
+def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
+    text = printable_bytes(data, MOST)
+    assert text.isprintable()
+    assert text.removesuffix("…").isascii()
+    assert len(text) <= MOST + 1
+    assert text.endswith("…") == (len(data) > MOST)
+
+
+def test_of_many_bytes_the_first_or_the_last_are_shown_and_none_in_half() -> None:
+    data = b"\xff" * MOST + b"end"
+    assert printable_bytes(data, MOST) == r"\xff" * (MOST // 4) + "…"
+    assert printable_bytes(data, MOST, last=True) == "…" + r"\xff" * ((MOST - 3) // 4) + "end"
+
+
+@given(st.text(alphabet=st.characters(exclude_categories=["Cs"], max_codepoint=0xFFFF)))
+def test_json_stays_the_same_and_can_be_printed(text: str) -> None:
+    line = json_line(json.dumps(text, ensure_ascii=False))
+    assert json.loads(line) == text
+    assert line.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0.0 µs"), (63.1e-6, "63 µs"), (999.4e-6, "999 µs"), (999.6e-6, "1.0 ms"),
+        (8.9125e-3, "8.9 ms"), (9.949e-3, "9.9 ms"), (9.96e-3, "10 ms"), (0.3328, "333 ms"),
+        (2.5, "2.5 s"), (9900.0, "2.8 h"), (1e12, "?"), (-1.0, "?"), (math.nan, "?"),
+    ],
+)  # fmt: skip
+def test_a_short_duration_has_two_digits_in_its_own_unit(seconds: float, text: str) -> None:
+    assert rough(seconds, 1e-6) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(None, "never"), (math.inf, "never"), (0.04, "0.0 s"), (9.96, "10 s"), (99.4, "99 s"),
+     (240.0, "4.0 min"), (7300.0, "2.0 h"), (9e5, "10 d"), (math.nan, "?"), (-1.0, "?")],
+)  # fmt: skip
+def test_an_age_is_in_seconds_or_larger_units(seconds: float | None, text: str) -> None:
+    assert rough(seconds) == text
+
+
+@given(st.floats(), st.sampled_from([1e-6, 1.0]))
+def test_a_rough_duration_never_takes_more_than_7_characters(seconds: float, unit: float) -> None:
+    assert len(rough(seconds, unit)) <= 7
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.04, "0 s"), (3.0, "3 s"), (59.94, "59.9 s"), (59.96, "1 min"), (303.0, "5 min 3 s"),
+        (3599.7, "1 h"), (3600.0 + 59.0, "1 h"), (7500.0, "2 h 5 min"), (2_592_000.0, "30 d"),
+        (2_591_999.0, "29 d 23 h"),
+    ],
+)  # fmt: skip
+def test_a_duration_has_its_two_largest_units(seconds: float, text: str) -> None:
+    assert lasting(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
+     (math.inf, "   +inf"), (math.nan, "      -")],
+)  # fmt: skip
+def test_a_number_has_its_sign_and_its_place(value: float, text: str) -> None:
+    assert signed(value, 2, 7) == text
+
+
+def test_a_count_agrees_with_its_noun() -> None:
+    assert [many(count, "line") for count in (0, 1, 2)] == ["no lines", "1 line", "2 lines"]
+    assert many(2, "change of who drives") == "2 changes of who drives"
+    assert (many(1, "loss", "losses"), many(2, "loss", "losses")) == ("1 loss", "2 losses")
+
+
+def test_a_long_list_says_how_many_are_left_out() -> None:
+    assert listed(["a", "b"], 2) == "a, b"
+    assert listed(["a", "b", "c", "d"], 2, "; ") == "a; b; and 2 more"

@@ -1,0 +1,883 @@
+"""Tests of the guard, which checks every line last.
+
+They cover the lines it passes, the lines it replaces, and its reasons.
+"""
+
+from __future__ import annotations
+
+import binascii
+import random
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.contradictions import contradictions
+from acsard.core.config.settings import (
+    CommandsConfig,
+    Config,
+    DriveConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    McuConfig,
+    Source,
+    WheelMap,
+)
+from acsard.core.guard import MARGIN_NS, Guard, Memory
+from acsard.core.link.check import seal
+from acsard.core.link.codec import Codec
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.limits import Limiter
+from acsard.core.robot import Robot
+from acsard.core.values import (
+    REST,
+    STILL,
+    Command,
+    Inputs,
+    Instant,
+    Outputs,
+    Plain,
+    Received,
+    Request,
+    Twist,
+    Verb,
+    WheelSpeeds,
+)
+from tests.each import each
+
+MS = 1_000_000
+NOW_NS = 50_000 * MS
+SOURCES = (Source("app", 50), Source("slow", 10, timeout=1.0))
+CODEC = Codec(WheelMap())
+STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+NOT_A_LINE = "it is not a whole line of four wheels"
+TOO_FAST = "a wheel is over limits.wheel_speed"
+NO_LINK = "it moves a wheel without a link"
+GROWS = "a wheel grows without a fresh command in mode driving"
+LATE = "it still moves a wheel although the longest ramp to rest is over"
+
+
+def line(*wheels: float) -> bytes:
+    """Return the line for a, b, c, d; one number applies to all of them."""
+    return CODEC.encode(WheelSpeeds(*(wheels * 4 if len(wheels) == 1 else wheels)))
+
+
+def outputs(
+    data: bytes | None,
+    *,
+    mode: str = "driving",
+    linked: bool = True,
+    source: str = "app",
+    age_ms: float | None = 0.0,
+    at_ns: int = NOW_NS,
+) -> Outputs:
+    """Return a step's outputs with this line.
+
+    By default a fresh command is followed on a live link.
+    """
+    return Outputs(
+        now=Instant(at_ns, at_ns),
+        due=True,
+        line=data,
+        speeds=STILL,
+        applied=REST,
+        linked=linked,
+        estimates=(),
+        mode=mode,
+        reason="",
+        link="up" if linked else "down",
+        source=source,
+        command_ns=None if age_ms is None else at_ns - int(age_ms * MS),
+        status_changed=False,
+    )
+
+
+def coasting(data: bytes) -> Outputs:
+    """Return outputs with this line and without any commander."""
+    return outputs(data, mode="ready", source="", age_ms=None)
+
+
+class Guarded:
+    """A guard and the last line that it passed."""
+
+    def __init__(
+        self,
+        stop: bytes,
+        wheel_speed: float,
+        sources: tuple[Source, ...],
+        require_check: bool = False,
+    ) -> None:
+        config = Config(
+            mcu=McuConfig(link_check="require" if require_check else "off"),
+            limits=LimitsConfig(wheel_speed=wheel_speed),
+            commands=CommandsConfig(sources=sources),
+        )
+        self.guard = Guard(stop, config)
+        self._passed = stop
+        self.trip = ""
+
+    def check(self, found: Outputs) -> bytes | None:
+        line, self.trip = self.guard.check(found)
+        self._passed = line or self._passed
+        return line
+
+    def note_sent(self) -> None:
+        self.guard.left(self._passed)
+
+
+@pytest.fixture
+def guard() -> Guarded:
+    return Guarded(STOP, 40.0, SOURCES)
+
+
+def sent(guard: Guarded, *wheels: float) -> Guarded:
+    """Return the guard after it passed a line with these speeds and the line was sent."""
+    data = line(*wheels)
+    assert guard.check(outputs(data)) == data
+    guard.note_sent()
+    return guard
+
+
+def objection(guard: Guarded, found: Outputs) -> str:
+    """Return why the line became STOP, or "" if it passed unchanged."""
+    passed = guard.check(found)
+    assert passed == (STOP if guard.trip else found.line)
+    return guard.trip
+
+
+# lines that pass
+
+
+def test_before_the_first_line_nothing_was_replaced(guard: Guarded) -> None:
+    assert guard.trip == ""
+
+
+def test_no_line_is_no_line(guard: Guarded) -> None:
+    assert guard.check(outputs(None)) is None
+    assert guard.trip == ""
+
+
+@pytest.mark.parametrize("linked", [True, False])
+@pytest.mark.parametrize("mode", ["inactive", "waiting", "ready", "driving", "stopped", "fault"])
+def test_zero_passes_always(guard: Guarded, mode: str, linked: bool) -> None:
+    sent(guard, 10.0)
+    assert objection(guard, outputs(STOP, mode=mode, linked=linked, age_ms=None)) == ""
+
+
+def test_a_commanded_line_passes(guard: Guarded) -> None:
+    assert objection(guard, outputs(line(12.5, -8.75, 15.0, -10.25))) == ""
+
+
+def test_a_line_as_fast_as_the_last_one_sent_passes_without_a_command(guard: Guarded) -> None:
+    sent(guard, 12.5, -8.75, 15.0, -10.25)
+    assert objection(guard, coasting(line(12.5, -8.75, 15.0, -10.25))) == ""
+
+
+@pytest.mark.parametrize("trailing_comma", [True, False])
+def test_a_ramp_to_zero_passes_to_the_end(trailing_comma: bool) -> None:
+    kinematics = Kinematics(DriveConfig())
+    codec, limiter = Codec(WheelMap(), trailing_comma), Limiter(LimitsConfig(), kinematics)
+    guard = Guarded(codec.stop, 40.0, SOURCES)
+    limiter.follow(Twist(0.7, -2.3), 1000.0)
+    data = codec.encode(kinematics.wheel_speeds(limiter.twist))
+    assert guard.check(outputs(data)) == data
+    guard.note_sent()
+    while limiter.twist != REST:
+        data = codec.encode(kinematics.wheel_speeds(limiter.coast(0.01)))
+        assert guard.check(coasting(data)) == data
+        guard.note_sent()
+    assert data == codec.stop
+
+
+# not a line
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\r\n",
+        b"ap01.00,bp01.00,cp01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.00",
+        b"ap01.00,bp01.00,cp01.00,dp01.00\n\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.00,\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp001.0\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01,00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp 1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp+1.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp0x.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dp01.0_\r\n",
+        b"ap01.00,bp01.00,cp01.00,dpnanan\r\n",
+        b"ap01.00,bp01.00,cp01.00,d-01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,dP01.00\r\n",
+        b"ap01.00,bp01.00,cp01.00,cp01.00\r\n",
+        b"bp01.00,ap01.00,cp01.00,dp01.00\r\n",
+        b"Ap01.00,bp01.00,cp01.00,dp01.00\r\n",
+        b"ap01.00;bp01.00;cp01.00;dp01.00\r\n",
+        b"ap01.00 bp01.00,cp01.00,dp01.00\r\n",
+        b"ap01.00, bp1.00,cp01.00,dp01.00\r\n",
+        b"ap100.00,bp01.00,cp1.00,dp1.00\r\n",
+        # Of two lines at once, the MCU would obey the first before the guard saw it.
+        b"ap01.00,bp01.00,cp01.00,dp01.00\r\n" * 2,
+        b"ap90.00,bp90.00,cp90.00,dp90.00\r\nap01.00,bp01.00,cp01.00,dp01.00\r\n",
+    ],
+)
+def test_what_is_not_a_whole_line_of_this_dialect_becomes_stop(guard: Guarded, data: bytes) -> None:
+    assert objection(guard, outputs(data)) == NOT_A_LINE
+
+
+def test_with_a_trailing_comma_only_lines_with_one_pass() -> None:
+    stop = STOP[:-2] + b",\r\n"
+    guard = Guarded(stop, 40.0, SOURCES)
+    good = b"ap12.50,bn08.75,cp15.00,dn10.25,\r\n"
+    assert guard.check(outputs(good)) == good
+    assert guard.check(outputs(line(1.0))) == stop
+    assert guard.trip == NOT_A_LINE
+    assert guard.check(outputs(b"ap12.50,bn08.75,cp15.00,dn10.25;\r\n")) == stop
+
+
+@given(data=st.binary(max_size=40))
+def test_noise_never_passes_and_never_raises(data: bytes) -> None:
+    assert objection(Guarded(STOP, 40.0, SOURCES), outputs(data)) == NOT_A_LINE
+
+
+# over the limit
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_no_wheel_may_be_faster_than_its_limit(guard: Guarded, wheel: int, sign: float) -> None:
+    speeds = [0.0, 0.0, 0.0, 0.0]
+    speeds[wheel] = sign * 40.0
+    assert objection(guard, outputs(line(*speeds))) == ""
+    speeds[wheel] = sign * 40.02
+    assert objection(guard, outputs(line(*speeds))) == TOO_FAST
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.294, 0.295, 0.296, 1.005, 39.996, 40.0, 99.985, 99.99])
+def test_a_wheel_at_its_limit_passes_however_the_limit_is_rounded(limit: float) -> None:
+    guard = Guarded(STOP, limit, SOURCES)
+    assert objection(guard, outputs(line(limit))) == ""
+    assert objection(guard, outputs(line(-limit))) == ""
+
+
+# no link
+
+
+def test_without_a_link_no_wheel_moves_not_even_more_slowly(guard: Guarded) -> None:
+    sent(guard, 10.0)
+    assert objection(guard, outputs(line(1.0), linked=False)) == NO_LINK
+    assert objection(guard, outputs(line(0.0, 0.0, 0.0, 0.01), linked=False)) == NO_LINK
+
+
+# growing speeds
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_command_no_wheel_may_grow(guard: Guarded, wheel: int, sign: float) -> None:
+    sent(guard, sign * 10.0)
+    speeds = [sign * 9.0] * 4
+    speeds[wheel] = sign * 10.01
+    assert objection(guard, coasting(line(*speeds))) == GROWS
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_command_no_wheel_may_turn_round(guard: Guarded, wheel: int, sign: float) -> None:
+    sent(guard, sign * 10.0)
+    speeds = [sign * 9.0] * 4
+    speeds[wheel] = sign * -0.01
+    assert objection(guard, coasting(line(*speeds))) == GROWS
+
+
+def test_without_a_command_the_slowest_wheel_may_not_turn_round_either(guard: Guarded) -> None:
+    sent(guard, 0.01)
+    assert objection(guard, coasting(line(0.01, 0.01, 0.01, -0.01))) == GROWS
+
+
+def test_a_wheel_that_stands_may_go_on_standing_while_others_slow_down(guard: Guarded) -> None:
+    sent(guard, 5.0, 0.0, -5.0, 0.0)
+    assert objection(guard, coasting(line(4.0, 0.0, -4.0, 0.0))) == ""
+
+
+def test_from_rest_nothing_moves_without_a_command(guard: Guarded) -> None:
+    assert objection(guard, coasting(line(0.01))) == GROWS
+
+
+@pytest.mark.parametrize(
+    "mode", ["inactive", "waiting", "ready", "stopped", "fault", "leaving", "", "Driving"]
+)
+def test_a_wheel_grows_only_in_mode_driving(guard: Guarded, mode: str) -> None:
+    assert objection(guard, outputs(line(1.0), mode=mode)) == GROWS
+
+
+def test_a_wheel_grows_only_for_a_configured_source(guard: Guarded) -> None:
+    assert objection(guard, outputs(line(1.0), source="stranger")) == GROWS
+    assert objection(guard, outputs(line(1.0), source="")) == GROWS
+
+
+@pytest.mark.parametrize(("source", "timeout_ms"), [("app", 250), ("slow", 1000)])
+def test_a_wheel_grows_only_for_a_command_within_the_timeout_of_its_source(
+    guard: Guarded, source: str, timeout_ms: float
+) -> None:
+    fresh = outputs(line(1.0), source=source, age_ms=timeout_ms)
+    old = outputs(line(1.0), source=source, age_ms=timeout_ms + 0.001)
+    assert objection(guard, fresh) == ""
+    assert objection(guard, old) == GROWS
+    assert objection(guard, outputs(line(1.0), source=source, age_ms=None)) == GROWS
+
+
+def test_a_command_that_arrived_while_the_step_ran_is_fresh(guard: Guarded) -> None:
+    assert objection(guard, outputs(line(1.0), age_ms=-1.0)) == ""
+
+
+def test_a_command_from_the_far_future_is_not_fresh(guard: Guarded) -> None:
+    assert objection(guard, outputs(line(1.0), age_ms=-1000.0)) == GROWS
+
+
+# the last sent line
+
+
+def test_a_line_that_did_not_go_out_is_not_what_the_next_is_compared_with(guard: Guarded) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, outputs(line(6.0))) == ""  # passed but not sent
+    assert objection(guard, coasting(line(6.0))) == GROWS
+    assert objection(guard, coasting(line(5.0))) == ""
+
+
+def test_a_slower_line_that_did_not_go_out_does_not_lower_the_comparison(guard: Guarded) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(3.0))) == ""  # passed but not sent
+    assert objection(guard, coasting(line(4.0))) == ""
+
+
+def test_each_line_sent_lowers_what_the_next_may_say(guard: Guarded) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(3.0))) == ""
+    guard.note_sent()
+    assert objection(guard, coasting(line(3.01))) == GROWS
+
+
+def test_after_a_trip_what_was_sent_is_the_stop(guard: Guarded) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(6.0))) == GROWS
+    guard.note_sent()
+    assert objection(guard, coasting(line(1.0))) == GROWS
+
+
+def test_a_trip_that_did_not_go_out_leaves_the_last_line_sent(guard: Guarded) -> None:
+    sent(guard, 5.0)
+    assert objection(guard, coasting(line(6.0))) == GROWS
+    assert objection(guard, coasting(line(4.0))) == ""
+
+
+def test_a_step_without_a_line_leaves_the_last_line_sent(guard: Guarded) -> None:
+    sent(guard, 5.0)
+    assert guard.check(outputs(None)) is None
+    assert objection(guard, coasting(line(5.0))) == ""
+
+
+def test_the_trip_is_of_the_last_line_only(guard: Guarded) -> None:
+    assert objection(guard, coasting(line(1.0))) == GROWS
+    assert objection(guard, outputs(line(1.0))) == ""
+    assert objection(guard, coasting(line(2.0))) == GROWS
+    assert guard.check(outputs(None)) is None
+    assert guard.trip == ""
+
+
+# the end of every ramp
+
+SLOW_TO_STOP = LimitsConfig(
+    linear_speed=1.0,
+    angular_speed=2.0,
+    linear_deceleration=0.5,
+    angular_deceleration=4.0,
+    linear_stop_deceleration=2.0,
+    angular_stop_deceleration=5.0,
+)
+"""Limits whose longest ramp takes 2 s, and 0.5 s after a stop."""
+
+
+class Clocked:
+    """A guard with its time in ms after the last fresh command; lines that pass are sent."""
+
+    def __init__(self, limits: LimitsConfig = SLOW_TO_STOP) -> None:
+        self.guard = Guard(STOP, Config(limits=limits))
+        self.drive(0)
+
+    def drive(self, ms: float, speed: float = 10.0) -> None:
+        """Follow a fresh command at this time."""
+        assert self.trip(ms, "driving", speed) == ""
+
+    def trip(self, ms: float, mode: str, speed: float = 10.0, line_due: bool = True) -> str:
+        """Return the guard's objection to a line at this time.
+
+        A command is fresh only in mode driving.
+        """
+        fresh = mode == "driving"
+        found = outputs(
+            line(speed) if line_due else None,
+            mode=mode,
+            source="app" if fresh else "",
+            age_ms=0.0 if fresh else None,
+            at_ns=NOW_NS + int(ms * MS),
+        )
+        passed, trip = self.guard.check(found)
+        assert passed == (STOP if trip else found.line)
+        if passed is not None:
+            self.guard.left(passed)
+        return trip
+
+
+def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
+    clocked = Clocked()
+    trips = [clocked.trip(ms, "stopped") for ms in range(10, 3_600_000, 10)]
+    first = next(n for n, trip in enumerate(trips) if trip)
+    assert trips[first] == LATE
+    assert (first + 1) * 10 == 10 + 500 + MARGIN_NS // MS + 10
+    # no motion may start again after the stop that was sent
+    assert set(trips[first + 1 :]) == {GROWS}
+
+
+@pytest.mark.parametrize(
+    ("mode", "ramp_ms"),
+    [
+        ("ready", 2000), ("waiting", 2000), ("inactive", 2000),
+        ("stopped", 500), ("fault", 500), ("leaving", 500),
+    ],
+)  # fmt: skip
+def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(
+    mode: str, ramp_ms: float
+) -> None:
+    last_ms = ramp_ms + 300
+    clocked = Clocked()
+    assert clocked.trip(0, mode) == clocked.trip(last_ms, mode) == ""
+    assert clocked.trip(last_ms + 0.000001, mode, 0.01) == LATE
+    assert clocked.trip(last_ms + 1, mode, 0.0) == ""
+
+
+def test_a_stale_command_in_mode_driving_does_not_keep_the_robot_going() -> None:
+    clocked = Clocked()
+    stale = outputs(line(10.0), age_ms=251, at_ns=NOW_NS + 2301 * MS)
+    assert clocked.guard.check(stale) == (STOP, LATE)
+
+
+def test_each_fresh_command_begins_the_time_anew() -> None:
+    clocked = Clocked()
+    for ms in range(0, 60_000, 250):
+        clocked.drive(ms)
+    assert clocked.trip(59_750 + 2300, "ready") == ""
+    assert clocked.trip(59_750 + 2301, "ready") == LATE
+
+
+def test_a_stop_in_the_middle_of_a_ramp_has_its_own_time_and_no_more_than_the_ramp() -> None:
+    clocked = Clocked()
+    assert clocked.trip(1000, "ready") == clocked.trip(1100, "stopped") == ""
+    assert clocked.trip(1900, "stopped") == ""
+    assert clocked.trip(1901, "stopped") == LATE
+    late = Clocked()
+    assert late.trip(2000, "stopped") == late.trip(2300, "stopped") == ""
+    assert late.trip(2301, "stopped") == LATE
+
+
+def test_a_stop_that_is_cleared_leaves_the_time_of_the_ramp() -> None:
+    clocked = Clocked()
+    assert clocked.trip(0, "stopped") == ""
+    assert clocked.trip(500, "ready", line_due=False) == ""
+    assert clocked.trip(1000, "ready") == clocked.trip(1000, "stopped") == ""
+    assert clocked.trip(1800, "stopped") == ""
+    assert clocked.trip(1801, "stopped") == LATE
+
+
+def test_a_second_stop_has_its_own_time_even_right_behind_a_command() -> None:
+    clocked = Clocked()
+    assert clocked.trip(100, "stopped") == ""
+    clocked.drive(600)
+    assert clocked.trip(1300, "stopped") == ""
+    assert clocked.trip(2100, "stopped") == ""
+    assert clocked.trip(2101, "stopped") == LATE
+
+
+def test_new_settings_keep_the_time_and_the_longer_ramp_of_a_robot_in_motion() -> None:
+    clocked = Clocked()
+    slower = replace(SLOW_TO_STOP, linear_speed=0.1, linear_deceleration=5.0)
+    for ms in range(0, 2300, 100):
+        clocked.guard.use(Config(limits=slower))
+        assert clocked.trip(ms, "ready") == ""
+    assert clocked.trip(2300, "ready") == ""
+    assert clocked.trip(2301, "ready") == LATE
+
+
+def test_new_settings_with_a_longer_ramp_give_a_robot_in_motion_more_time() -> None:
+    clocked = Clocked()
+    clocked.guard.use(Config(limits=replace(SLOW_TO_STOP, linear_deceleration=0.25)))
+    assert clocked.trip(4300, "ready") == ""
+    assert clocked.trip(4301, "ready") == LATE
+
+
+def test_new_settings_with_a_longer_stop_give_a_robot_in_motion_more_time() -> None:
+    clocked = Clocked()
+    clocked.guard.use(Config(limits=replace(SLOW_TO_STOP, linear_stop_deceleration=1.0)))
+    assert clocked.trip(0, "stopped") == clocked.trip(1300, "stopped") == ""
+    assert clocked.trip(1301, "stopped") == LATE
+
+
+def test_a_ramp_that_was_longer_counts_no_more_once_the_robot_was_at_rest() -> None:
+    clocked = Clocked()
+    clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))  # 0.4 s
+    assert clocked.trip(100, "ready", 0.0) == ""
+    clocked.drive(1000)
+    assert clocked.trip(1700, "ready") == ""
+    assert clocked.trip(1701, "ready") == LATE
+
+
+def test_the_ramp_of_a_robot_that_skids_is_that_of_its_wider_track() -> None:
+    limits = LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0)
+    narrow, wide = (
+        Guard(STOP, Config(limits=limits, drive=DriveConfig(wheel_separation_multiplier=factor)))
+        for factor in (1.0, 2.0)
+    )
+    assert narrow.memory.ramp_ns == pytest.approx(2 * wide.memory.ramp_ns, rel=1e-6)
+
+
+def test_at_rest_new_settings_bring_their_own_ramp() -> None:
+    clocked = Clocked()
+    assert clocked.trip(100, "ready", 0.0) == ""
+    # this ramp takes 0.4 s
+    clocked.guard.use(Config(limits=LimitsConfig(linear_speed=0.4, angular_speed=0.4)))
+    clocked.drive(1000)
+    assert clocked.trip(1700, "ready") == ""
+    assert clocked.trip(1701, "ready") == LATE
+
+
+@pytest.mark.parametrize(
+    ("limits", "ramp_ms"),
+    [
+        (LimitsConfig(), 1000),
+        (LimitsConfig(angular_deceleration=2.0), 2000),
+        # The wheels allow only 0.5 m/s and 3.33 rad/s.
+        (LimitsConfig(linear_speed=9.0, angular_speed=0.0, wheel_speed=10.0), 500),
+        (LimitsConfig(linear_speed=0.0, angular_speed=50.0, wheel_speed=10.0), 833),
+    ],
+)
+def test_the_longest_ramp_is_worked_by_hand(limits: LimitsConfig, ramp_ms: int) -> None:
+    assert Guard(STOP, Config(limits=limits)).memory.ramp_ns // MS == ramp_ms
+
+
+def test_a_guard_goes_on_from_the_memory_of_another() -> None:
+    clocked = Clocked()
+    assert clocked.trip(10, "stopped") == ""
+    memory = clocked.guard.memory
+    assert memory == Memory(line(10.0), NOW_NS, NOW_NS + 10 * MS, 2000 * MS, 500 * MS)
+    clocked.guard = Guard(STOP, Config(limits=SLOW_TO_STOP), memory)
+    assert clocked.trip(810, "stopped") == ""
+    assert clocked.trip(811, "stopped") == LATE
+
+
+def test_a_line_that_moves_before_any_command_is_late() -> None:
+    guard = Guard(STOP, Config(), Memory(line(1.0)))
+    assert guard.check(coasting(line(1.0))) == (STOP, LATE)
+
+
+# with a robot
+
+
+class Loop:
+    """Robot and guard, connected as in the control loop; `wire` collects the sent lines."""
+
+    def __init__(self, config: Config, wheel_speed: float | None = None) -> None:
+        self.robot = Robot(config)
+        self.stop = self.robot.session.codec.stop
+        most = config.limits.wheel_speed if wheel_speed is None else wheel_speed
+        self.guard = Guarded(self.stop, most, config.commands.sources)
+        self.guard.guard.use(replace(config, limits=replace(config.limits, wheel_speed=most)))
+        self.config = config
+        self.now_ns = NOW_NS
+        self.opened = 1
+        self.superseded = False
+        self.trip = ""
+        self.trips: list[str] = []
+        self.events: list[str] = []
+        self.wire: list[tuple[bytes, Outputs]] = []
+
+    def step(
+        self,
+        *commands: Command,
+        ask: Verb | None = None,
+        settings: dict[str, Plain] | None = None,
+        ms: float = 10.0,
+        tick: bool = True,
+        heard: int = 1,
+        port_open: bool = True,
+        goes: bool = True,
+    ) -> Outputs:
+        self.now_ns += int(ms * MS)
+        now = Instant(self.now_ns, self.now_ns)
+        found = self.robot.step(
+            Inputs(
+                now=now,
+                tick=tick,
+                port_open=port_open,
+                opened=self.opened,
+                received=(Received(now, self.stop * heard),),
+                commands=commands,
+                requests=(Request(ask, settings=settings or {}),) if ask else (),
+                guard_trip=self.trip,
+                superseded=self.superseded,
+            )
+        )
+        self.events += [event.name for event in found.events]
+        if self.robot.config is not self.config:
+            self.config = self.robot.config
+            self.guard.guard.use(self.config)
+        data, self.trip = self.guard.check(found), self.guard.trip
+        self.trips += [self.trip] * bool(self.trip)
+        if data is None:
+            self.superseded = False
+            return found
+        self.superseded = not (goes and port_open)
+        if not self.superseded:
+            self.guard.note_sent()
+            self.wire.append((data, found))
+        return found
+
+    def command(self, linear: float, angular: float = 0.0) -> Command:
+        return Command("app", Twist(linear, angular), self.now_ns)
+
+
+def test_one_trip_is_one_fault_that_names_it() -> None:
+    loop = Loop(Config(), wheel_speed=5.0)  # the robot itself assumes 40 rad/s
+    loop.step(heard=3)
+    loop.step(loop.command(0.0))
+    for _ in range(60):
+        found = loop.step(loop.command(1.0))
+    assert loop.trips == [TOO_FAST]
+    assert loop.events.count("fault") == 1
+    assert TOO_FAST in found.reason
+    assert loop.wire[-1][0] == STOP
+
+
+@st.composite
+def legal(draw: st.DrawFn) -> Config:
+    """Return a configuration whose slowest ramps are often as long as the rules allow."""
+    drive = DriveConfig(
+        draw(st.floats(0.03, 0.2)),
+        draw(st.floats(0.2, 0.8)),
+        draw(st.floats(0.5, 2.0)),
+        draw(st.floats(0.8, 1.2)),
+        draw(st.floats(0.8, 1.2)),
+    )
+    wheel_speed = draw(st.floats(1.0, 90.0))
+    sides = drive.left_wheel_radius_multiplier + drive.right_wheel_radius_multiplier
+    rim = wheel_speed * drive.wheel_radius * sides / 2
+    most = (rim, 2 * rim / (drive.wheel_separation * drive.wheel_separation_multiplier))
+    numbers: dict[str, float] = {"wheel_speed": wheel_speed}
+    for axis, reach, limit in zip(("linear", "angular"), most, (10.0, 50.0), strict=True):
+        speed = draw(st.floats(0.0, limit))
+        fastest = min(speed, reach)
+        least = max(0.02, 1.001 * fastest / 5)
+        softer = draw(st.one_of(st.just(least), st.floats(least, 100.0)))
+        harder = max(softer, 1.001 * fastest / 2)
+        numbers |= {
+            f"{axis}_speed": speed,
+            f"{axis}_acceleration": 100.0,
+            f"{axis}_deceleration": softer,
+            f"{axis}_stop_deceleration": draw(st.one_of(st.just(harder), st.floats(harder, 100.0))),
+            f"{axis}_jerk": draw(st.sampled_from((0.0, 0.0, 500.0))),
+        }
+    return Config(
+        drive=drive,
+        limits=LimitsConfig(**numbers),
+        feedback=FeedbackConfig(wheel_speed=99.99, fault_time=0.0),
+    )
+
+
+HAPPENINGS = (
+    "silence", "stall", "superseded", "command", "half", "stop", "clear", "lower", "harder"
+)  # fmt: skip
+
+
+def happen(loop: Loop, what: str, steps: int, ms: float, full: Twist) -> None:
+    """Apply one event in the middle of a ramp."""
+    limits = loop.config.limits
+    match what:
+        case "stall":
+            loop.step(ms=ms * 10)
+        case "superseded":
+            for _ in range(steps):
+                loop.step(ms=ms, goes=False)
+        case "command" | "half":
+            share = 1.0 if what == "command" else 0.5
+            for _ in range(steps):
+                loop.step(loop.command(full.linear * share, full.angular * share), ms=ms)
+        case "stop" | "clear":
+            loop.step(ask=what, ms=ms)
+        case "lower":
+            slower = limits.linear_speed / 2, limits.angular_speed / 2
+            names = "limits.linear_speed", "limits.angular_speed"
+            loop.step(ask="set", settings=dict(zip(names, slower, strict=True)), ms=ms)
+        case "harder":
+            braking = limits.linear_stop_deceleration
+            settings: dict[str, Plain] = {"limits.linear_deceleration": braking}
+            loop.step(ask="set", settings=settings, ms=ms)
+    for _ in range(steps):
+        loop.step(ms=ms)
+
+
+@given(
+    config=legal(),
+    ms=st.sampled_from((3.0, 10.0, 24.0, 90.0)),
+    signs=st.tuples(st.sampled_from((-1, 0, 1)), st.sampled_from((-1, 0, 1))),
+    happenings=st.lists(st.tuples(st.sampled_from(HAPPENINGS), st.integers(0, 12)), max_size=6),
+)
+def test_no_legal_ramp_is_cut_short_whatever_happens_in_it(
+    config: Config, ms: float, signs: tuple[int, int], happenings: list[tuple[str, int]]
+) -> None:
+    assume(not contradictions(config))
+    loop = Loop(config)
+    full = Twist(signs[0] * 10.0, signs[1] * 50.0)
+    loop.step(heard=3)
+    loop.step(loop.command(0.0))
+    for _ in range(30):
+        loop.step(loop.command(full.linear, full.angular), ms=24.0)
+    for what, steps in happenings:
+        happen(loop, what, steps, ms, full)
+    for _ in range(round(5500 / ms)):
+        loop.step(ms=ms)
+    assert loop.trips == []
+    assert loop.wire[-1][0] == STOP
+
+
+EACH_CONFIG = pytest.mark.parametrize(
+    "config",
+    [
+        pytest.param(Config(), id="default"),
+        pytest.param(
+            Config(commands=CommandsConfig(neutral_first=False)),
+            id="without neutral first",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            Config(limits=LimitsConfig(linear_jerk=5.0, angular_jerk=20.0, wheel_speed=20.0)),
+            id="jerk",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+
+
+def random_walk(rng: random.Random, config: Config) -> Loop:
+    """Run three seconds in which the port, the MCU, the wire and the operators behave randomly."""
+    loop, port_open, heard, goes = Loop(config), True, 1, 1.0
+    twist = REST
+    verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate")
+    for _ in range(300):
+        if rng.random() < (0.01 if port_open else 0.2):
+            port_open = not port_open
+            loop.opened += port_open
+        if rng.random() < 0.01:
+            loop.opened += port_open  # lost and found again between two steps
+        if rng.random() < 0.05:
+            heard = rng.choice((0, 1, 1, 1, 3))
+        if rng.random() < 0.02:
+            goes = rng.choice((1.0, 1.0, 0.7, 0.2))
+        if rng.random() < 0.1:
+            twist = rng.choice((REST, REST, Twist(0.5), Twist(-2.0, 2.0), Twist(0.0, -9.0)))
+        loop.step(
+            *[loop.command(twist.linear, twist.angular)] * (rng.random() < 0.5),
+            ask=rng.choice(verbs) if rng.random() < 0.01 else None,
+            ms=rng.choice((10.0, 10.0, 10.0, 11.0, 3.0, 60.0)),
+            tick=rng.random() < 0.85,
+            heard=heard,
+            port_open=port_open,
+            goes=rng.random() < goes,
+        )
+    return loop
+
+
+@EACH_CONFIG
+def test_a_healthy_robot_never_trips_the_guard(config: Config) -> None:
+    moved = 0
+    for seed in range(40):
+        loop = random_walk(random.Random(seed), config)
+        assert loop.trips == []
+        moved += sum(data != STOP for data, _ in loop.wire)
+    assert moved > 500
+
+
+@EACH_CONFIG
+def test_on_the_wire_no_wheel_grows_without_a_fresh_command_nor_moves_without_a_link(
+    config: Config,
+) -> None:
+    for seed in range(40):
+        before = (0.0, 0.0, 0.0, 0.0)
+        for data, found in random_walk(random.Random(seed), config).wire:
+            wheels = CODEC.decode(data.rstrip()).as_tuple()
+            assert found.linked or not any(wheels)
+            arrived_ns = found.command_ns
+            fresh = arrived_ns is not None and found.now.mono_ns - arrived_ns <= 250 * MS
+            if not (fresh and found.linked and found.mode == "driving"):
+                for old, new in zip(before, wheels, strict=True):
+                    assert abs(new) <= abs(old)
+                    assert new * old >= 0.0
+            before = wheels
+
+
+# the checked line
+
+NO_CHECK = "it moves a wheel without the check that mcu.link_check requires"
+
+
+@pytest.mark.parametrize("comma", [False, True])
+@pytest.mark.parametrize("letters", [b"", b"S"])
+@given(sequence=st.integers(0, 255), speed=st.floats(-40.0, 40.0))
+def test_a_line_with_a_right_check_passes(
+    comma: bool, letters: bytes, sequence: int, speed: float
+) -> None:
+    codec = Codec(WheelMap(), comma)
+    sealed = seal(codec.encode(WheelSpeeds(speed, -speed, speed, -speed)), sequence, letters)
+    assert objection(Guarded(codec.stop, 40.0, SOURCES), outputs(sealed)) == ""
+
+
+def test_what_a_checked_line_says_is_judged_as_ever(guard: Guarded) -> None:
+    assert objection(guard, outputs(seal(line(41.0), 7))) == TOO_FAST
+    assert objection(guard, outputs(seal(line(1.0), 7), linked=False)) == NO_LINK
+    assert objection(guard, coasting(seal(line(1.0), 7))) == GROWS
+    assert objection(guard, outputs(seal(STOP, 7), mode="fault", linked=False)) == ""
+
+
+@each("place", range(42))
+@each("bit", range(8))
+def test_a_checked_line_with_one_bit_wrong_is_none(guard: Guarded, place: int, bit: int) -> None:
+    good = seal(line(12.5, -8.75, 15.0, -10.25), 7, b"S")
+    bad = b"%b%c%b" % (good[:place], good[place] ^ 1 << bit, good[place + 1 :])
+    assert objection(guard, outputs(bad)) == NOT_A_LINE
+
+
+@pytest.mark.parametrize(
+    ("suffix", "letters"),
+    [(b"#07", b"Z"), (b"#07", b"SS"), (b"#0", b""), (b"#007", b""), (b"#0a", b""), (b",#07", b"")],
+)
+def test_another_suffix_is_none_even_under_a_right_check(
+    guard: Guarded, suffix: bytes, letters: bytes
+) -> None:
+    body = line(1.0)[:-2] + suffix + letters
+    closed = b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
+    assert objection(guard, outputs(closed)) == NOT_A_LINE
+
+
+def test_the_comma_of_the_dialect_is_not_left_out_of_a_checked_line() -> None:
+    guard = Guarded(STOP[:-2] + b",\r\n", 40.0, SOURCES)
+    guard.check(outputs(seal(line(1.0), 7)))
+    assert guard.trip == NOT_A_LINE
+
+
+def test_where_the_check_is_required_no_wheel_moves_without() -> None:
+    guard = Guarded(STOP, 40.0, SOURCES, require_check=True)
+    assert objection(guard, outputs(line(1.0))) == NO_CHECK
+    assert objection(guard, outputs(STOP)) == ""
+    assert objection(guard, outputs(seal(line(1.0), 7))) == ""

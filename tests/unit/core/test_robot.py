@@ -1,0 +1,1396 @@
+"""Tests of `Robot.step`, one step at a time: link, modes, commands, lines, answers and counters."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import Counter
+from itertools import pairwise
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import (
+    CommandsConfig,
+    Config,
+    ControlConfig,
+    FeedbackConfig,
+    LimitsConfig,
+    McuConfig,
+    OdometryConfig,
+    Source,
+)
+from acsard.core.link.codec import Codec
+from acsard.core.motion.told import MAX_SENDER
+from acsard.core.motion.words import waiting
+from acsard.core.robot import Robot
+from acsard.core.values import (
+    NS_PER_S,
+    REST,
+    STILL,
+    Answer,
+    Command,
+    Event,
+    GyroSample,
+    Inputs,
+    Instant,
+    Latch,
+    Latches,
+    Outputs,
+    Plain,
+    Pose,
+    Received,
+    Refusal,
+    Request,
+    Twist,
+    Verb,
+    WheelSpeeds,
+)
+
+MS = 1_000_000
+WALL_NS = 1_800_000_000 * NS_PER_S
+GO = Twist(0.5, 0.0)
+ZERO_LINE = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+ROLLING = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
+"""Wheel speeds of 0.5 m/s straight on."""
+
+
+class Bench:
+    """A robot with its time and an MCU that answers every period with `reply`."""
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        latches: Latches = Latches(),  # noqa: B008
+        fault_time: float = 0.0,
+    ) -> None:
+        # `fault_time` 0 disables contradiction faults, because this MCU always reports the same
+        # speeds.
+        config = replace(config or Config(), feedback=FeedbackConfig(fault_time=fault_time))
+        self.robot = Robot(config, latches)
+        self.codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
+        self.now_ns = 50 * NS_PER_S
+        self.period_ms = 1000 / config.rate_hz
+        self.opened = 1
+        self.port_open = True
+        self.reply: bytes | None = self.codec.stop
+        self.leaving = False
+        self.out = self.robot.step(Inputs(self.now, tick=False, port_open=False))
+
+    @property
+    def now(self) -> Instant:
+        return Instant(self.now_ns, self.now_ns + WALL_NS)
+
+    def step(
+        self,
+        *commands: Twist,
+        source: str = "app",
+        ask: Verb | None = None,
+        pose: Pose | None = None,
+        ms: float | None = None,
+        tick: bool = True,
+        superseded: bool = False,
+        guard_trip: str = "",
+        refusals: tuple[Refusal, ...] = (),
+        gyro: float | None = None,
+        late_ms: float | None = None,
+    ) -> Outputs:
+        """Run one step a period later, or `ms` later, and return its outputs.
+
+        A `clear` or `activate` names the latch of the step before, as the tools do. `gyro` is the
+        rate of a sample. With `late_ms`, the commands carry stamps that old by a clock of their
+        own.
+        """
+        held = self.out.latches.in_force
+        latch = held.number if ask in ("clear", "activate") and held else None
+        self.now_ns += int((self.period_ms if ms is None else ms) * MS)
+        heard = self.reply is not None and self.port_open
+        stamp_ns = None if late_ms is None else self.now_ns + WALL_NS - int(late_ms * MS)
+        self.out = self.robot.step(
+            Inputs(
+                now=self.now,
+                tick=tick,
+                port_open=self.port_open,
+                opened=self.opened,
+                received=(Received(self.now, self.reply),) if heard and self.reply else (),
+                commands=tuple(Command(source, t, self.now_ns, stamp_ns) for t in commands),
+                gyro=() if gyro is None else (GyroSample(self.now_ns, None, gyro),),
+                requests=(Request(ask, 7, pose, latch=latch),) if ask else (),
+                refusals=refusals,
+                guard_trip=guard_trip,
+                superseded=superseded,
+                leaving=self.leaving,
+            )
+        )
+        return self.out
+
+    def linked(self) -> Bench:
+        """Step until the link is up."""
+        for _ in range(3):
+            self.step()
+        assert self.out.link == "up"
+        return self
+
+    def driving(self, twist: Twist = GO, steps: int = 60) -> Bench:
+        """Link up, arm with a zero, and follow the twist until it is reached."""
+        self.linked().step(REST)
+        for _ in range(steps):
+            self.step(twist)
+        assert self.out.mode == "driving"
+        return self
+
+    def let_go(self) -> Bench:
+        """Send zeros until one arrives a timeout after the last speed."""
+        for _ in range(27):
+            self.step(REST)
+        return self
+
+    def unplug(self) -> Bench:
+        self.port_open = False
+        return self
+
+    def replug(self) -> Bench:
+        self.port_open = True
+        self.opened += 1
+        return self
+
+    def answer(self, ask: Verb, pose: Pose | None = None) -> Answer:
+        (answer,) = self.step(ask=ask, pose=pose).answers
+        assert answer.id == 7
+        return answer
+
+    def said(self) -> WheelSpeeds | None:
+        """Return the wheel speeds of the last line, or None without a line."""
+        return None if self.out.line is None else self.codec.decode(self.out.line.rstrip(b",\r\n"))
+
+    @property
+    def robot_latch(self) -> int:
+        """Return the number of the latch that `clear` releases next."""
+        latch = self.robot.step(Inputs(self.now, False, True, self.opened)).latches.next
+        return 0 if latch is None else latch.number
+
+    def set(self, settings: dict[str, Plain]) -> dict[str, float]:
+        """Change settings and return the limits that are kept lowered afterwards."""
+        self.now_ns += 10 * MS
+        requests = (Request("set", 7, settings=settings),)
+        self.out = self.robot.step(Inputs(self.now, True, True, self.opened, requests=requests))
+        assert self.out.answers[0].success
+        return self.out.latches.lowered
+
+    def link(self) -> str:
+        return self.out.link
+
+    def mode(self) -> str:
+        return self.out.mode
+
+    def counters(self) -> dict[str, int]:
+        return self.robot.snapshot(self.now_ns).counters
+
+
+def names(outputs: Outputs) -> list[str]:
+    return [event.name for event in outputs.events]
+
+
+# the link
+
+
+def test_without_a_port_the_robot_waits_and_says_why() -> None:
+    out = Bench().out
+    assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
+    assert out.reason == "the serial port is closed; it is being reopened"
+
+
+def test_an_open_port_boots_and_three_good_lines_make_it_ready() -> None:
+    bench = Bench()
+    seen = []
+    for _ in range(4):
+        out = bench.step()
+        seen.append((out.mode, out.link, out.linked))
+    booting = ("waiting", "booting", False)
+    assert seen == [booting, booting, ("ready", "up", True), ("ready", "up", True)]
+
+
+def test_each_change_of_the_link_is_an_event_once() -> None:
+    bench = Bench()
+    assert names(bench.step()) == ["link_booting"]
+    assert names(bench.step()) == []
+    assert names(bench.step()) == ["link_up", "mode"]
+    bench.reply = None
+    assert names(bench.step(ms=101)) == ["link_stale", "mode"]
+    assert names(bench.unplug().step()) == ["link_down"]
+    assert names(bench.step()) == []
+
+
+def test_a_lost_link_is_a_warning() -> None:
+    bench = Bench().linked()
+    event, mode = bench.unplug().step().events
+    assert (event.name, event.level) == ("link_down", "warning")
+    assert (mode.name, mode.level) == ("mode", "info")
+
+
+def test_a_port_that_opens_and_a_link_that_comes_up_are_no_warnings() -> None:
+    bench = Bench()
+    events = [event for _ in range(3) for event in bench.step().events]
+    assert [(event.name, event.level) for event in events] == [
+        ("link_booting", "info"),
+        ("link_up", "info"),
+        ("mode", "info"),
+    ]
+
+
+def test_every_feedback_line_is_an_estimate_with_its_own_stamp() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(ROLLING) * 2
+    first, second = bench.step(tick=False).estimates
+    wire_ns = 33 * 10 * NS_PER_S // 115200
+    assert (first.heard_ns, second.heard_ns) == (bench.now_ns - wire_ns, bench.now_ns)
+    assert second.at.mono_ns == bench.now_ns - wire_ns
+    # Their period is not known yet, so they share the time since the line before.
+    assert first.at.mono_ns == second.at.mono_ns - 5_000_000
+    assert first.speeds == second.speeds == ROLLING
+
+
+def test_a_step_without_a_tick_folds_feedback_and_sends_nothing() -> None:
+    bench = Bench().driving()
+    out = bench.step(GO, tick=False)
+    assert len(out.estimates) == 1
+    assert (out.line, out.due) == (None, False)
+    assert out.mode == "driving"
+
+
+def test_odometry_follows_the_wheels() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(ROLLING)
+    for _ in range(100):
+        bench.step()
+    (estimate,) = bench.out.estimates
+    # 0.5 m/s for 1 s
+    assert estimate.pose.x == pytest.approx(0.5)
+    assert estimate.twist == Twist(0.5, 0.0)
+    assert estimate.positions == pytest.approx((10.0,) * 4)
+    assert estimate.covariance.xx == pytest.approx(1e-6 + 0.5e-4, rel=1e-4)  # 1e-4 m2 per metre
+    snapshot = bench.robot.snapshot(bench.now_ns)
+    assert (snapshot.pose, snapshot.measured) == (estimate.pose, estimate.twist)
+    assert snapshot.speeds == ROLLING
+
+
+def test_a_robot_that_is_found_rolling_starts_at_the_pose_zero() -> None:
+    bench = Bench()
+    bench.reply = bench.codec.encode(ROLLING)
+    (estimate,) = bench.step().estimates
+    assert (estimate.pose, estimate.positions) == (Pose(), (0.0,) * 4)
+
+
+def test_the_pose_does_not_jump_over_a_lost_port() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(ROLLING)
+    before = bench.step().estimates[-1].pose
+    bench.unplug().step(ms=3000)
+    after = bench.replug().step(ms=3000).estimates[-1].pose
+    assert after == before
+
+
+# commands
+
+
+def test_a_commander_that_never_sent_a_zero_does_not_drive() -> None:
+    bench = Bench().linked()
+    for _ in range(100):
+        assert bench.step(GO).applied == REST
+    assert bench.mode() == "ready"
+    assert bench.out.reason.startswith("send a zero first: app must send a zero")
+    assert bench.out.source == "app"
+
+
+def test_after_a_zero_a_command_drives() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    out = bench.step(GO)
+    assert (out.mode, out.reason) == ("driving", "driving: commanded by app")
+    assert (out.source, out.command_ns) == ("app", bench.now_ns)
+    assert out.applied.linear == pytest.approx(0.01)
+
+
+def test_without_neutral_first_the_first_command_drives() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).linked()
+    bench.step(GO)
+    assert bench.mode() == "driving"
+
+
+def test_the_speed_grows_by_the_acceleration_up_to_the_command() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    for step in range(1, 61):
+        out = bench.step(GO)
+        assert out.applied.linear == pytest.approx(min(0.01 * step, 0.5))
+    assert out.applied == GO
+
+
+def test_the_line_says_what_is_applied() -> None:
+    bench = Bench().driving(Twist(0.3, 1.0), steps=100)
+    # The wheels turn at 3 and 9 rad/s.
+    assert bench.out.line == b"ap09.00,bp03.00,cp03.00,dp09.00\r\n"
+    assert bench.out.applied == Twist(0.3, 1.0)
+    assert bench.out.speeds.as_tuple() == pytest.approx((9.0, 3.0, 3.0, 9.0))
+
+
+def test_the_line_is_written_in_the_configured_dialect() -> None:
+    bench = Bench(Config(mcu=McuConfig(trailing_comma=True))).driving()
+    assert bench.out.line == b"ap10.00,bp10.00,cp10.00,dp10.00,\r\n"
+
+
+def test_a_command_beyond_the_limits_is_clamped() -> None:
+    bench = Bench().driving(Twist(2.0, 0.0), steps=150)
+    assert bench.out.applied == Twist(1.0, 0.0)
+
+
+def test_a_silent_commander_is_followed_until_its_timeout_and_then_ramped_to_zero() -> None:
+    bench = Bench().driving()
+    for _ in range(25):
+        assert bench.step().applied == GO
+    for step in range(1, 51):
+        out = bench.step()
+        assert out.applied.linear == pytest.approx(max(0.5 - 0.01 * step, 0.0), abs=1e-12)
+        assert out.mode == "ready"
+    assert out.applied == REST
+    assert out.line == ZERO_LINE
+    assert out.reason.startswith("waiting for a command")
+
+
+def test_a_commander_that_returns_after_its_timeout_drives_on_from_the_speed_left() -> None:
+    bench = Bench().driving()
+    for _ in range(35):
+        bench.step()
+    left = bench.out.applied.linear
+    assert bench.step(GO).applied.linear == pytest.approx(left + 0.01)
+
+
+def test_commands_are_counted_and_refusals_by_reason() -> None:
+    bench = Bench().linked()
+    bench.step(REST, GO)
+    refusals = tuple(Refusal(reason, "") for reason in ("malformed", "malformed", "wildcard"))
+    bench.step(Twist(math.nan, 0.0), refusals=refusals)
+    bench.step(GO, source="stranger")
+    counters = bench.counters()
+    assert counters["commands"] == 2
+    assert counters["command_not_finite"] == 1
+    assert counters["command_unknown_source"] == 1
+    assert counters["command_malformed"] == 2
+    assert counters["command_wildcard"] == 1
+
+
+def test_the_last_refusal_is_shown_in_words() -> None:
+    bench = Bench().linked()
+    assert bench.robot.snapshot(bench.now_ns).refused == ""
+    bench.step(refusals=(Refusal("wildcard", "cmd/**: no wildcards"),))
+    assert bench.robot.snapshot(bench.now_ns).refused == "cmd/**: no wildcards"
+    bench.step(REST, source="stranger")
+    bench.step(REST)
+    refused = bench.robot.snapshot(bench.now_ns).refused
+    assert refused == "source stranger: not one of commands.sources"
+
+
+def test_lines_are_counted_and_rejects_by_reason_and_zeros_left_out() -> None:
+    bench = Bench().linked()
+    bench.reply = b"hello\r\n" + bench.codec.stop
+    bench.step()
+    counters = bench.counters()
+    assert counters["lines"] == 4
+    assert counters["line_malformed"] == 1
+    assert "line_too_long" not in counters
+
+
+def test_commands_are_heard_in_a_step_without_a_tick() -> None:
+    bench = Bench().linked()
+    bench.step(REST, tick=False)
+    bench.step(GO, tick=False)
+    bench.step()
+    assert bench.mode() == "driving"
+
+
+def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None:
+    bench = Bench().driving()
+    bench.step(REST, source="teleop")
+    assert bench.step(GO).source == "teleop"
+    snapshot = bench.robot.snapshot(bench.now_ns)
+    waits = {source.name: waiting(source.waits_for) for source in snapshot.sources}
+    assert waits["app"] == "teleop has the higher priority: until it is silent"
+    assert waits["teleop"] == ""
+
+
+# a lost link
+
+
+def test_an_unplugged_port_is_rest_in_the_same_step() -> None:
+    bench = Bench().driving()
+    out = bench.unplug().step(GO, tick=False)
+    assert (out.mode, out.link, out.linked) == ("waiting", "down", False)
+    assert (out.applied, out.speeds) == (REST, STILL)
+
+
+def test_a_lost_port_clears_every_command() -> None:
+    bench = Bench().driving()
+    bench.unplug().step()
+    sources = bench.robot.snapshot(bench.now_ns).sources
+    assert {source.age_s for source in sources} == {None}
+
+
+def test_who_commands_while_the_port_is_closed_is_shown_all_the_same() -> None:
+    bench = Bench().linked().unplug()
+    bench.step()
+    bench.step(GO)
+    bench.step(ms=100)
+    ages = {s.name: s.age_s for s in bench.robot.snapshot(bench.now_ns).sources}
+    assert ages["app"] == 0.1
+
+
+def test_without_neutral_first_nobody_is_asked_for_it_before_the_port_is_there() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).unplug()
+    bench.opened = 0  # the port was never open
+    bench.step(GO)
+    waits = {s.name: waiting(s.waits_for) for s in bench.robot.snapshot(bench.now_ns).sources}
+    assert waits["app"] == ""
+
+
+def test_a_silent_mcu_is_told_to_stand_ten_times_a_second_at_any_rate() -> None:
+    bench = Bench(Config(mcu=McuConfig(baud_rate=115200), control=ControlConfig(rate=250.0)))
+    bench.driving()
+    bench.reply = None
+    while bench.out.link == "up":
+        bench.step(GO)
+    said = [bench.now_ns for _ in range(1000) if bench.step(GO).line is not None]
+    assert {after - before for before, after in pairwise(said)} == {100 * MS}
+
+
+def test_a_silent_mcu_is_rest_after_quiet() -> None:
+    bench = Bench().driving()
+    bench.reply = None
+    for _ in range(10):
+        assert bench.step(GO).applied == GO
+    out = bench.step(GO)
+    assert (out.applied, out.link, out.mode) == (REST, "stale", "waiting")
+    assert out.reason.startswith("the built-in simulator, a part of this program, is late")
+
+
+def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:
+    bench = Bench().driving()
+    bench.reply = None
+    for _ in range(10):
+        bench.step(GO)  # the silence timeout has not passed, so these still drive
+    lines = [bench.step(GO).line for _ in range(100)]
+    assert [index for index, line in enumerate(lines) if line] == list(range(0, 100, 10))
+    assert {line for line in lines if line} == {ZERO_LINE}
+
+
+def test_the_first_line_of_a_new_robot_is_zero_and_goes_at_once() -> None:
+    bench = Bench()
+    bench.reply = None
+    assert bench.step().line == ZERO_LINE
+    assert bench.step().line is None
+
+
+def test_while_it_boots_every_line_is_zero() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False)))
+    assert bench.step(REST).line == ZERO_LINE
+    assert bench.step(GO).line == ZERO_LINE
+    assert bench.link() == "booting"
+
+
+def test_after_a_short_gap_the_robot_ramps_up_again_from_zero() -> None:
+    bench = Bench().driving()
+    reply, bench.reply = bench.reply, None
+    for _ in range(50):
+        bench.step(GO)
+    bench.reply = reply
+    assert [bench.step(GO).applied.linear for _ in range(5)] == pytest.approx(
+        [0.0, 0.0, 0.01, 0.02, 0.03]
+    )
+
+
+def test_after_a_long_gap_each_source_must_be_neutral_again() -> None:
+    bench = Bench().driving()
+    reply, bench.reply = bench.reply, None
+    for _ in range(101):
+        bench.step(GO)
+    bench.reply = reply
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+    assert bench.out.reason.startswith("send a zero first")
+    bench.let_go()
+    assert bench.step(GO).mode == "driving"
+
+
+def test_after_a_reopened_port_each_source_must_be_neutral_again() -> None:
+    bench = Bench().driving()
+    bench.unplug().step(GO)
+    bench.replug()
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+    assert bench.out.reason.startswith("send a zero first")
+
+
+def test_a_port_reopened_between_two_steps_is_a_new_session() -> None:
+    bench = Bench().driving()
+    out = bench.replug().step(GO)
+    assert (out.link, out.applied) == ("booting", REST)
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+
+
+def test_a_zero_sent_while_the_port_was_closed_does_not_count_as_neutral() -> None:
+    bench = Bench().driving()
+    bench.unplug().step(REST)
+    bench.replug().step(GO)
+    for _ in range(20):
+        assert bench.step(GO).applied == REST
+
+
+# stop, clear, activate, deactivate
+
+
+def test_a_stop_brakes_by_its_own_deceleration_and_is_latched() -> None:
+    bench = Bench().driving()
+    answer = bench.answer("stop")
+    assert answer == Answer(7, True, "stopped and latched; srv/clear releases it")
+    # 3 m/s2 is 0.03 m/s per step; 0.5 m/s take 17 steps.
+    path = [bench.out.applied.linear, *(bench.step(GO).applied.linear for _ in range(17))]
+    assert path == pytest.approx([max(0.5 - 0.03 * step, 0.0) for step in range(1, 19)], abs=1e-12)
+    assert bench.mode() == "stopped"
+    assert bench.out.reason == "stopped by request at 2027-01-15 08:00:50 UTC; call srv/clear"
+
+
+def test_a_stop_is_an_event() -> None:
+    assert names(Bench().driving().step(ask="stop")) == ["stop", "mode"]
+
+
+def test_a_stop_that_is_repeated_is_answered_and_is_no_second_event() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    assert bench.answer("stop").success
+    assert names(bench.out) == []
+
+
+def test_a_refused_request_is_no_event() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    assert bench.answer("activate") == Answer(
+        7, False, "the robot is stopped: call srv/clear first"
+    )
+    assert names(bench.out) == []
+
+
+def test_a_clear_of_nothing_succeeds_says_so_and_changes_nothing() -> None:
+    bench = Bench().driving()
+    mode, twist = bench.mode(), bench.out.applied
+    assert bench.step(GO, ask="clear").answers == (
+        Answer(7, True, "nothing to clear: the robot is neither stopped nor in fault"),
+    )
+    assert (bench.mode(), bench.out.applied != REST, twist != REST) == (mode, True, True)
+
+
+def test_a_stop_holds_over_a_lost_link() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    bench.unplug().step()
+    bench.replug()
+    for _ in range(10):
+        bench.step(REST)
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("stopped", REST)
+
+
+def test_after_clear_the_robot_is_ready_and_each_source_must_be_neutral() -> None:
+    bench = Bench().driving()
+    bench.step(ask="stop")
+    answer = bench.answer("clear")
+    assert answer == Answer(7, True, "cleared; each sender must send a zero before it drives")
+    assert bench.mode() == "ready"
+    for _ in range(20):
+        bench.step(GO)
+        assert bench.mode() == "ready"
+    bench.let_go()
+    assert bench.step(GO).mode == "driving"
+
+
+def test_clear_without_a_link_waits_for_it() -> None:
+    bench = Bench()
+    bench.step(ask="stop")
+    bench.unplug().step()
+    bench.step(ask="clear")
+    assert bench.mode() == "waiting"
+
+
+def test_clear_leaves_a_robot_that_was_switched_off_switched_off() -> None:
+    bench = Bench().linked()
+    bench.step(ask="deactivate")
+    bench.step(ask="stop")
+    bench.step(ask="clear")
+    assert bench.mode() == "inactive"
+
+
+def test_a_stopped_robot_refuses_to_be_activated() -> None:
+    bench = Bench().linked()
+    bench.step(ask="stop")
+    assert bench.answer("activate") == Answer(
+        7, False, "the robot is stopped: call srv/clear first"
+    )
+    assert bench.mode() == "stopped"
+
+
+def test_deactivating_ramps_to_zero_by_the_normal_deceleration() -> None:
+    bench = Bench().driving()
+    answer = bench.answer("deactivate")
+    assert answer == Answer(7, True, "inactive: ramping to zero; srv/activate switches it on")
+    assert bench.out.applied.linear == pytest.approx(0.49)
+    for _ in range(50):
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("inactive", REST)
+    off = "switched off by request at 2027-01-15 08:00:50 UTC; call srv/activate"
+    assert bench.out.reason == off
+
+
+def test_activating_switches_it_on_and_each_source_must_be_neutral() -> None:
+    bench = Bench().driving()
+    bench.step(ask="deactivate")
+    assert bench.answer("activate") == Answer(7, True, "active")
+    for _ in range(20):
+        bench.step(GO)
+    assert bench.mode() == "ready"
+    bench.let_go()
+    bench.step(GO)
+    assert bench.mode() == "driving"
+
+
+def test_activating_an_active_robot_changes_nothing() -> None:
+    bench = Bench().driving()
+    bench.step(GO, ask="activate")
+    assert bench.mode() == "driving"
+    assert bench.step(GO).applied == GO
+
+
+def test_without_auto_activate_the_robot_starts_switched_off() -> None:
+    bench = Bench(Config(control=ControlConfig(auto_activate=False))).linked()
+    assert bench.mode() == "inactive"
+    bench.step(ask="activate")
+    bench.step()
+    assert bench.mode() == "ready"
+
+
+def test_each_change_of_mode_by_request_is_an_event_however_soon_it_comes() -> None:
+    bench = Bench().linked()
+    for _ in range(2):
+        assert names(bench.step(ask="stop")) == ["stop", "mode"]
+        assert names(bench.step(ask="clear")) == ["clear", "mode"]
+
+
+# the pose
+
+
+def test_set_pose_puts_the_robot_there() -> None:
+    bench = Bench().linked()
+    answer = bench.answer("set_pose", Pose(1.0, 2.0, 0.5))
+    assert answer == Answer(7, True, "pose is x 1, y 2, yaw 0.5")
+    assert bench.step().estimates[-1].pose == Pose(1.0, 2.0, 0.5)
+
+
+def test_reset_odometry_is_the_pose_zero() -> None:
+    bench = Bench().linked()
+    bench.step(ask="set_pose", pose=Pose(1.0, 2.0, 0.5))
+    assert bench.answer("reset_odometry") == Answer(7, True, "pose is x 0, y 0, yaw 0")
+    assert bench.step().estimates[-1].pose == Pose()
+
+
+def test_the_pose_may_be_set_while_driving_and_changes_no_motion() -> None:
+    bench = Bench().driving()
+    out = bench.step(GO, ask="set_pose", pose=Pose(5.0, 5.0, 3.0))
+    assert (out.mode, out.applied) == ("driving", GO)
+
+
+def test_several_requests_of_one_step_are_answered_in_order() -> None:
+    bench = Bench().linked()
+    bench.now_ns += 10 * MS
+    requests = (Request("stop", 1), Request("activate", 2), Request("reset_odometry", 3))
+    out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests))
+    assert [(answer.id, answer.success) for answer in out.answers] == [
+        (1, True),
+        (2, False),
+        (3, True),
+    ]
+
+
+@pytest.mark.parametrize("order", [("stop", "clear"), ("clear", "stop")])
+def test_a_clear_that_came_with_a_stop_does_not_undo_it(order: tuple[Verb, Verb]) -> None:
+    bench = Bench().linked()
+    bench.step(ask="stop")
+    bench.now_ns += 10 * MS
+    requests = tuple(Request(verb) for verb in order)
+    assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=requests)).mode == "stopped"
+
+
+def test_a_clear_asked_before_the_stop_was_obeyed_does_not_undo_it() -> None:
+    bench = Bench().linked()
+    asked_ns = bench.now_ns + 5 * MS
+    bench.step(ask="stop")
+    bench.now_ns += 10 * MS
+    latch = bench.robot_latch
+    late = (Request("clear", 7, asked_ns=asked_ns, latch=latch),)
+    out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=late))
+    assert (out.mode, out.answers[0].success) == ("stopped", False)
+    assert "call it again" in out.answers[0].message
+    bench.now_ns += 10 * MS
+    again = (Request("clear", 8, asked_ns=bench.now_ns, latch=latch),)
+    assert bench.robot.step(Inputs(bench.now, True, True, 1, requests=again)).answers[0].success
+
+
+def test_a_service_called_as_fast_as_can_be_is_a_line_of_log_a_second() -> None:
+    bench = Bench().linked()
+    said = [event for _ in range(250) for event in bench.step(ask="reset_odometry").events]
+    assert [event.count for event in said] == [1, 100, 100]
+
+
+def test_a_stop_that_comes_ahead_of_its_query_and_with_it_is_one_event() -> None:
+    bench = Bench().linked()
+    for number in (1, 2):
+        asked_ns = bench.now_ns
+        ahead = Request("stop", asked_ns=asked_ns, by="joe (native)")
+        bench.now_ns += 10 * MS
+        out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(ahead,)))
+        told = [out.events]
+        bench.now_ns += 1500 * MS
+        out = bench.robot.step(Inputs(bench.now, True, True, 1, requests=(replace(ahead, id=7),)))
+        assert out.answers[0].success
+        told.append(out.events)
+        stops = [event for events in told for event in events if event.name == "stop"]
+        assert [(event.by, event.count) for event in stops] == [("joe (native)", 1)], number
+        bench.now_ns += 1500 * MS
+
+
+# logged events
+
+
+def test_a_command_that_is_refused_is_told_with_its_reason_and_who_sent_it() -> None:
+    (event,) = Bench().linked().step(REST, source="nobody").events
+    assert (event.name, event.level) == ("command_refused", "warning")
+    assert event.text == "unknown_source: source nobody: not one of commands.sources"
+    refusal = Refusal("malformed", "cmd/app: no map", "app", "a" * 1000)
+    bench = Bench().linked()
+    told = [event for _ in range(150) for event in bench.step(refusals=(refusal,)).events]
+    first, second = told
+    assert first.text.startswith("malformed: cmd/app")
+    assert (first.by, first.count) == ("a" * MAX_SENDER, 1)
+    assert second.text.startswith("100 x malformed; the last: ")
+
+
+def test_missed_periods_are_told_with_their_number() -> None:
+    bench = Bench().linked()
+    bench.now_ns += 50 * MS
+    out = bench.robot.step(Inputs(bench.now, True, True, 1, missed=4))
+    (event,) = (event for event in out.events if event.name == "missed_periods")
+    assert (event.text, event.count) == ("4 x missed: 4 in a row", 4)
+    assert bench.counters()["missed_periods"] == 4
+
+
+def test_what_the_shell_has_to_say_comes_first_and_as_seldom_as_the_rest() -> None:
+    bench = Bench()
+    told: list[Event] = []
+    lost = Event("port_lost", "it is gone", "warning")
+    for _ in range(1000):
+        bench.now_ns += 10 * MS
+        told += bench.robot.step(Inputs(bench.now, True, True, 1, events=(lost,))).events
+    assert told[0] == lost
+    lines = [event for event in told if event.name == "port_lost"]
+    assert len(lines) <= 15
+    assert sum(event.count for event in lines) > 900
+
+
+def test_over_one_line_in_a_hundred_that_cannot_be_true_is_told_with_what_to_do() -> None:
+    bench, told = Bench().linked(), Counter[str]()
+    for i in range(2000):
+        bench.reply = bench.codec.encode(WheelSpeeds(99.0, 0.0, 0.0, 0.0) if i % 50 == 0 else STILL)
+        told.update(names(bench.step()))
+    assert told["lines_dropped"] == 2
+    assert bench.out.mode == "ready"
+
+
+def test_lines_that_cannot_be_true_are_told_as_rejected() -> None:
+    bench = Bench().linked()
+    bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
+    assert names(bench.step())[0] == "lines_rejected"
+
+
+# fault
+
+
+def test_a_guard_trip_is_a_latched_fault_and_an_error_event() -> None:
+    bench = Bench().driving()
+    out = bench.step(GO, guard_trip="a wheel is too fast")
+    assert out.mode == "fault"
+    at = "latched at 2027-01-15 08:00:50 UTC"
+    assert out.reason == f"the guard replaced a line: a wheel is too fast, {at}; call srv/clear"
+    event, mode = out.events
+    assert (event.name, event.level) == ("fault", "error")
+    assert mode.text.startswith("driving -> fault: the guard replaced a line: a wheel is too fast")
+    for _ in range(50):
+        bench.step(REST)
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("fault", REST)
+
+
+def test_after_a_guard_trip_the_robot_goes_on_from_the_stop_that_was_sent() -> None:
+    bench = Bench().driving()
+    assert bench.step(GO, guard_trip="a wheel is too fast").line == ZERO_LINE
+
+
+def impossible(bench: Bench, lines: int) -> Bench:
+    """Feed impossible feedback for this many lines, then the earlier reply again."""
+    reply, bench.reply = bench.reply, bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
+    for _ in range(lines):
+        bench.step(GO)
+    bench.reply = reply
+    return bench
+
+
+def test_a_third_impossible_line_is_a_fault_that_brakes_by_the_stop_deceleration() -> None:
+    bench = impossible(Bench().driving(), 2)
+    assert (bench.mode(), bench.out.applied) == ("driving", GO)
+    impossible(bench, 1)
+    assert bench.mode() == "fault"
+    assert bench.out.reason.startswith("impossible feedback: front_right 99.00 rad/s")
+    # Each step removes 3 m/s2 x 10 ms.
+    assert bench.out.applied.linear == pytest.approx(0.47)
+    assert bench.step(GO).applied.linear == pytest.approx(0.44)
+    assert bench.counters()["line_impossible"] == 3
+
+
+def test_a_lost_link_begins_the_count_of_impossible_lines_anew() -> None:
+    bench = impossible(Bench().driving(), 2)
+    bench.unplug().step()
+    impossible(bench.replug(), 3)
+    assert (bench.link(), bench.mode()) == ("up", "ready")
+
+
+def test_a_fault_clears_every_command() -> None:
+    bench = Bench().driving()
+    bench.step(guard_trip="a wheel is too fast")
+    sources = bench.robot.snapshot(bench.now_ns).sources
+    assert {source.age_s for source in sources} == {None}
+
+
+def test_after_clear_impossible_lines_are_counted_anew() -> None:
+    bench = impossible(Bench().driving(), 3)
+    bench.reply = bench.codec.encode(WheelSpeeds(99.0, 99.0, 99.0, 99.0))
+    bench.step(ask="clear")
+    assert [bench.step().mode for _ in range(3)] == ["ready", "ready", "fault"]
+
+
+def test_a_fault_keeps_its_first_reason() -> None:
+    bench = Bench().driving()
+    bench.step(GO, guard_trip="a wheel is too fast")
+    bench.step(GO, guard_trip="a wheel grows")
+    assert bench.out.reason.startswith("the guard replaced a line: a wheel is too fast, latched")
+
+
+def test_a_fault_and_a_stop_are_cleared_one_after_the_other() -> None:
+    bench = Bench().driving()
+    bench.step(guard_trip="a wheel is too fast")
+    assert not bench.answer("activate").success
+    assert bench.answer("stop").success
+    assert bench.mode() == "fault"
+    assert bench.answer("clear") == Answer(
+        7, True, "fault cleared; still stopped by request: call srv/clear again"
+    )
+    assert bench.mode() == "stopped"
+    assert bench.answer("clear").success
+    assert bench.mode() == "ready"
+
+
+def test_after_a_fault_each_source_must_be_neutral() -> None:
+    bench = Bench().driving()
+    bench.step(GO, guard_trip="a wheel is too fast")
+    bench.step(GO, ask="clear")
+    for _ in range(20):
+        bench.step(GO)
+    assert bench.mode() == "ready"
+
+
+# shutdown
+
+
+def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
+    bench = Bench().driving()
+    bench.leaving = True
+    path = [bench.step(GO).applied.linear for _ in range(20)]
+    assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
+    assert path[17:] == [0.0, 0.0, 0.0]
+    assert (bench.mode(), bench.out.reason) == ("leaving", "the daemon is going down")
+
+
+def test_leaving_is_one_event() -> None:
+    bench = Bench().driving()
+    bench.leaving = True
+    (event,) = bench.step().events
+    assert event == Event("mode", "driving -> leaving: the daemon is going down")
+    assert names(bench.step()) == []
+
+
+@pytest.mark.parametrize("verb", ["clear", "activate", "deactivate"])
+def test_a_leaving_robot_refuses_to_be_switched(verb: Verb) -> None:
+    bench = Bench().linked()
+    bench.leaving = True
+    assert bench.answer(verb) == Answer(7, False, "the daemon is going down")
+
+
+def test_a_leaving_robot_never_drives_again() -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).driving()
+    bench.leaving = True
+    for _ in range(100):
+        bench.step(GO)
+    assert (bench.mode(), bench.out.applied) == ("leaving", REST)
+
+
+# lines that did not leave
+
+
+def test_a_superseded_line_never_happened() -> None:
+    # Every second line leaves, so two periods have passed since the last sent one.
+    bench = Bench().linked()
+    bench.step(REST)
+    bench.step(GO)
+    assert bench.out.applied.linear == pytest.approx(0.01)
+    bench.step(GO)
+    assert bench.out.applied.linear == pytest.approx(0.02)
+    bench.step(GO, superseded=True)
+    assert bench.out.applied.linear == pytest.approx(0.03)  # 0.01 and 20 ms
+    bench.step(GO, superseded=True)
+    assert bench.out.applied.linear == pytest.approx(0.04)  # 0.01 and 30 ms
+    bench.step(GO)
+    assert bench.out.applied.linear == pytest.approx(0.05)
+
+
+def test_while_lines_are_superseded_the_speed_cannot_run_away_from_the_last_line_sent() -> None:
+    bench = Bench().driving(Twist(0.1, 0.0))
+    bench.step(Twist(1.0, 0.0))  # 0.11 m/s was sent; no later line leaves
+    bench.step(Twist(1.0, 0.0))
+    for _ in range(23):
+        out = bench.step(Twist(1.0, 0.0), superseded=True)
+        assert out.applied.linear <= 0.11 + 0.05 + 1e-9
+
+
+def test_a_superseded_line_in_a_ramp_brakes_as_time_passes() -> None:
+    bench = Bench().driving()
+    for _ in range(26):
+        bench.step()
+    assert bench.out.applied.linear == pytest.approx(0.49)
+    bench.step()  # this line does not leave
+    assert bench.step(superseded=True).applied.linear == pytest.approx(0.47)  # 0.49 and 20 ms
+
+
+def test_what_was_not_said_for_too_long_is_not_resumed() -> None:
+    bench = Bench().driving()
+    assert bench.step(GO, ms=250).applied == GO
+    assert bench.step(GO, ms=260).applied == REST
+    assert bench.step(GO).applied.linear == pytest.approx(0.01)
+
+
+def test_lines_superseded_for_too_long_begin_again_from_rest() -> None:
+    bench = Bench().driving()
+    bench.step(GO)  # the first line that does not leave; the MCU received the one before it last
+    path = [bench.step(GO, superseded=True).applied.linear for _ in range(26)]
+    assert path[:24] == [0.5] * 24  # from 20 to 250 ms
+    assert path[24:] == [0.0, 0.0]
+
+
+def test_a_stalled_loop_does_not_leap() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    bench.step(GO)
+    assert bench.step(GO, ms=200).applied.linear == pytest.approx(0.01 + 0.05)
+
+
+def test_at_a_slow_rate_a_stalled_loop_leaps_one_and_a_half_periods_at_most() -> None:
+    slow = Config(
+        control=ControlConfig(rate=10.0),
+        commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
+    )
+    bench = Bench(slow).linked()
+    bench.step(REST)
+    assert bench.step(GO, ms=240).applied.linear == pytest.approx(0.15)
+
+
+def test_a_stalled_loop_brakes_for_all_the_time_that_passed() -> None:
+    bench = Bench().driving()
+    bench.reply = bench.codec.stop
+    for _ in range(25):
+        bench.step()
+    assert bench.step(ms=200).applied.linear == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("neutral_first", [True, False])
+def test_a_line_superseded_before_the_port_was_lost_does_not_bring_its_speed_back(
+    neutral_first: bool,
+) -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
+    bench.step(GO)  # this line does not leave
+    bench.replug().step(GO, superseded=True)  # zero, which does not leave
+    assert bench.out.applied == REST
+    bench.reply = bench.codec.stop * 2
+    bench.step(GO, superseded=True)
+    assert bench.link() == "up"
+    assert bench.out.applied.linear <= 0.05
+
+
+@pytest.mark.parametrize("neutral_first", [True, False])
+def test_nor_when_the_port_was_lost_and_found_between_two_ticks(neutral_first: bool) -> None:
+    bench = Bench(Config(commands=CommandsConfig(neutral_first))).driving()
+    bench.step(GO)  # this line does not leave
+    bench.replug()
+    for _ in range(3):
+        bench.step(GO, tick=False)
+    assert bench.link() == "up"
+    assert bench.step(GO, superseded=True).applied.linear <= 0.05
+
+
+# changes of the status
+
+
+def test_the_status_changes_with_mode_reason_link_and_source_and_not_otherwise() -> None:
+    bench = Bench()
+    assert bench.out.status_changed
+    assert not bench.unplug().step().status_changed
+    bench.replug()
+    assert [bench.step().status_changed for _ in range(4)] == [True, False, True, False]
+    assert bench.step(REST).status_changed  # driven by app
+    assert not bench.step(GO).status_changed
+    assert bench.step(REST, source="teleop").status_changed
+    assert not bench.step(REST, source="teleop").status_changed
+    assert bench.step(ask="stop").status_changed
+
+
+def test_the_outputs_carry_the_time_of_the_step() -> None:
+    bench = Bench()
+    assert bench.step().now == bench.now
+
+
+# determinism
+
+
+def random_walk(seed: int) -> list[Outputs]:
+    """Run two hundred steps with random events."""
+    rng = random.Random(seed)
+    bench = Bench(
+        Config(commands=CommandsConfig(sources=(Source("app", 50), Source("teleop", 100))))
+    )
+    found = []
+    for _ in range(200):
+        bench.reply = rng.choice((bench.codec.stop, bench.codec.encode(ROLLING), b"hello\n", None))
+        if rng.random() < 0.02:
+            bench.unplug()
+        elif rng.random() < 0.2 and not bench.port_open:
+            bench.replug()
+        verbs: tuple[Verb, ...] = ("stop", "clear", "clear", "activate", "deactivate", "set_pose")
+        found.append(
+            bench.step(
+                *rng.choices((REST, GO, Twist(-1.0, 3.0)), k=rng.randrange(3)),
+                source=rng.choice(("app", "teleop", "stranger")),
+                ask=rng.choice(verbs) if rng.random() < 0.1 else None,
+                ms=rng.choice((3.0, 10.0, 10.0, 10.0, 25.0)),
+                tick=rng.random() < 0.8,
+                superseded=rng.random() < 0.1,
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_same_inputs_give_the_same_outputs(seed: int) -> None:
+    first = random_walk(seed)
+    assert first == random_walk(seed)
+    assert len({outputs.mode for outputs in first}) > 2
+
+
+def test_a_linked_robot_is_ready_in_the_step_that_activates_it() -> None:
+    bench = Bench(Config(control=ControlConfig(auto_activate=False))).linked()
+    bench.step(ask="activate")
+    assert (bench.mode(), bench.link()) == ("ready", "up")
+
+
+def test_a_stop_on_the_way_down_is_latched_for_the_next_start() -> None:
+    bench = Bench().linked()
+    bench.leaving = True
+    assert bench.answer("stop") == Answer(7, True, "stopped and latched; the daemon is going down")
+    assert bench.out.mode == "leaving"
+    assert bench.out.latches.stop is not None
+
+
+# the latches that a robot starts with
+
+
+STOPPED = Latches(stop=Latch(7, WALL_NS, "ann", "stopped by ann", kept=True))
+FAULTED = Latches(fault=Latch(8, WALL_NS, "", "a wheel is dead", kept=True))
+OFF = Latches(inactive=Latch(9, WALL_NS, "joe", "switched off by joe", kept=True))
+
+
+@pytest.mark.parametrize(
+    ("latches", "mode", "why"),
+    [
+        (STOPPED, "stopped", "was stopped by ann at 2027-01-15 08:00:00 UTC, before the restart"),
+        (
+            FAULTED,
+            "fault",
+            "a wheel is dead, latched at 2027-01-15 08:00:00 UTC, before the restart",
+        ),
+        (OFF, "inactive", "was switched off by joe at 2027-01-15 08:00:00 UTC, before the restart"),
+    ],
+)
+def test_a_robot_starts_in_the_mode_of_its_latches_and_one_event_says_so(
+    latches: Latches, mode: str, why: str
+) -> None:
+    bench = Bench(latches=latches)
+    release = "srv/activate" if mode == "inactive" else "srv/clear"
+    assert (bench.out.mode, bench.out.reason) == (mode, f"{why}; call {release}")
+    assert bench.out.latches is latches
+    (event,) = bench.out.events
+    assert event == Event(
+        "mode", f"start -> {mode}: {why}; call {release}", "warning", kind=event.kind
+    )
+    bench.linked().step(REST)
+    for _ in range(100):
+        assert bench.step(GO).applied == REST
+    assert (bench.mode(), bench.out.latches) == (mode, latches)
+    assert bench.answer("activate" if mode == "inactive" else "clear").success
+    assert bench.out.latches == Latches()
+    bench.let_go()
+    assert bench.step(GO).mode == "driving"
+
+
+def test_latches_are_the_same_object_until_one_changes() -> None:
+    bench = Bench().driving()
+    before = bench.out.latches
+    assert bench.step(GO).latches is before
+    stopped = bench.step(ask="stop").latches
+    assert stopped != before
+    assert bench.step(GO).latches is stopped
+
+
+# limits that `set` lowered
+
+
+SLOW = {"limits.linear_speed": 0.3}
+
+
+def test_a_lowered_limit_is_kept_until_it_is_raised_to_that_of_the_file() -> None:
+    bench = Bench().linked()
+    assert bench.set({"limits.linear_speed": 0.3, "limits.angular_speed": 5.0}) == SLOW
+    assert bench.set({"limits.linear_speed": 0.9}) == {"limits.linear_speed": 0.9}
+    assert bench.set({"limits.linear_speed": 1.0}) == {}
+
+
+def test_a_lowered_limit_holds_after_a_restart_and_an_event_says_so() -> None:
+    bench = Bench(latches=Latches(lowered=SLOW))
+    (event,) = bench.out.events
+    assert (event.name, event.level) == ("set", "warning")
+    assert event.text == "limits.linear_speed = 0.3 (was 1.0): lowered before the restart"
+    bench.driving(Twist(1.0, 0.0), steps=100)
+    assert bench.out.applied == Twist(0.3, 0.0)
+    assert bench.out.latches.lowered == SLOW
+    assert bench.set({"limits.linear_speed": 1.0}) == {}
+
+
+def test_a_kept_limit_above_that_of_the_file_does_not_count() -> None:
+    bench = Bench(Config(limits=LimitsConfig(linear_speed=0.2)), latches=Latches(lowered=SLOW))
+    assert bench.out.events == ()
+    assert bench.robot.config.limits.linear_speed == 0.2
+    assert bench.out.latches.lowered == {}
+
+
+def test_at_a_slow_rate_a_commanded_zero_brakes_by_the_whole_deceleration() -> None:
+    slow = Config(
+        control=ControlConfig(rate=10.0),
+        commands=CommandsConfig(sources=(Source("app", 50, 1.0),)),
+    )
+    bench = Bench(slow).driving(Twist(1.0), steps=30)
+    speeds = [bench.step(REST).applied.linear for _ in range(3)]
+    assert speeds == pytest.approx([0.9, 0.8, 0.7])
+
+
+def test_bytes_faster_than_the_wire_carries_them_end_nothing() -> None:
+    """A board floods the USB link, or the baud rate is set too low.
+
+    Reads with one and the same time are not a clock.
+    """
+    robot = Robot(Config())
+    good = b"a0.00,b0.00,c0.00,d0.00\r\n"
+    for n in range(2000):
+        odd, after = n % 12 == 0, n % 12 == 1
+        data = (b"" if after else b"xxxxxxxxxx\n") + good + (b"" if odd else b"y" * 120)
+        now = Instant(10**12 + n * 1_000_000, 0)
+        robot.step(
+            Inputs(
+                now=now,
+                tick=n % 10 == 0,
+                port_open=True,
+                opened=1,
+                received=(Received(now, data),),
+            )
+        )
+
+
+# the gyro, the wheels and the clocks, as the robot reports them
+
+
+def test_the_track_that_a_gyro_taught_is_an_event_and_is_used_from_then_on() -> None:
+    bench = Bench(Config(odometry=OdometryConfig(gyro=True, learned_track=True))).linked()
+    for _ in range(150):
+        bench.step(gyro=0.0)
+    told: list[Event] = []
+    for second in range(60):
+        # Opposite wheels turn by 1 rad/s at the configured track; the robot turns by 1/1.6 of that.
+        rate = (1.0, -1.0, 0.5, 0.0)[second % 4]
+        bench.reply = bench.codec.encode(bench.robot._kinematics.wheel_speeds(Twist(0.0, rate)))
+        for _ in range(100):
+            told += [one for one in bench.step(gyro=rate / 1.6).events if one.name == "track"]
+    (event,) = told
+    assert event.text.endswith(" in use, configured 1.000")
+    assert bench.robot.snapshot(bench.now_ns).gyro.track_use == "used"
+
+
+def test_a_pose_may_be_set_with_a_gyro() -> None:
+    bench = Bench(Config(odometry=OdometryConfig(gyro=True))).linked()
+    assert bench.answer("set_pose", Pose(1.0, 2.0, 0.5)).success
+    assert bench.step(gyro=0.0).estimates[-1].pose == Pose(1.0, 2.0, 0.5)
+
+
+def test_the_distance_travelled_counts_forwards_and_backwards() -> None:
+    bench = Bench().linked()
+    for speeds in (ROLLING, WheelSpeeds(-10.0, -10.0, -10.0, -10.0)):
+        bench.reply = bench.codec.encode(speeds)
+        for _ in range(100):
+            bench.step()
+    assert bench.robot.travelled == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_link_that_was_lost_while_no_step_came_is_counted_as_late() -> None:
+    bench = Bench().linked()
+    bench.reply = None
+    bench.step(ms=400)
+    assert bench.link() == "stale"
+    assert bench.counters()["link_lost"] == 1
+    assert bench.counters()["link_lost_late"] == 1
+
+
+def test_a_link_that_was_lost_in_time_is_not_counted_as_late() -> None:
+    bench = Bench().linked()
+    bench.reply = None
+    for _ in range(40):
+        bench.step()
+    assert bench.counters()["link_lost"] == 1
+    assert "link_lost_late" not in bench.counters()
+
+
+def test_wheels_that_turn_against_their_command_are_a_fault() -> None:
+    bench = Bench(fault_time=0.3).driving(steps=1)
+    bench.reply = bench.codec.encode(WheelSpeeds(-10.0, -10.0, -10.0, -10.0))
+    for _ in range(100):
+        bench.step(GO)
+    assert bench.mode() == "fault"
+
+
+def test_wheels_that_turn_without_a_command_are_told_and_counted() -> None:
+    bench = Bench(fault_time=0.3).linked()
+    bench.reply = bench.codec.encode(WheelSpeeds(5.0, 5.0, 5.0, 5.0))
+    told = [one.name for _ in range(100) for one in bench.step().events]
+    assert "wheels_turned" in told
+    assert bench.counters()["wheels_turned"] >= 1
+    assert bench.mode() == "ready"
+
+
+def test_a_wheel_that_stands_while_the_others_roll_is_told_and_counted() -> None:
+    bench = Bench().driving()
+    bench.reply = bench.codec.encode(replace(ROLLING, front_left=0.0))
+    told = [one.name for _ in range(200) for one in bench.step(GO).events]
+    assert "wheels_doubted" in told
+    assert bench.counters()["wheels_doubted"] >= 1
+
+
+def test_a_setting_that_cannot_be_is_refused_and_changes_nothing() -> None:
+    bench = Bench().linked()
+    before = bench.robot.config
+    settings: dict[str, Plain] = {"limits.linear_speed": -1.0}
+    request = Request("set", 7, settings=settings)
+    outputs = bench.robot.step(Inputs(bench.now, True, True, bench.opened, requests=(request,)))
+    assert not outputs.answers[0].success
+    assert "limits.linear_speed" in outputs.answers[0].message
+    assert bench.robot.config is before
+
+
+def test_a_timeout_that_is_set_applies_and_each_sender_must_be_neutral_again() -> None:
+    bench = Bench().linked()
+    bench.step(REST)
+    bench.set({"commands.sources.app.timeout": 0.5})
+    bench.step(GO)
+    assert bench.robot.snapshot(bench.now_ns).sources[1].waits_for.what == "neutral"
+    bench.step(REST)
+    bench.step(GO)
+    for _ in range(45):
+        bench.step()
+    assert bench.mode() == "driving"
+
+
+def test_a_message_that_was_refused_ends_the_wait_of_a_shared_zero() -> None:
+    bench = Bench().linked()
+    refusal = Refusal("malformed", "it cannot be read", "app", "", bench.now_ns)
+    for number in range(150):
+        bench.now_ns += 10 * MS
+        inputs = Inputs(
+            bench.now, True, True, bench.opened,
+            received=(Received(bench.now, bench.codec.stop),),
+            commands=(Command("app", REST, bench.now_ns, shared=True),) if number == 0 else (),
+            refusals=(replace(refusal, arrived_ns=bench.now_ns),) if number == 50 else (),
+        )  # fmt: skip
+        bench.out = bench.robot.step(inputs)
+    bench.now_ns += 10 * MS
+    command = Command("app", GO, bench.now_ns, shared=True)
+    bench.out = bench.robot.step(
+        Inputs(bench.now, True, True, bench.opened, commands=(command,),
+               received=(Received(bench.now, bench.codec.stop),))
+    )  # fmt: skip
+    assert bench.mode() == "ready"
+
+
+def test_the_first_commands_of_a_clock_are_counted_apart_from_those_refused() -> None:
+    bench = Bench().linked()
+    bench.step(REST, late_ms=0.0)
+    counters = bench.counters()
+    assert counters["commands_first_contact"] == 1
+    assert not [name for name in counters if name.startswith("command_")]
+
+
+def test_what_foreign_clocks_were_forgiven_is_counted_in_ms() -> None:
+    bench = Bench().linked()
+    for number in range(300):
+        bench.step(REST, late_ms=min(max(0.0, 10.0 * (number - 100)), 300.0), ms=50)
+    assert "clocks_forgiven_ms" in bench.counters()
+
+
+def test_the_latches_of_a_robot_are_those_of_its_last_step() -> None:
+    bench = Bench().linked()
+    bench.answer("stop")
+    assert bench.robot.latches is bench.out.latches
+    assert bench.robot.latches.stop
+
+
+def test_lines_that_are_not_answered_are_told() -> None:
+    bench = Bench().linked()
+    told: list[str] = []
+    for number in range(1100):
+        bench.robot.counters["lines_sent"] += 1
+        bench.reply = None if number % 5 == 0 else bench.codec.stop
+        told += [one.name for one in bench.step().events]
+    assert told.count("lines_lost") == 1
+
+
+def test_stamps_that_a_router_replaced_are_counted() -> None:
+    bench = Bench().linked()
+    command = Command("app", REST, bench.now_ns, stamp_replaced=True)
+    bench.robot.step(Inputs(bench.now, True, True, bench.opened, commands=(command,)))
+    assert bench.counters()["stamps_replaced"] == 1

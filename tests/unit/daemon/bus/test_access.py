@@ -1,0 +1,474 @@
+"""Tests of the access rules: which role may send which message on which key.
+
+The tests read the rules as Zenoh reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.config.settings import (
+    AccessConfig,
+    CommandsConfig,
+    Config,
+    McuConfig,
+    OdometryConfig,
+    RobotConfig,
+    RosConfig,
+    Source,
+)
+from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, full_key, whoami_key
+from acsard.core.ros.transports import PARAMETERS, claims, endpoints
+from acsard.core.values import Role
+from acsard.daemon.bus.access import (
+    GRANTS,
+    SERVICE_ROLES,
+    access_control,
+    door_access,
+    least_role,
+)
+
+ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
+EVERYBODY = ("local", *ROLES)
+ZID = "0123456789abcdef"
+
+
+class Access:
+    """The access rules that follow from one configuration."""
+
+    def __init__(
+        self, rules: Callable[[Config], dict[str, object]] = access_control, **tables: Any
+    ) -> None:
+        self.config = Config(**tables)
+        self.value = cast(dict[str, Any], rules(self.config))
+        self.rules: dict[str, dict[str, Any]] = {rule["id"]: rule for rule in self.value["rules"]}
+        self.subjects = {subject["id"]: subject for subject in self.value["subjects"]}
+
+    def rules_of(self, who: str) -> list[dict[str, Any]]:
+        """Return the rules of a role and of the certificate with the same name."""
+        subjects = {who, f"certificate {who}"}
+        policies = [p for p in self.value["policies"] if subjects & set(p["subjects"])]
+        return [self.rules[name] for policy in policies for name in policy["rules"]]
+
+    def lets(self, who: str, message: str, key: str, flow: str = "ingress") -> bool:
+        """Return whether a rule allows the message and none denies it.
+
+        A rule applies to every key that its key expressions include.
+        """
+        asked = zenoh.KeyExpr(key)
+        said = {
+            rule["permission"]
+            for rule in self.rules_of(who)
+            if flow in rule["flows"] and message in rule["messages"]
+            if any(zenoh.KeyExpr(held).includes(asked) for held in rule["key_exprs"])
+        }
+        return said == {"allow"}
+
+    def key(self, below: str) -> str:
+        return full_key(self.config.robot.id, below)
+
+    def who(self, message: str, key: str) -> set[str]:
+        return {who for who in EVERYBODY if self.lets(who, message, key)}
+
+
+DEFAULT, DOOR = Access(), Access(door_access)
+REAL, GYRO = McuConfig(port="/dev/ttyACM0"), OdometryConfig(gyro=True)
+SENSING = Access(mcu=REAL, odometry=GYRO)
+TRUSTING = Access(access=AccessConfig(wildcards=True))
+FROM: dict[Role, set[str]] = {
+    "viewer": {"viewer", "operator", "maintainer", "local"},
+    "operator": {"operator", "maintainer", "local"},
+    "maintainer": {"maintainer", "local"},
+}
+"""Maps a role to every subject that has at least this role."""
+
+
+def written(key: str) -> str:
+    """Return a key of the table with real names in place of its placeholders."""
+    key = key.replace("<source>", "app").replace("<certificate>", "anna")
+    return key.replace("<Type>", "Twist").replace("<role>", "operator")
+
+
+# the roles
+
+
+def test_each_role_has_all_that_the_one_before_has_and_more() -> None:
+    for less, more in (("viewer", "operator"), ("operator", "maintainer"), ("maintainer", "local")):
+        given_less = {rule["id"] for rule in DEFAULT.rules_of(less)}
+        given_more = {rule["id"] for rule in DEFAULT.rules_of(more)}
+        forbidden = {name for name in given_more if DEFAULT.rules[name]["permission"] == "deny"}
+        assert given_less < given_more - forbidden
+    assert set(GRANTS) == set(ROLES)
+
+
+def test_every_service_has_a_role_and_every_role_has_a_service() -> None:
+    assert set(SERVICE_ROLES) == set(SERVICES)
+    assert set(SERVICE_ROLES.values()) == set(ROLES)
+
+
+def test_what_no_rule_allows_is_denied() -> None:
+    assert DEFAULT.value["enabled"] is True
+    assert DEFAULT.value["default_permission"] == "deny"
+
+
+def test_a_certificate_counts_only_where_it_was_shown_and_plain_tcp_only_without_one() -> None:
+    assert DEFAULT.subjects["local"] == {"id": "local", "link_protocols": ["tcp"]}
+    for role in ROLES:
+        subject = DEFAULT.subjects[role]
+        assert subject["link_protocols"] == ["tls"]
+        assert subject["cert_common_names"] == [role]
+
+
+def test_every_policy_names_rules_and_subjects_that_exist() -> None:
+    for policy in DEFAULT.value["policies"]:
+        assert set(policy["rules"]) <= set(DEFAULT.rules)
+        assert set(policy["subjects"]) <= set(DEFAULT.subjects)
+
+
+# the native keys
+
+
+TOLD = [key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")]
+
+
+@pytest.mark.parametrize("told", TOLD)
+def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) -> None:
+    key = DEFAULT.key(told)
+    assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
+    assert DEFAULT.who("query", key) == FROM["viewer"]
+    for who in EVERYBODY:
+        assert DEFAULT.lets(who, "put", key, "egress")
+        assert DEFAULT.lets(who, "reply", key, "egress")
+
+
+@pytest.mark.parametrize("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
+def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: str) -> None:
+    assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == {"local"}
+    assert TRUSTING.who("declare_subscriber", TRUSTING.key(below)) == FROM["viewer"]
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
+    heard = [rule for rule in DOOR.rules_of(role) if "ingress" in rule["flows"]]
+    named = [key for rule in heard for key in rule["key_exprs"]]
+    assert named
+    assert not [key for key in named if "*" in key]
+
+
+def test_by_tls_each_certificate_commands_on_its_own_keys_and_no_other() -> None:
+    people = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
+    door = Access(door_access, access=people)
+    for kind in ("cmd", "wheel_cmd"):
+        for who in ("wall", "anna", "ben", "chief", "viewer", "operator", "maintainer"):
+            for name in ("anna", "ben", "chief", "wall", "*", "ann$*"):
+                own = who == name and who != "wall"
+                assert door.lets(who, "put", door.key(f"{kind}/app/{name}")) == own
+            assert not door.lets(who, "put", door.key(f"{kind}/app"))
+
+
+def test_a_router_hands_on_the_commands_of_any_certificate_and_has_none_without() -> None:
+    for role in ("operator", "maintainer"):
+        assert DEFAULT.lets(role, "put", DEFAULT.key("cmd/app/anna"))
+        assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/ghost/anna"))
+        assert not DEFAULT.lets(role, "put", DEFAULT.key("cmd/app"))
+    assert not DEFAULT.lets("viewer", "put", DEFAULT.key("cmd/app/anna"))
+
+
+LEAST: dict[str, Role] = {
+    "cmd/<source>/<certificate>": "operator",
+    "wheel_cmd/<source>/<certificate>": "operator",
+    "imu": "maintainer",
+    "stop": "viewer",
+    "info": "viewer",
+    "topics": "viewer",
+    "interfaces": "viewer",
+    "schema/<Type>": "viewer",
+    "whoami/<role>": "operator",
+    "config": "maintainer",
+    "srv/stop": "viewer",
+    "srv/clear": "operator",
+    "srv/activate": "operator",
+    "srv/deactivate": "operator",
+    "srv/reset_odometry": "operator",
+    "srv/set_pose": "maintainer",
+    "srv/set": "maintainer",
+}
+
+
+@pytest.mark.parametrize(
+    "topic", [t for t in TOPICS if t.direction != "out"], ids=lambda topic: topic.key
+)
+def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
+    access = SENSING if topic.gyro else DEFAULT
+    key = access.key(written(topic.key))
+    message = "put" if topic.direction == "in" else "query"
+    allowed = FROM[LEAST[topic.key]] if topic.key in LEAST else {"local"}
+    assert access.who(message, key) == allowed
+    declared = "declare_subscriber" if topic.direction == "in" else "declare_queryable"
+    for who in EVERYBODY:
+        assert access.lets(who, declared, access.key(topic.pattern), "egress")
+
+
+@pytest.mark.parametrize("access", [DEFAULT, TRUSTING], ids=["exact", "wildcards"])
+def test_a_role_may_ask_for_its_own_name_and_those_below_and_no_other(access: Access) -> None:
+    for role in ROLES:
+        who = access.who("query", access.key(whoami_key(role)))
+        assert who == FROM[role]
+    assert access.who("query", access.key("whoami/*")) <= FROM["maintainer"]
+
+
+def test_the_least_role_of_a_key_is_the_one_that_the_rules_have() -> None:
+    for topic in TOPICS:
+        if topic.direction != "out" and topic.key in LEAST and topic.key != WHOAMI:
+            assert least_role(written(topic.key)) == LEAST[topic.key]
+        elif topic.direction == "out":
+            assert least_role(topic.key) == "viewer"
+
+
+def test_a_gyro_that_nobody_wants_is_granted_to_nobody() -> None:
+    for key in (DEFAULT.key("imu"), "imu/data"):
+        assert not any(DEFAULT.lets(role, "put", key) for role in ROLES)
+
+
+def test_beside_the_simulated_gyro_only_who_is_at_the_machine_is_heard_and_all_may_follow_it(
+) -> None:  # fmt: skip
+    simulated = Access(odometry=GYRO)
+    # received so that the daemon can refuse and report it
+    assert simulated.who("put", simulated.key("imu")) == {"local"}
+    assert simulated.who("declare_subscriber", simulated.key("imu")) == FROM["viewer"]
+
+
+def test_everybody_admitted_sees_that_the_robot_is_alive() -> None:
+    for message in ("declare_liveliness_subscriber", "liveliness_query"):
+        assert DEFAULT.who(message, DEFAULT.key("alive")) == FROM["viewer"]
+        assert DEFAULT.who(message, "acsard/*/alive") == {"local"}
+        assert TRUSTING.who(message, "acsard/*/alive") == FROM["viewer"]
+    for who in EVERYBODY:
+        assert DEFAULT.lets(who, "liveliness_token", DEFAULT.key("alive"), "egress")
+
+
+def test_a_router_may_tell_of_another_with_our_id_or_our_ros_names() -> None:
+    for token in (DEFAULT.key("alive"), *claims(RosConfig())):
+        assert DEFAULT.who("liveliness_token", token) == FROM["maintainer"]
+        assert DEFAULT.lets("maintainer", "declare_liveliness_subscriber", token, "egress")
+
+
+def test_who_comes_late_gets_the_static_transforms_that_are_kept() -> None:
+    ros = endpoints(RosConfig(), ZID)
+    for key in (DEFAULT.key("tf_static"), *(e.key for e in ros if e.latched)):
+        for message in ("query", "declare_subscriber"):
+            assert DEFAULT.who(message, f"{key}/@adv/**") == {"local"}
+            assert TRUSTING.who(message, f"{key}/@adv/**") == FROM["viewer"]
+        for who in EVERYBODY:
+            assert DEFAULT.lets(who, "reply", f"{key}/@adv/**", "egress")
+
+
+# no wildcard gets around the rules
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_no_role_may_delete_or_answer_in_the_robots_place(role: Role) -> None:
+    messages = {m for r in DEFAULT.rules_of(role) if "ingress" in r["flows"] for m in r["messages"]}
+    assert not messages & {"delete", "reply", "declare_queryable"}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_no_role_may_put_by_wildcard_or_on_what_the_robot_publishes(role: Role) -> None:
+    below = [
+        "*",
+        "**",
+        "cmd/*",
+        "cmd/**",
+        "wheel_cmd/*",
+        "cmd/a$*",
+        "stop/**",
+        "*/app",
+        "cmd/ghost",
+        "cmd/app",
+        "cmd/app/**",
+        "cmd/*/anna",
+    ]
+    below += ["json/*", "json/**", *TOLD]
+    for key in (*map(DEFAULT.key, below), "acsard/*/cmd/app", "acsard/**", "**"):
+        assert not DEFAULT.lets(role, "put", key), key
+
+
+@pytest.mark.parametrize("role", ["viewer", "operator"])
+def test_no_wildcard_covers_a_service_for_less_than_a_maintainer(role: Role) -> None:
+    """A wildcard that matches a service is denied.
+
+    A wildcard that includes such a wildcard is therefore denied as well.
+    """
+    services = [DEFAULT.key(f"srv/{verb}") for verb in SERVICES] + [DEFAULT.key("config")]
+    services += [e.key for e in endpoints(RosConfig(), ZID) if e.direction in ("query", "service")]
+    for rule in TRUSTING.rules_of(role):
+        if "ingress" in rule["flows"] and "query" in rule["messages"]:
+            for held in map(zenoh.KeyExpr, rule["key_exprs"]):
+                met = [service for service in services if held.intersects(zenoh.KeyExpr(service))]
+                assert met in ([], [str(held)])
+
+
+def test_not_even_a_maintainer_asks_beyond_the_robots_own_keys() -> None:
+    for key in ("acsard/*/config", "acsard/**", "**", "acsard/*", "0/**", "acsard/other/srv/stop"):
+        assert DEFAULT.who("query", key) == TRUSTING.who("query", key) == set()
+
+
+@pytest.mark.parametrize("role", ROLES)
+@pytest.mark.parametrize(
+    "key", ["acsard/other/stop", "acsard/other/cmd/app", "acsard/acsard/stop", "other/cmd_vel", "x"]
+)
+def test_nothing_outside_the_robots_own_keys_is_granted(role: Role, key: str) -> None:
+    for message in ("put", "query", "delete", "reply"):
+        assert not DEFAULT.lets(role, message, key)
+        assert not DEFAULT.lets(role, message, key, "egress")
+
+
+IDS = st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True)
+
+
+@pytest.mark.slow
+@given(IDS, IDS)
+def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> None:
+    access = Access(robot=RobotConfig(id=one), ros=RosConfig(bridge=False, rmw=False))
+    for topic in TOPICS:
+        message = "put" if topic.direction == "in" else "query"
+        key = full_key(other, written(topic.key))
+        if one != other:
+            assert not any(access.lets(role, message, key) for role in ROLES)
+    assert access.lets("viewer", "put", full_key(one, "stop"))
+
+
+# rules that depend on the configuration
+
+
+@given(st.lists(IDS, min_size=1, max_size=5, unique=True))
+def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
+    sources = tuple(Source(name, priority=1, timeout=0.25) for name in names)
+    access = Access(door_access, commands=CommandsConfig(sources=sources), ros=RosConfig())
+    for kind in ("cmd", "wheel_cmd"):
+        for name in names:
+            assert access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
+            assert not access.lets("viewer", "put", access.key(f"{kind}/{name}/operator"))
+        for name in {"teleop", "app", "nav", "ros2_control"}.difference(names):
+            assert not access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
+    for endpoint in endpoints(RosConfig(), ZID):
+        if endpoint.direction == "in" and endpoint.native != "imu":
+            listed = endpoint.native.partition("/")[2] in names
+            assert access.lets("operator", "put", endpoint.key) == listed
+
+
+def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() -> None:
+    for rules in (access_control, door_access):
+        access = Access(rules, commands=CommandsConfig(sources=()))
+        assert not access.lets("maintainer", "put", access.key("cmd/app/maintainer"))
+        assert access.lets("viewer", "put", access.key("stop"))
+        zenoh.Config().insert_json5("access_control", json.dumps(access.value))
+
+
+@pytest.mark.parametrize("namespace", ["", "robot1"])
+@pytest.mark.parametrize("transport", ["bridge", "rmw"])
+def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, namespace: str) -> None:
+    other = "rmw" if transport == "bridge" else "bridge"
+    ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
+    access = Access(ros=ros, mcu=REAL, odometry=GYRO)
+    found = endpoints(ros, ZID)
+    assert {endpoint.direction for endpoint in found} == {"in", "out", "query", "service"}
+    for endpoint in found:
+        key, native = endpoint.key, endpoint.native
+        if endpoint.direction == "out":
+            assert access.who("declare_subscriber", key) == FROM["viewer"]
+            assert access.lets("viewer", "put", key, "egress")
+            assert not any(access.lets(role, "put", key) for role in ROLES)
+        elif endpoint.direction == "in":
+            assert access.who("put", key) == FROM[LEAST.get(native, "operator")]
+        else:
+            least = "maintainer" if native.startswith(PARAMETERS) else LEAST[native]
+            assert access.who("query", key) == FROM[least]
+            assert access.lets("viewer", "declare_queryable", key, "egress")
+        if endpoint.token:
+            assert access.lets("viewer", "liveliness_token", endpoint.token, "egress")
+
+
+@pytest.mark.parametrize("gone", ["bridge", "rmw"])
+def test_a_ros_tree_that_is_off_leaves_no_keys_behind(gone: str) -> None:
+    access = Access(ros=RosConfig(**{gone: False}))  # type: ignore[arg-type]
+    keys = {e.key for e in endpoints(RosConfig(), ZID) if e.transport == gone}
+    named = {key for rule in access.rules.values() for key in rule["key_exprs"]}
+    assert keys
+    assert not keys & named
+    for key in keys:
+        assert not any(
+            access.lets(role, message, key) for role in ROLES for message in ("put", "query")
+        )
+
+
+def test_the_lists_of_certificates_are_the_subjects() -> None:
+    names = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
+    subjects = Access(access=names).subjects
+    held = {role: subjects[role]["cert_common_names"] for role in ROLES}
+    assert held == {"viewer": ["wall"], "operator": ["anna", "ben"], "maintainer": ["chief"]}
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
+    """Zenoh would apply a subject without names to every client."""
+    access = Access(access=AccessConfig(**{f"{role}s": ()}))  # type: ignore[arg-type]
+    assert role not in access.subjects
+    assert set(access.subjects) == {*EVERYBODY} - {role}
+    assert not any(role in policy["subjects"] for policy in access.value["policies"])
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {},
+        {"ros": RosConfig(bridge=False, rmw=False)},
+        {"ros": RosConfig(namespace="a/b", domain=232)},
+        {"access": AccessConfig(viewers=(), operators=(), maintainers=())},
+        {"robot": RobotConfig(id="x" * 32)},
+    ],
+    ids=["defaults", "no ROS", "ROS elsewhere", "no certificates", "long id"],
+)
+@pytest.mark.parametrize("rules", [access_control, door_access])
+def test_zenoh_accepts_the_rules(
+    tables: dict[str, Any], rules: Callable[[Config], dict[str, object]]
+) -> None:
+    access = Access(rules, **tables)
+    config = zenoh.Config()
+    config.insert_json5("access_control", json.dumps(access.value))
+    assert json.loads(config.get_json("access_control"))["default_permission"] == "deny"
+    for rule in access.value["rules"]:
+        assert rule["key_exprs"]
+        assert len(set(rule["key_exprs"])) == len(rule["key_exprs"])
+
+
+def test_at_the_door_each_role_may_what_it_may_and_the_daemon_all() -> None:
+    door = DOOR
+    for role in ROLES:
+        there, here = (
+            [rule for rule in access.rules_of(role) if "/cmd/" not in rule["key_exprs"][0]]
+            for access in (door, DEFAULT)
+        )
+        assert there == here
+    for flow in ("ingress", "egress"):
+        for message in ("put", "delete", "query", "reply", "declare_subscriber"):
+            for key in ("acsard/acsar/odom", "acsard/acsar/tf_static/@adv/x", "@ros2_lv/0/x", "**"):
+                assert door.lets("local", message, key, flow)
+
+
+@pytest.mark.parametrize("page", ["web", "systemd", "zenoh"])
+@pytest.mark.parametrize("role", ROLES)
+def test_each_page_names_the_services_of_a_role(page: str, role: Role) -> None:
+    text = (Path(__file__).parents[4] / "deploy" / page / "README.md").read_text()
+    (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)
+    named = {verb for verb in SERVICES if re.search(rf"[`*]{verb}[`*]", row)}
+    assert named == {verb for verb, least in SERVICE_ROLES.items() if least == role}

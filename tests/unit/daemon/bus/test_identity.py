@@ -1,0 +1,76 @@
+"""The role of a client is the highest role whose key answers, in any order of answers.
+
+Without an answer there is no role.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from acsard.core.values import ROLES
+from acsard.daemon.bus import identity as rooms
+from acsard.daemon.bus.identity import Identity, identity
+
+
+def of(*answering: str) -> Identity:
+    def ask(name: str, take: Any) -> None:
+        asked.append(name)
+        if len(asked) == len(ROLES):  # every key is queried before the first reply is awaited
+            for role in answering:
+                take(SimpleNamespace(key_expr=f"acsard/acsar/whoami/{role}"))
+
+    asked: list[str] = []
+    return identity(ask, "", "joe/1/aa")
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rooms, "WHOAMI_S", 0.05)
+    monkeypatch.setattr(rooms, "WHOAMI_MORE_S", 0.02)
+
+
+def test_the_highest_role_that_answers_is_ours_in_any_order() -> None:
+    for count in range(1, len(ROLES) + 1):
+        for answering in permutations(ROLES[:count]):
+            assert of(*answering).role == ROLES[count - 1]
+
+
+def test_no_answer_and_a_strangers_are_no_role() -> None:
+    assert of().role == of("admin").role == ""
+
+
+def test_what_a_role_lacks_is_told_with_the_role_it_takes_and_else_nothing() -> None:
+    viewer = Identity("viewer", "anna", "joe/1/aa")
+    assert viewer.lacks("srv/clear") == (
+        "your certificate anna is viewer: it may follow and stop, not drive; "
+        "srv/clear is for a certificate that is operator"
+    )
+    assert viewer.lacks("srv/stop") == viewer.lacks("state") == ""
+    assert Identity("maintainer", "", "x").lacks("config") == ""
+    assert Identity("", "", "x").lacks("config") == ""
+
+
+def test_a_silence_is_first_a_question_about_the_id_and_no_claim_about_a_list() -> None:
+    nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
+    for told in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
+        assert told.startswith("nobody answers as 'robot1' at tls/a.local:7449")
+        assert "asked: acsard/robot1/whoami/viewer" in told
+        assert told.index("is --id right") < told.index("daemon run") < told.index("role's list")
+        assert "yours is anna" in told
+        assert "add" not in told
+    stranger = Identity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
+    assert stranger.words().startswith("nobody answers as 'robot1' at tcp/127.0.0.1:7448")
+    assert "certificate" not in stranger.words()
+    assert Identity("viewer", "anna", "x").silence == stranger.silence == ""
+
+
+def test_who_is_asked_and_where_is_told_with_the_role() -> None:
+    def nobody(name: str, take: Any) -> None:
+        pass
+
+    found = identity(nobody, "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
+    assert (found.robot, found.endpoint) == ("robot1", "tcp/127.0.0.1:7448")

@@ -1,0 +1,104 @@
+"""Tests of the outlets between the control loop and the bus.
+
+The loop never waits, and the newest value is sent.
+"""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any, cast
+
+import msgspec
+import pytest
+import zenoh
+
+from acsard.core.messages.schema import Twist, Vector3
+from acsard.daemon.bus.outlets import HELD, STUCK_NS, Outlets
+from acsard.host import clock
+
+TOPIC, KEY = "cmd_vel_out", "acsard/acsar/cmd_vel_out"
+WAIT_S = 5.0
+
+
+class Publisher:
+    """A publisher with a subscriber, whose put blocks until `free` is set."""
+
+    matching_status = SimpleNamespace(matching=True)
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.free, self.entered, self.error = threading.Event(), threading.Event(), error
+        self.sent: list[float] = []
+
+    def declare_matching_listener(self, callback: object) -> object:
+        return callback
+
+    def put(self, payload: bytes) -> None:
+        self.entered.set()
+        assert self.free.wait(WAIT_S)
+        if self.error:
+            raise self.error
+        self.sent.append(msgspec.msgpack.decode(payload, type=Twist).linear.x)
+
+    def declare_publisher(self, key: str, **options: Any) -> Publisher:
+        """Act as the session, which declares this publisher for its only key."""
+        return self
+
+
+def started(publisher: Publisher) -> Outlets:
+    outlets = Outlets()
+    outlets.declare(cast(zenoh.Session, publisher), TOPIC, KEY, "msgpack", "")
+    outlets.start()
+    return outlets
+
+
+def publish(outlets: Outlets, number: float) -> None:
+    outlets.publish(TOPIC, Twist(Vector3(x=number), Vector3()))
+    outlets.flush()
+
+
+def test_all_is_sent_in_its_order_while_the_bus_takes_it() -> None:
+    publisher = Publisher()
+    publisher.free.set()
+    outlets = started(publisher)
+    for number in range(HELD):
+        publish(outlets, number)
+    outlets.stop(WAIT_S)
+    assert publisher.sent == list(range(HELD))
+    assert outlets.losses(clock.mono_ns()) == (0, False)
+
+
+def test_while_the_bus_is_locked_the_newest_wait_and_the_others_are_counted() -> None:
+    publisher = Publisher()
+    outlets = started(publisher)
+    publish(outlets, 0)
+    assert publisher.entered.wait(WAIT_S)
+    for number in range(1, 101):
+        publish(outlets, number)
+    assert outlets.losses(clock.mono_ns())[0] == 100 - HELD
+    publisher.free.set()
+    outlets.stop(WAIT_S)
+    assert publisher.sent == [0, *range(101 - HELD, 101)]
+
+
+def test_a_locked_bus_is_told_once_and_after_it_was_free_again() -> None:
+    publisher = Publisher()
+    outlets = started(publisher)
+    publish(outlets, 0)
+    assert publisher.entered.wait(WAIT_S)
+    now_ns = clock.mono_ns()
+    told = [outlets.losses(now_ns + late_ns)[1] for late_ns in (0, STUCK_NS + 1, 2 * STUCK_NS)]
+    assert told == [False, True, False]
+    publisher.free.set()
+    outlets.stop(WAIT_S)
+    assert outlets.losses(now_ns + 3 * STUCK_NS) == (0, False)
+
+
+def test_what_the_thread_dies_of_ends_the_loop() -> None:
+    publisher = Publisher(ValueError("a bug"))
+    publisher.free.set()
+    outlets = started(publisher)
+    publish(outlets, 0)
+    outlets.stop(WAIT_S)
+    with pytest.raises(ValueError, match="a bug"):
+        outlets.flush()

@@ -1,0 +1,52 @@
+"""Tests of the robots that `--id` selects, and of the robot that a key belongs to."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.daemon.bus.robot_discovery import named, nobody, robot_of
+from acsard.host.errors import UsageError
+
+
+@pytest.mark.parametrize(
+    ("text", "ids"),
+    [
+        ("robot1", ()),
+        ("*", ("*",)),
+        ("robot1,robot2", ("robot1", "robot2")),
+        ("b, a,b", ("b", "a")),
+    ],
+)
+def test_an_id_names_one_robot_several_or_all(text: str, ids: tuple[str, ...]) -> None:
+    assert named(text) == ids
+
+
+@pytest.mark.parametrize("text", ["a,", ",", "a,*", "a,b/c", "a,$*"])
+def test_what_names_nobody_is_refused_with_the_way_to_write_it(text: str) -> None:
+    with pytest.raises(UsageError, match="comma"):
+        named(text)
+
+
+@pytest.mark.parametrize(
+    ("key", "robot"),
+    [
+        ("acsard/robot1/state", "robot1"),
+        ("acsard/robot1/srv/stop", "robot1"),
+        ("acsard/*/state", ""),
+        ("acsard/**", ""),
+        ("acsard/robot1/**", ""),
+        ("other/robot1/state", ""),
+    ],
+)
+def test_a_key_is_of_one_robot_and_a_wildcard_of_none(key: str, robot: str) -> None:
+    assert robot_of(key) == robot
+
+
+def test_where_wildcards_do_not_pass_names_are_asked_for() -> None:
+    assert "exact keys" in nobody("tls/router.local:7447")
+    assert "exact keys" not in nobody("tcp/127.0.0.1:7448")
+
+
+def test_where_certificates_decide_who_sees_nobody_is_told_how_to_find_out() -> None:
+    assert "`acsard whoami --id robot1` tells" in nobody("tls/router.local:7447")
+    assert "whoami" not in nobody("tcp/127.0.0.1:7448")

@@ -1,0 +1,155 @@
+"""A subscription returns the samples of its key in order and ends after a silence."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import deque
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import zenoh
+
+from acsard.daemon.bus.subscription import QUEUED, Subscription, queue_on
+
+KEY, WILDCARD = "acsard/acsar/state", "acsard/**"
+
+
+class Queue:
+    """A stand-in for Zenoh's queue."""
+
+    def __init__(self, *keys: str) -> None:
+        self.held = deque(SimpleNamespace(key_expr=key, number=n) for n, key in enumerate(keys))
+        self.open = True
+
+    def try_recv(self) -> Any:
+        return self.held.popleft() if self.held else None
+
+    def wait(self, seconds: float | None) -> None:
+        """Return at once, because no further sample arrives."""
+
+    def undeclare(self) -> None:
+        self.open = False
+
+
+def numbers(subscription: Subscription) -> list[int]:
+    found: Any = subscription.until_silence(0.01)
+    return [sample.number for sample in found]
+
+
+def test_what_a_stranger_put_on_a_wildcard_is_not_of_the_key() -> None:
+    assert numbers(Subscription(Queue(KEY, WILDCARD, WILDCARD, KEY), KEY)) == [0, 3]
+
+
+def test_without_a_key_it_is_all_there_is() -> None:
+    assert numbers(Subscription(Queue(KEY, WILDCARD, KEY))) == [0, 1, 2]
+
+
+def test_a_flood_of_strangers_does_not_hold_the_caller() -> None:
+    queue = Queue(*[WILDCARD] * (QUEUED + 1), KEY)
+    subscription = Subscription(queue, KEY)
+    assert subscription.try_recv() is None
+    assert len(queue.held) == 2
+    assert subscription.try_recv() is not None
+
+
+def test_it_is_undeclared_after_a_silence_and_when_its_reader_leaves() -> None:
+    silent, left = Queue(), Queue(KEY, KEY)
+    assert numbers(Subscription(silent)) == []
+    reader: Any = Subscription(left).until_silence(None)
+    next(reader)
+    reader.close()
+    assert (silent.open, left.open) == (False, False)
+
+
+class Closed(Queue):
+    """A queue whose session has been closed while the queue was still in use."""
+
+    def try_recv(self) -> Any:
+        if not self.held:
+            raise zenoh.ZError("receiving on a closed channel")
+        return super().try_recv()
+
+    def undeclare(self) -> None:
+        raise zenoh.ZError("already undeclared")
+
+
+def test_it_ends_when_its_session_is_closed() -> None:
+    assert numbers(Subscription(Closed(KEY, KEY))) == [0, 1]
+
+
+def test_a_closed_one_is_undeclared_without_a_word() -> None:
+    Subscription(Closed()).undeclare()
+
+
+# samples that Zenoh's thread hands over
+
+
+class Session:
+    """A session whose subscriptions receive their samples from the test."""
+
+    def __init__(self) -> None:
+        self.handlers: list[Any] = []
+
+    def declare_subscriber(self, key: str, handler: Any) -> Queue:
+        self.handlers.append(handler)
+        return Queue()
+
+
+def declared() -> tuple[Any, Subscription]:
+    session: Any = Session()
+    queue = queue_on(session, KEY, latched=False)
+    return session.handlers[0], Subscription(queue)
+
+
+def sample(number: int) -> Any:
+    return SimpleNamespace(key_expr=KEY, number=number)
+
+
+def test_a_reader_sleeps_until_something_comes_and_ends_when_the_session_is_closed() -> None:
+    handler, subscription = declared()
+    asleep: Any = subscription.until_silence(None)
+
+    def other() -> None:
+        for number in range(3):
+            handler.callback(sample(number))
+        handler.drop()
+
+    looks = 0
+    look = subscription.try_recv
+
+    def counted() -> Any:
+        nonlocal looks
+        looks += 1
+        if looks == 1:
+            # The first look finds the queue empty. The waiter looks again only when a sample
+            # arrives.
+            threading.Timer(0.2, other).start()
+        return look()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(subscription, "try_recv", counted)
+        assert [one.number for one in asleep] == [0, 1, 2]
+    assert looks <= 1 + 2 * 4  # a poll every millisecond would look 200 times
+
+
+def test_an_asyncio_reader_is_woken_by_what_comes_and_by_the_end() -> None:
+    handler, subscription = declared()
+
+    async def read() -> list[int]:
+        asyncio.get_running_loop().call_later(0.05, handler.callback, sample(2))
+        asyncio.get_running_loop().call_later(0.06, handler.drop)
+        return [one.number async for one in subscription.arriving()]  # type: ignore[attr-defined]
+
+    for number in range(2):
+        handler.callback(sample(number))
+    assert asyncio.run(read()) == [0, 1, 2]
+
+
+def test_of_a_flood_the_newest_are_kept() -> None:
+    handler, subscription = declared()
+    for number in range(QUEUED + 5):
+        handler.callback(sample(number))
+    handler.drop()
+    assert numbers(subscription) == list(range(5, QUEUED + 5))

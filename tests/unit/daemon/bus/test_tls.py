@@ -1,0 +1,133 @@
+"""Tests of the certificate files, and of the sentence for each way in which TLS fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.tls import common_name, ends_ns, require_usable, trouble
+from acsard.host.errors import CertificateError, NotPermittedError
+from acsard.lan.authority import Authority
+
+DAY_NS = 86400 * NS_PER_S
+
+
+def made(where: Path, days: float = 10, authority_days: int = 10) -> Path:
+    Authority.make(where, "test", authority_days).issue(where, "robot", ["localhost"], days)
+    return where
+
+
+def test_the_name_in_a_certificate_is_told_and_of_none_that_can_be_used_no_name(
+    tmp_path: Path,
+) -> None:
+    assert common_name(str(made(tmp_path))) == "robot"
+    Authority.load(tmp_path, str).issue(tmp_path / "anna", "laptop-anna", [], 10)
+    assert common_name(str(tmp_path / "anna")) == "laptop-anna"
+    (tmp_path / "certificate.pem").write_text("junk")
+    assert common_name(str(tmp_path)) == common_name(str(tmp_path / "nobody")) == ""
+
+
+def test_what_lan_init_makes_can_be_used(tmp_path: Path) -> None:
+    require_usable(str(made(tmp_path)))
+
+
+def mixed(where: Path) -> None:
+    other = where / "other"
+    other.mkdir()
+    made(other)
+    (where / "key.pem").write_bytes((other / "key.pem").read_bytes())
+
+
+def with_password(where: Path) -> None:
+    file, lock = where / "key.pem", serialization.BestAvailableEncryption(b"secret")
+    key = serialization.load_pem_private_key(file.read_bytes(), None)
+    pem, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+    file.write_bytes(key.private_bytes(pem, pkcs8, lock))
+
+
+BROKEN: dict[str, Callable[[Path], object]] = {
+    "nothing": lambda where: [path.rename(where / path.stem) for path in where.glob("*.pem")],
+    "no key": lambda where: [path.rename(where / "gone") for path in where.glob("key.pem")],
+    "junk": lambda where: (where / "certificate.pem").write_text("junk"),
+    "junk authority": lambda where: (where / "ca.pem").write_text("junk"),
+    "another's key": mixed,
+    "a key with a password": with_password,
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: str) -> None:
+    BROKEN[how](made(tmp_path))
+    with pytest.raises(CertificateError) as caught:
+        require_usable(str(tmp_path))
+    assert str(tmp_path) in str(caught.value)
+    assert "acsard lan" in str(caught.value)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")
+def test_a_key_that_is_not_ours_to_read_is_no_permission(tmp_path: Path) -> None:
+    (made(tmp_path) / "key.pem").chmod(0)
+    with pytest.raises(NotPermittedError):
+        require_usable(str(tmp_path))
+
+
+@pytest.mark.parametrize(("days", "authority"), [(10, 100), (3000, 2)])
+def test_it_ends_when_the_first_of_certificate_and_authority_does(
+    tmp_path: Path, days: int, authority: int
+) -> None:
+    ends = ends_ns(str(made(tmp_path, days, authority)))
+    later = ends_ns(str(made(tmp_path, 1, 1)))
+    assert ends is not None
+    assert later is not None
+    # an authority is valid for five times the days that were asked for
+    expected = min(days, 5 * authority)
+    assert round((ends - later) / DAY_NS) == expected - 1
+
+
+def test_files_that_are_none_end_at_no_time(tmp_path: Path) -> None:
+    assert ends_ns(str(tmp_path)) is None
+
+
+@pytest.mark.parametrize(
+    ("number", "told", "untold"),
+    [
+        (errno.EHOSTUNREACH, "robot.local is not there (No route to host)", "listens"),
+        (errno.ENETUNREACH, "robot.local is not there (Network is unreachable)", "listens"),
+        (errno.ECONNREFUSED, "nobody listens on port 7449 of robot.local", "not there"),
+    ],
+)
+def test_a_host_that_is_not_there_is_not_one_on_which_nobody_listens(
+    number: int, told: str, untold: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def connection(*_: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(socket, "create_connection", connection)
+    found = trouble("tls/robot.local:7449", "")
+    assert told in found
+    assert untold not in found
+
+
+@pytest.mark.parametrize("options", ["?prio=0-5", "#iface=eth0", "?prio=0-5#iface=eth0"])
+def test_the_options_of_an_endpoint_are_not_part_of_its_port(
+    options: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def connection(address: tuple[str, int], *_: Any) -> None:
+        asked.append(address)
+        raise TimeoutError
+
+    monkeypatch.setattr(socket, "create_connection", connection)
+    assert trouble(f"tls/robot.local:7449{options}", "") == (
+        "robot.local is silent on port 7449: is it on, and does a firewall drop connections?"
+    )
+    assert asked == [("robot.local", 7449)]

@@ -1,0 +1,246 @@
+"""Tests of the router configurations: those that are written, and those that Zenoh accepts.
+
+All others get an error.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import PUBLISHED, TOPICS, json_key, source_keys, whoami_key
+from acsard.core.values import ROLES, Role
+from acsard.daemon.bus.access import least_role
+from acsard.daemon.gateway.fleet_router import Router, router_file
+from acsard.host.errors import InUseError, RouterFileError, UsageError
+
+ROUTER_FILE = Path(__file__).resolve().parents[4] / "deploy" / "zenoh" / "router.json5"
+
+
+def written(where: Path, text: str) -> Path:
+    file = where / "router.json5"
+    file.write_text(text)
+    return file
+
+
+def test_it_takes_the_fleets_file_as_it_is() -> None:
+    router = Router(ROUTER_FILE)
+    assert (router.where, router.most) == ("tls/0.0.0.0:7447", 256)
+    assert router.ready()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }', "not a router's"),
+        ('{ mode: "router", listen: { endpoints: [] } }', "not a router's"),
+        # Zenoh would listen on every address without encryption
+        ('{ mode: "router" }', "needs mode"),
+        ('{ mode: "ruter" }', "; correct it"),
+        ("", "router.json5"),
+    ],
+)
+def test_what_is_none_is_refused_with_the_file_and_the_mend(
+    tmp_path: Path, text: str, says: str
+) -> None:
+    with pytest.raises(RouterFileError) as error:
+        Router(written(tmp_path, text))
+    assert says in str(error.value)
+    assert "router.json5" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{ mode", "line 1, column 1: expected array, boolean, null, number, object, or string"),
+        ('{\n  mode: "router"\n  listen: {} }', "line 2, column 9: expected boolean or null"),
+        ('{ mode: "ruter" }', "line 1, column 9: unknown variant `ruter`, expected one of"),
+        ("{\n  foo: 1 }", "line 2, column 3: unknown field `foo`"),
+        ("{\n  foo: 1 }", "`plugins_loading`, `plugins`"),  # the last of 23 names
+        ('{ mode: "a\\"b" }', 'unknown variant `a"b`'),
+    ],
+)
+def test_what_cannot_be_read_is_told_whole_with_its_line_and_column(
+    tmp_path: Path, text: str, says: str
+) -> None:
+    with pytest.raises(RouterFileError) as error:
+        Router(written(tmp_path, text))
+    assert says in str(error.value)
+    assert ".rs" not in str(error.value)
+    assert "Location" not in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RouterFileError, match=r"nowhere\.json5"):
+        Router(tmp_path / "nowhere.json5")
+
+
+def on(where: Path, endpoint: str) -> Router:
+    alone = "scouting: { multicast: { enabled: false } }"
+    text = f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, {alone} }}'
+    return Router(written(where, text))
+
+
+def test_an_address_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as other,
+        pytest.raises(InUseError, match="are the addresses free"),
+    ):
+        on(tmp_path, f"tcp/127.0.0.1:{other.getsockname()[1]}").open()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "says"),
+    [("tls/127.0.0.1:0", "TLS private key"), ("pigeon/127.0.0.1:0", "pigeon protocol")],
+)
+def test_what_no_address_would_mend_is_the_file_s_fault(
+    tmp_path: Path, endpoint: str, says: str
+) -> None:
+    with pytest.raises(RouterFileError, match=rf"router\.json5 cannot be used: .*{says}"):
+        on(tmp_path, endpoint).open()
+
+
+TEMPLATE = (Path(__file__).resolve().parents[4] / "deploy" / "zenoh" / "router.json5").read_text()
+
+TEN = tuple(f"robot{n}" for n in range(1, 11))
+
+
+def read(text: str) -> Any:
+    """Return the access rules and storages that Zenoh reads from the file."""
+    config = zenoh.Config.from_json5(text)
+    access = json.loads(config.get_json("access_control"))
+    return access | {"storages": json.loads(config.get_json("plugins/storage_manager/storages"))}
+
+
+def made(robots: Sequence[str], people: Mapping[Role, Sequence[str]] | None = None) -> Any:
+    return read(router_file(TEMPLATE, robots, people or {}))
+
+
+def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
+    assert made(["robot1"]) == read(TEMPLATE)
+
+
+@pytest.mark.parametrize(
+    ("rule", "role"),
+    [("see-robot1", "viewer"), ("operate-robot1", "operator"), ("keep-robot1", "maintainer")],
+)
+def test_each_role_may_ask_for_what_the_bus_of_a_robot_lets_it(rule: str, role: Role) -> None:
+    (keys,) = [one["key_exprs"] for one in read(TEMPLATE)["rules"] if one["id"] == rule]
+    told = [topic.key for topic in PUBLISHED]
+    asked = [topic.key for topic in TOPICS if topic.direction in ("query", "service")]
+    asked = [key for key in asked if "<" not in key] + [f"schema/{name}" for name in SCHEMAS]
+    may = {key for key in [*told, *map(json_key, told), *asked, "alive"] if least_role(key) == role}
+    assert {key.removeprefix("acsard/robot1/") for key in keys} == may | {whoami_key(role)}
+
+
+def test_each_of_ten_robots_has_what_one_has_and_nothing_of_another() -> None:
+    one, ten = made(["robot1"]), made(TEN)
+    for robots in (["robot1"], TEN):
+        assert f"// It is for {', '.join(robots)}. For yours:\n" in router_file(
+            TEMPLATE, robots, {}
+        )
+    own = [rule for rule in one["rules"] if "robot1" in rule["id"]]
+    assert len(ten["rules"]) == len(one["rules"]) + 9 * len(own)
+    rules = {rule["id"]: rule for rule in ten["rules"]}
+    for robot in TEN:
+        for rule in own:
+            there = rules[rule["id"].replace("robot1", robot)]
+            assert there["key_exprs"] == [
+                key.replace("acsard/robot1/", f"acsard/{robot}/") for key in rule["key_exprs"]
+            ]
+        (policy,) = [p for p in ten["policies"] if p["subjects"] == [f"robot-{robot}"]]
+        assert policy["rules"] == [f"own-{robot}"]
+        (subject,) = [s for s in ten["subjects"] if s["id"] == f"robot-{robot}"]
+        assert subject["cert_common_names"] == [robot]
+        assert {f"{robot}-state", f"{robot}-odom", f"{robot}-tf_static"} <= ten["storages"].keys()
+    for role in ("viewers", "operators", "maintainers"):
+        before, after = (
+            next(p["rules"] for p in each["policies"] if p["subjects"] == [role])
+            for each in (one, ten)
+        )
+        named = [rule for rule in before if "robot1" in rule]
+        assert sorted(after) == sorted(
+            {rule.replace("robot1", robot) for rule in named for robot in TEN}
+            | set(before) - set(named)
+        )
+
+
+def test_people_are_in_the_list_of_their_role_beside_its_own_certificate() -> None:
+    who: dict[Role, list[str]] = {
+        "operator": ["laptop-anna", "robot1-ben"],
+        "viewer": ["wall"],
+        "maintainer": ["chief"],
+    }
+    names = {s["id"]: s["cert_common_names"] for s in made(["a-1"], who)["subjects"]}
+    assert names == {
+        "viewers": ["viewer", "wall"],
+        "operators": ["operator", "laptop-anna", "robot1-ben"],
+        "maintainers": ["maintainer", "chief"],
+        "robot-a-1": ["a-1"],
+        **{f"certificate {name}": [name] for name in DRIVE},
+    }
+
+
+DRIVE = ("operator", "laptop-anna", "robot1-ben", "maintainer", "chief")
+
+
+@pytest.mark.parametrize("robots", [["a-1"], ["operator-1", "robot1", "x"]])
+def test_each_certificate_that_commands_has_keys_of_its_own_on_each_robot(
+    robots: list[str],
+) -> None:
+    people: dict[Role, list[str]] = {
+        "operator": ["laptop-anna", "robot1-ben"],
+        "maintainer": ["chief"],
+        "viewer": ["wall"],
+    }
+    access = made(robots, people)
+    rules = {rule["id"]: rule for rule in access["rules"]}
+    commands = [rule for rule in rules.values() if any("cmd/" in key for key in rule["key_exprs"])]
+    own = {f"own-{robot}" for robot in robots}
+    assert {rule["id"] for rule in commands} == {f"commands of {name}" for name in DRIVE} | own
+    for name in DRIVE:
+        rule = rules[f"commands of {name}"]
+        assert set(rule["key_exprs"]) == {
+            f"acsard/{robot}/{key}"
+            for robot in robots
+            for key in source_keys(("teleop", "app", "ros2_control", "nav"), name)
+        }
+        assert (rule["flows"], rule["messages"]) == (["ingress"], ["put"])
+        (policy,) = [p for p in access["policies"] if rule["id"] in p["rules"]]
+        assert policy["subjects"] == [f"certificate {name}"]
+
+
+@pytest.mark.parametrize(
+    ("robots", "people"),
+    [
+        (["robot1", "robot1"], {}),
+        (["robot1"], {"viewer": ["robot1"]}),
+        (["robot1"], {"viewer": ["anna"], "operator": ["anna"]}),
+        (["operator"], {}),
+    ],
+)
+def test_a_name_has_one_place(robots: list[str], people: Mapping[Role, Sequence[str]]) -> None:
+    with pytest.raises(UsageError, match="there twice"):
+        router_file(TEMPLATE, robots, people)
+
+
+def test_no_robot_is_called_as_something_else_in_the_file_is() -> None:
+    robots = ["viewers", "hear", "learn", "a", "see-a", "own-a", "robot-a"]
+    access = made(robots)
+    for kind in ("rules", "subjects"):
+        ids = [one["id"] for one in access[kind]]
+        assert len(set(ids)) == len(ids)
+    assert len(access["storages"]) == 3 * len(robots)
+
+
+def test_every_role_has_its_list() -> None:
+    for role in ROLES:
+        subject = f'{{ id: "{role}s", link_protocols: ["tls"], cert_common_names: ["{role}"] }}'
+        assert subject in TEMPLATE

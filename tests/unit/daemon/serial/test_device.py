@@ -1,0 +1,157 @@
+"""Tests of a serial device on a pty: the reasons why it cannot be opened, and its release."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import itertools
+import os
+import pty
+import termios
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from serial import SerialException
+
+from acsard.cli.exits import code_of
+from acsard.daemon.serial.device import close, draining, open_raw, refusal, require, unsent
+from acsard.host import clock
+from acsard.host.errors import Exit, InUseError, NoPortError
+
+
+@pytest.fixture
+def path() -> Iterator[str]:
+    ends = pty.openpty()
+    yield os.ttyname(ends[1])
+    for end in ends:
+        os.close(end)
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        (errno.ENOENT, Exit.NO_PORT, "is not there"),
+        (errno.ENXIO, Exit.NO_PORT, "is not there"),
+        (errno.ENOTTY, Exit.NO_PORT, "is not a serial port"),
+        (errno.EACCES, Exit.NO_PERMISSION, "dialout"),
+        (errno.EPERM, Exit.NO_PERMISSION, "dialout"),
+        (errno.EBUSY, Exit.IN_USE, "in use by another process"),
+        (errno.EAGAIN, Exit.IN_USE, "in use by another process"),
+        (errno.EIO, Exit.FAILURE, "the driver did not answer"),
+    ],
+)
+def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: str) -> None:
+    refused = refusal("/dev/acsar_that_is_not", OSError(number, "the driver did not answer"))
+    assert code_of(refused) is code
+    assert str(refused).count("/dev/acsar_that_is_not") == 1
+    assert words in str(refused)
+
+
+def test_nothing_to_read_is_no_hang_up_and_a_hang_up_is() -> None:
+    master, slave = pty.openpty()
+    device = open_raw(os.ttyname(slave), 115200)
+    os.close(slave)
+    device.timeout = 0  # pyserial-asyncio does this: it sets the port up once more
+    assert device.read(10) == b""
+    os.close(master)
+    with pytest.raises(SerialException, match=r"hung up|read failed"):
+        device.read(10)
+    close(device, lost=True, wait_s=5.0)
+
+
+def test_a_port_that_no_thread_could_close_is_closed_by_the_next_opening(path: str) -> None:
+    device = open_raw(path, 115200)
+    usual = threading.stack_size(1 << 46)  # no machine has room for such a thread
+    try:
+        close(device, lost=True)
+    finally:
+        threading.stack_size(usual)
+    device.close()
+    again = open_raw(path, 115200)  # the lock would refuse this if the first one were still open
+    close(again, wait_s=5.0)
+    again.close()
+
+
+def test_a_port_is_locked_while_it_is_open_and_free_when_it_is_closed(path: str) -> None:
+    device = open_raw(path, 115200)
+    with pytest.raises(OSError, match=r"lock|busy") as locked:
+        open_raw(path, 115200)
+    assert isinstance(refusal(path, locked.value), InUseError)
+    close(device, wait_s=5.0)
+    # Root may open a locked device anyway, so the test reads the lock itself.
+    after = os.open(path, os.O_RDWR | os.O_NOCTTY)
+    exclusive = bytearray(4)
+    fcntl.ioctl(after, 0x80045440, exclusive)  # TIOCGEXCL
+    os.close(after)
+    assert not any(exclusive)
+    again = open_raw(path, 115200)
+    close(again, wait_s=5.0)
+    again.close()
+    device.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [(name, call) for name, calls in (("tcgetattr", 2), ("tcsetattr", 2), ("tcflush", 3))
+     for call in range(1, calls + 1)],
+)  # fmt: skip
+def test_a_device_that_vanishes_inside_any_call_of_the_opening_is_a_lost_device(
+    path: str, monkeypatch: pytest.MonkeyPatch, name: str, call: int
+) -> None:
+    real, calls = getattr(termios, name), itertools.count(1)
+
+    def vanishing(*arguments: object) -> object:
+        if next(calls) >= call:
+            raise termios.error(errno.EIO, "Input/output error")
+        return real(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(termios, name, vanishing)
+        with pytest.raises(OSError, match="Input/output error") as lost:
+            open_raw(path, 115200)
+    assert lost.value.errno == errno.EIO
+    assert code_of(refusal(path, lost.value)) is Exit.FAILURE
+    close(open_raw(path, 115200), wait_s=5.0)  # the failed attempt left nothing open or locked
+
+
+def test_a_device_that_is_no_tty_is_told_so() -> None:
+    with pytest.raises(OSError, match="ioctl") as refused:
+        open_raw("/dev/null", 115200)
+    assert refused.value.errno == errno.ENOTTY
+
+
+def test_who_has_the_device_may_still_drain_and_close_it(path: str) -> None:
+    device = open_raw(path, 115200)
+    close(device, lost=True, wait_s=5.0)
+    assert os.readlink(f"/proc/self/fd/{device.fileno()}") == os.devnull
+    with pytest.raises(termios.error):
+        device.flush()
+    device.close()
+
+
+def test_what_cannot_say_what_it_holds_is_drained_at_once(path: str) -> None:
+    with open(os.devnull) as null:
+        assert unsent(null.fileno()) == 0
+        assert list(draining(null.fileno(), clock.mono_ns() + 10**9)) == []
+
+
+@pytest.mark.parametrize("name", ["nothing", "file", "."])
+def test_what_is_no_device_is_no_port(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(NoPortError, match=r"`acsard ports` lists"):
+        require(str(tmp_path / name))
+
+
+def test_a_device_by_its_stable_name_is_one(tmp_path: Path) -> None:
+    link = tmp_path / "acsar"
+    link.symlink_to("/dev/null")
+    require(str(link))
+
+
+def test_a_port_that_was_closed_is_read_as_a_lost_one(path: str) -> None:
+    device = open_raw(path, 115200)
+    device.close()
+    with pytest.raises(SerialException):
+        device.read(1)

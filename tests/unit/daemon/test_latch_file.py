@@ -1,0 +1,613 @@
+"""Tests of the latch file on disks that are full, fail, hang or hold another file."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config
+from acsard.core.values import Event, Instant, Latch, Latches
+from acsard.daemon import latch_file as module
+from acsard.daemon.kept_latches import MAX_BYTES, encode
+from acsard.daemon.latch_file import LatchFile, place
+from acsard.host.atomic_file import replace as replace_file
+from acsard.host.atomic_file import sync as sync_file
+from acsard.host.errors import InUseError
+
+NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
+STOP = Latches(stop=Latch(1_800_000_000_000, NOW.wall_ns, "joe", "stopped by joe"))
+FAULT = Latches(fault=Latch(1_800_000_000_001, NOW.wall_ns, "", "front_left turns by itself"))
+NAME = "acsar.latches.json"
+
+Started = Callable[..., tuple[LatchFile, Latches]]
+
+
+def config(where: Path) -> Config:
+    return replace(Config(), control=replace(Config().control, state_directory=str(where)))
+
+
+@pytest.fixture
+def started() -> Iterator[Started]:
+    """Yield a function that starts latch files, and end them afterwards as a process would."""
+    files: list[LatchFile] = []
+
+    def start(where: Path) -> tuple[LatchFile, Latches]:
+        files.append(LatchFile(config(where), {}))
+        return files[-1], asyncio.run(files[-1].start(NOW))
+
+    yield start
+    for file in files:
+        end(file)
+
+
+def end(file: LatchFile) -> None:
+    """End as a process ends: write for the last time and release the lock."""
+    file.close()
+    if file._lock >= 0:
+        os.close(file._lock)
+        file._lock = -1
+
+
+def until(look: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not look():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+def test_without_a_file_it_is_the_first_start_and_the_file_is_there_then(
+    tmp_path: Path, started: Started
+) -> None:
+    file, latches = started(tmp_path / "state" / "acsard")
+    assert latches == Latches()
+    assert file.trouble == ""
+    assert (tmp_path / "state" / "acsard" / NAME).read_bytes() == encode("acsar", Latches())
+
+
+@pytest.mark.parametrize("latches", [STOP, FAULT])
+def test_latches_are_in_force_at_the_next_start(
+    tmp_path: Path, started: Started, latches: Latches
+) -> None:
+    file, _ = started(tmp_path)
+    file.keep(latches)
+    end(file)
+    assert started(tmp_path)[1] == latches.after_restart()
+
+
+def test_a_latch_that_was_cleared_stays_cleared(tmp_path: Path, started: Started) -> None:
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    file.keep(Latches())
+    end(file)
+    assert started(tmp_path)[1] == Latches()
+
+
+def half(path: Path) -> None:
+    path.write_bytes(encode("acsar", STOP)[:80])
+
+
+def loop(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def link_to_nothing(path: Path) -> None:
+    path.symlink_to(path.with_name("unmounted"))
+
+
+def too_large(path: Path) -> None:
+    path.write_bytes(encode("acsar", STOP) + b" " * MAX_BYTES)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (Path.touch, "it is empty"),
+        (half, "it is damaged"),
+        (Path.mkdir, "Is a directory"),
+        (os.mkfifo, "it is not a regular file"),
+        (loop, "Too many levels of symbolic links"),
+        (link_to_nothing, "No such file"),
+        (too_large, "more than 65536 bytes"),
+    ],
+)
+def test_a_file_that_cannot_be_read_starts_the_robot_stopped(
+    tmp_path: Path, started: Started, spoil: Callable[[Path], None], reason: str
+) -> None:
+    path = tmp_path / NAME
+    spoil(path)
+    _, latches = started(tmp_path)
+    assert latches.stop
+    assert latches.stop.by == "acsard"
+    begins = f"stopped at the start, because {path} cannot be read: "
+    assert latches.stop.why.startswith(begins)
+    assert reason in latches.stop.why
+    assert latches.stop.why.endswith("; a stop may have been lost")
+
+
+def test_the_stop_for_a_lost_file_is_itself_kept(tmp_path: Path, started: Started) -> None:
+    half(tmp_path / NAME)
+    file, latches = started(tmp_path)
+    end(file)
+    assert started(tmp_path)[1] == latches.after_restart()
+
+
+def test_a_directory_that_cannot_be_written_starts_the_robot_stopped(
+    tmp_path: Path, started: Started
+) -> None:
+    (tmp_path / "file").touch()
+    file, latches = started(tmp_path / "file")
+    assert latches.stop
+    assert latches.stop.why.startswith("stopped at the start, because ")
+    assert file.trouble.startswith("a stop cannot be kept over a restart: ")
+
+
+def test_an_old_stop_in_a_directory_that_cannot_be_written_keeps_its_name(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    end(file)
+    monkeypatch.setattr(module, "replace", full)
+    file, latches = started(tmp_path)
+    assert latches == STOP.after_restart()
+    assert "No space left" in file.trouble
+
+
+def test_a_user_without_a_home_is_told_so_and_the_robot_starts_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def nowhere() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", nowhere)
+    file = LatchFile(Config(), {})
+    latches = asyncio.run(file.start(NOW))
+    assert latches.stop
+    assert "set control.state_directory or $XDG_STATE_HOME" in latches.stop.why
+    file.close()
+
+
+def test_a_directory_of_an_unknown_user_is_told_and_the_robot_starts_stopped() -> None:
+    file = LatchFile(config(Path("~nobody-has-this-name/acsard")), {})
+    latches = asyncio.run(file.start(NOW))
+    file.close()
+    assert latches.stop
+    assert "control.state_directory: " in latches.stop.why
+
+
+def test_each_place_goes_before_the_next_one() -> None:
+    service, user = {"STATE_DIRECTORY": "/var/lib/acsard:/var/lib/b"}, {"XDG_STATE_HOME": "/u"}
+    assert place(config(Path("/mine")), service | user) == Path("/mine") / NAME
+    assert place(Config(), service | user) == Path("/var/lib/acsard") / NAME
+    assert place(Config(), user) == Path("/u/acsard") / NAME
+    assert place(Config(), {}) == Path.home() / ".local/state/acsard" / NAME
+    # The specification of the variable says that a relative path must be ignored.
+    assert place(Config(), {"XDG_STATE_HOME": "state"}) == place(Config(), {})
+    assert place(config(Path("~/mine")), {}) == Path.home() / "mine" / NAME
+
+
+def test_two_robots_in_one_directory_keep_apart(tmp_path: Path, started: Started) -> None:
+    started(tmp_path)[0].keep(STOP)
+    two = replace(config(tmp_path), robot=replace(Config().robot, id="two"))
+    other = LatchFile(two, {})
+    assert asyncio.run(other.start(NOW)) == Latches()
+    end(other)
+
+
+def test_a_file_that_another_daemon_keeps_is_not_overwritten_after_a_slow_start(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, _ = started(tmp_path)
+    first.keep(STOP)
+    until(lambda: first.holds(STOP))
+    goes, usual = threading.Event(), LatchFile._read
+
+    def late(self: LatchFile, now: Instant) -> Latches:
+        assert goes.wait(10.0)
+        return usual(self, now)
+
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(LatchFile, "_read", late)
+    second, latches = started(tmp_path)
+    assert latches.stop
+    goes.set()
+    until(lambda: "another daemon keeps the stop" in second.trouble)
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_a_second_daemon_of_the_same_robot_does_not_start(tmp_path: Path, started: Started) -> None:
+    started(tmp_path)
+    with pytest.raises(InUseError, match=r"another daemon keeps the stop of robot acsar in .*id"):
+        started(tmp_path)
+
+
+def test_the_temporary_file_of_a_killed_write_is_removed(tmp_path: Path, started: Started) -> None:
+    (tmp_path / f".{NAME}.k1ll3d").touch()
+    started(tmp_path)
+    assert not list(tmp_path.glob(f".{NAME}.*"))
+
+
+def test_a_file_system_without_locks_keeps_latches_all_the_same(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without(*words: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", without)
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    end(file)
+    assert started(tmp_path)[1] == STOP.after_restart()
+
+
+# while it runs
+
+
+def full(*words: object, **more: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class Stuck:
+    """A disk that writes nothing until `goes` is set."""
+
+    def __init__(self) -> None:
+        self.asked, self.goes, self.texts = threading.Event(), threading.Event(), list[str]()
+
+    def replace(self, file: Path, text: str, *, synced: bool) -> None:
+        self.asked.set()
+        assert self.goes.wait(10.0)
+        self.texts.append(text)
+        replace_file(file, text, synced=synced)
+
+
+@pytest.fixture
+def stuck(monkeypatch: pytest.MonkeyPatch) -> Iterator[Stuck]:
+    disk = Stuck()
+    yield disk
+    disk.goes.set()
+
+
+def test_only_the_newest_is_written_when_the_disk_takes_again(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file.keep(FAULT)
+    assert stuck.asked.wait(10.0)
+    for latches in (STOP, Latches(), STOP, FAULT, STOP):
+        file.keep(latches)
+    stuck.goes.set()
+    end(file)
+    assert stuck.texts == [encode("acsar", FAULT).decode(), encode("acsar", STOP).decode()]
+
+
+def test_a_flood_of_stops_is_written_at_a_pace(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    texts = []
+
+    def counted(path: Path, text: str, *, synced: bool) -> None:
+        texts.append(text)
+        replace_file(path, text, synced=synced)
+
+    monkeypatch.setattr(module, "replace", counted)
+    began = time.monotonic()
+    for number in range(40):
+        file.keep(Latches(stop=Latch(number, NOW.wall_ns, "joe", "stopped by joe")))
+        time.sleep(0.005)
+    end(file)
+    assert len(texts) <= (time.monotonic() - began) / module.PACE_S + 2
+    assert '"number": 39' in texts[-1]
+
+
+def test_latches_are_held_from_the_rename_on(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, first = started(tmp_path)
+    assert file.holds(first)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file.keep(STOP)
+    assert stuck.asked.wait(10.0)
+    assert not file.holds(STOP)
+    syncs = threading.Event()
+    monkeypatch.setattr(module, "sync", lambda path: syncs.wait(10.0))
+    stuck.goes.set()
+    until(lambda: file.holds(STOP))
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+    syncs.set()
+
+
+def test_to_wait_ends_once_the_latches_are_held(tmp_path: Path, started: Started) -> None:
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    file.wait(STOP, 10.0)
+    assert file.holds(STOP)
+
+
+def test_to_wait_for_a_stuck_disk_ends_when_the_time_is_over(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file.keep(STOP)
+    began = time.monotonic()
+    file.wait(STOP, 0.05)
+    assert 0.05 <= time.monotonic() - began < 5.0
+    assert not file.holds(STOP)
+
+
+def test_to_wait_for_a_disk_that_fails_is_over_at_once(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "replace", full)
+    file.keep(STOP)
+    until(lambda: file.trouble)
+    began = time.monotonic()
+    file.wait(STOP, 10.0)
+    assert time.monotonic() - began < 5.0
+
+
+def test_the_end_waits_for_a_stuck_disk_only_for_its_time(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file.keep(STOP)
+    began = time.monotonic()
+    file.close()
+    assert module.CLOSE_S <= time.monotonic() - began < module.CLOSE_S + 5.0
+
+
+OFF = Latches(
+    inactive=Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page"),
+    lowered={"limits.linear_speed": 0.4},
+)
+
+
+def test_a_disk_that_does_not_write_at_the_start_loses_no_latch_that_was_read(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", OFF))
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file, latches = started(tmp_path)
+    assert latches.stop
+    assert "a stop cannot be kept over a restart" in latches.stop.why
+    assert "the disk did not answer" in latches.stop.why
+    assert "the disk did not answer" in file.trouble
+    assert replace(latches, stop=None) == OFF.after_restart()
+    stuck.goes.set()
+    until(lambda: file.trouble == "")
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", latches)
+
+
+def test_a_disk_that_syncs_slowly_does_not_stop_the_robot_at_the_start(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", OFF))
+    goes = threading.Event()
+    monkeypatch.setattr(module, "START_S", 0.2)
+    monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
+    try:
+        assert started(tmp_path)[1] == OFF.after_restart()
+    finally:
+        goes.set()
+
+
+def test_a_first_sync_that_hangs_is_reported_when_a_stop_waits_for_it(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+    monkeypatch.setattr(module, "sync", lambda path: goes.wait(10.0))
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "START_S", 0.05)
+    try:
+        file.keep(STOP)
+        until(lambda: module.HANGS in file.trouble)
+    finally:
+        goes.set()
+    until(lambda: file.trouble == "")
+
+
+def fails_to_sync(path: Path) -> None:
+    raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def test_a_first_sync_that_fails_is_reported_and_tried_again(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "sync", fails_to_sync)
+    file, _ = started(tmp_path)
+    until(lambda: "Input/output error" in file.trouble)
+    monkeypatch.setattr(module, "sync", sync_file)
+    until(lambda: file.trouble == "")
+
+
+def test_a_first_sync_that_fails_does_not_undo_a_stop_that_came_meanwhile(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+
+    def fails_late(path: Path) -> None:
+        assert goes.wait(10.0)
+        fails_to_sync(path)
+
+    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    monkeypatch.setattr(module, "sync", fails_late)
+    file, _ = started(tmp_path)
+    file.keep(STOP)
+    goes.set()
+    until(lambda: "Input/output error" in file.trouble)
+    monkeypatch.setattr(module, "sync", sync_file)
+    until(lambda: file.trouble == "")
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual = threading.Thread.start
+
+    def start(self: threading.Thread) -> None:
+        if self.name == "latches":
+            raise RuntimeError("can't start new thread")
+        usual(self)
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    file, latches = started(tmp_path)
+    assert latches.stop
+    assert "no room for another thread" in latches.stop.why
+    assert "no room for another thread" in file.trouble
+
+
+def test_a_thread_that_has_ended_is_told(tmp_path: Path, started: Started) -> None:
+    file, _ = started(tmp_path)
+    file.close()
+    assert file.trouble.startswith("the thread that keeps a stop over a restart has ended")
+
+
+def test_a_file_that_was_not_read_at_the_start_is_read_before_it_is_written(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", replace(OFF, fault=FAULT.fault)))
+    goes, usual = threading.Event(), module._content
+
+    def late(path: Path) -> bytes:
+        assert goes.wait(10.0)
+        return usual(path)
+
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "_content", late)
+    file, latches = started(tmp_path)
+    assert latches.stop
+    assert f"{tmp_path / NAME} cannot be read: the disk did not answer" in latches.stop.why
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", replace(OFF, fault=FAULT.fault))
+    goes.set()
+    until(lambda: file.trouble == "")
+    until(lambda: file.holds(latches))
+    file.keep(cleared := Latches(lowered={"limits.angular_speed": 1.0}))
+    until(lambda: file.holds(cleared))
+    end(file)
+    monkeypatch.undo()
+    _, after = started(tmp_path)
+    both = {"limits.linear_speed": 0.4, "limits.angular_speed": 1.0}
+    assert after == replace(OFF, fault=FAULT.fault, lowered=both).after_restart()
+
+
+def test_a_first_look_that_begins_after_the_start_gave_up_changes_nothing(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", OFF))
+    works: list[Callable[[], object]] = []
+
+    async def never(work: Callable[[], object], seconds: float) -> None:
+        works.append(work)
+        raise TimeoutError
+
+    monkeypatch.setattr(module, "in_thread", never)
+    file, latches = started(tmp_path)
+    until(lambda: file.holds(latches))
+    written = (tmp_path / NAME).read_bytes()
+    works[0]()
+    assert file.holds(latches)
+    assert (tmp_path / NAME).read_bytes() == written
+
+
+@pytest.mark.parametrize("number", [errno.ESTALE, errno.EACCES])
+def test_a_name_that_cannot_be_looked_up_is_not_a_first_start(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    (tmp_path / NAME).write_bytes(encode("acsar", STOP))
+    usual = os.lstat
+
+    def fails(path: str | Path) -> os.stat_result:
+        if Path(path) == tmp_path / NAME:
+            raise OSError(number, os.strerror(number))
+        return usual(path)
+
+    monkeypatch.setattr(os, "lstat", fails)
+    _, latches = started(tmp_path)
+    monkeypatch.setattr(os, "lstat", usual)
+    assert latches.stop
+    assert os.strerror(number) in latches.stop.why
+
+
+def test_a_disk_that_hangs_later_is_reported_once_and_so_is_its_answer(
+    tmp_path: Path, started: Started, stuck: Stuck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, first = started(tmp_path)
+    until(lambda: file.holds(first))
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "replace", stuck.replace)
+    file.keep(STOP)
+    until(lambda: file.trouble)
+    path = tmp_path / NAME
+    assert file.trouble == f"a stop cannot be kept over a restart: {path}: {module.HANGS}"
+    (event,) = file.news()
+    assert (event.name, event.level) == ("latch_file", "warning")
+    assert module.HANGS in event.text
+    assert file.news() == []
+    stuck.goes.set()
+    until(lambda: file.trouble == "")
+    assert file.news() == [Event("latch_file", f"a stop is kept again in {path}")]
+
+
+def test_a_disk_that_hangs_and_then_fails_is_not_said_to_keep_again(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+
+    def fails_late(*words: object, **more: object) -> None:
+        assert goes.wait(10.0)
+        full()
+
+    file, first = started(tmp_path)
+    until(lambda: file.holds(first))
+    monkeypatch.setattr(module, "START_S", 0.05)
+    monkeypatch.setattr(module, "replace", fails_late)
+    file.keep(STOP)
+    until(lambda: file.trouble)
+    assert [event.level for event in file.news()] == ["warning"]
+    goes.set()
+    until(lambda: "No space left" in file.trouble)
+    (event,) = file.news()
+    assert event.level == "warning"
+    assert "No space left" in event.text
+
+
+def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    monkeypatch.setattr(module, "RETRY_S", 0.01)
+    tries = []
+
+    def fails(*words: object, **more: object) -> None:
+        tries.append(1)
+        full()
+
+    monkeypatch.setattr(module, "replace", fails)
+    file.keep(STOP)
+    until(lambda: len(tries) > 3)
+    news = file.news()
+    path = tmp_path / NAME
+    said = f"a stop cannot be kept over a restart: {path}: No space left on device"
+    assert file.trouble == said
+    again = f"{said}; it is tried again every {module.RETRY_S:g} s"
+    assert news == [Event("latch_file", again, "warning")]
+    monkeypatch.setattr(module, "replace", replace_file)
+    until(lambda: file.trouble == "")
+    assert file.news() == [Event("latch_file", f"a stop is kept again in {path}")]
+    assert path.read_bytes() == encode("acsar", STOP)

@@ -1,0 +1,175 @@
+"""Tests of the daemon's own latencies, and of the histogram that holds them."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.values import NS_PER_S, Measured, Spread
+from acsard.daemon.latencies import (
+    DECADES,
+    NAMES,
+    PER_DECADE,
+    SLOT_NS,
+    SLOTS,
+    Figures,
+    Histogram,
+    LastMinute,
+)
+
+BUCKET = 10 ** (1 / PER_DECADE)
+"""Upper end of a bucket divided by its lower end: 1.122."""
+
+
+def spread_of(values: list[float]) -> Spread:
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    return histogram.spread()
+
+
+def order_statistic(values: list[float], share: float) -> float:
+    """Return the smallest value that at least `share` of all values do not exceed."""
+    return sorted(values)[max(0, math.ceil(share * len(values)) - 1)]
+
+
+def test_nothing_measured_is_all_zeros() -> None:
+    assert Histogram().spread() == Spread(0, 0.0, 0.0, 0.0)
+
+
+@given(st.lists(st.floats(1.0, 10.0**DECADES), min_size=1, max_size=300))
+def test_a_percentile_is_at_most_one_bucket_above_the_truth(values: list[float]) -> None:
+    spread = spread_of(values)
+    for share, shown in ((0.50, spread.p50), (0.99, spread.p99)):
+        truth = order_statistic(values, share)
+        assert truth * (1 - 1e-9) <= shown <= truth * BUCKET * (1 + 1e-9)
+
+
+@given(st.lists(st.floats(-1e3, 1e12), min_size=1, max_size=100))
+def test_count_and_maximum_are_exact_and_the_percentiles_in_order(values: list[float]) -> None:
+    spread = spread_of(values)
+    assert spread.count == len(values)
+    assert spread.max == max(0.0, *values)
+    assert 0.0 <= spread.p50 <= spread.p99 <= spread.max
+
+
+def test_one_outlier_in_two_hundred_shows_in_the_maximum_only() -> None:
+    spread = spread_of([10.0] * 199 + [5000.0])
+    assert spread.p50 == pytest.approx(10.0, rel=0.13)
+    assert spread.p99 == pytest.approx(10.0, rel=0.13)
+    assert spread.max == 5000.0
+
+
+def test_two_outliers_in_a_hundred_show_in_the_99th_percentile() -> None:
+    spread = spread_of([10.0] * 98 + [5000.0] * 2)
+    assert spread.p50 == pytest.approx(10.0, rel=0.13)
+    assert spread.p99 == pytest.approx(5000.0, rel=0.13)
+
+
+def test_what_lies_beyond_the_decades_falls_into_the_end_buckets() -> None:
+    assert spread_of([0.001]).p50 == 0.001
+    assert spread_of([3e9]).p50 == pytest.approx(10.0**DECADES)
+    assert spread_of([3e9]).max == 3e9
+
+
+MINUTE_NS = SLOT_NS * SLOTS
+US = 1000
+
+
+def step_time(figures: Figures, now_ns: int) -> Measured:
+    return figures.measured(now_ns)["step_time"]
+
+
+def test_every_figure_is_there_from_the_start() -> None:
+    assert Figures().measured(0) == dict.fromkeys(NAMES, Measured(Spread(), Spread()))
+
+
+def test_a_measurement_counts_for_both() -> None:
+    figures = Figures()
+    figures.add("step_time", NS_PER_S, 250 * US)
+    one = step_time(figures, NS_PER_S)
+    assert one.since_start == one.last_minute == Spread(1, 250.0, 250.0, 250.0)
+
+
+def test_after_a_minute_it_counts_for_the_start_alone() -> None:
+    figures = Figures()
+    figures.add("step_time", 0, 250 * US)
+    assert step_time(figures, MINUTE_NS - 1).last_minute.count == 1
+    one = step_time(figures, MINUTE_NS + NS_PER_S)
+    assert (one.since_start.count, one.last_minute.count) == (1, 0)
+
+
+def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
+    for pause in range(1, 3 * SLOTS):
+        figures = Figures()
+        for slot in range(SLOTS):
+            figures.add("step_time", slot * SLOT_NS, 100 * US)
+        now_ns = (SLOTS - 1 + pause) * SLOT_NS
+        left = max(0, SLOTS - pause)
+        assert step_time(figures, now_ns).last_minute.count == left
+
+
+def test_what_is_told_is_at_most_a_second_old() -> None:
+    figures = Figures()
+    figures.add("step_time", 0, 100 * US)
+    assert step_time(figures, 0).since_start.count == 1
+    figures.add("step_time", 1, 100 * US)
+    assert step_time(figures, NS_PER_S - 1).since_start.count == 1
+    assert step_time(figures, NS_PER_S).since_start.count == 2
+
+
+@given(st.lists(st.tuples(st.integers(0, 20 * NS_PER_S), st.integers(0, 10**9)), max_size=60))
+def test_the_minute_is_what_a_histogram_of_its_measurements_says(
+    measurements: list[tuple[int, int]],
+) -> None:
+    figures, now_ns, kept = Figures(), 0, []
+    for wait_ns, duration_ns in measurements:
+        now_ns += wait_ns
+        figures.add("mcu_round_trip", now_ns, duration_ns)
+        kept.append((now_ns, duration_ns))
+    minute = Histogram()
+    for at_ns, duration_ns in kept:
+        if now_ns // SLOT_NS - at_ns // SLOT_NS < SLOTS:
+            minute.add(duration_ns / 1000)
+    assert figures.measured(now_ns)["mcu_round_trip"].last_minute == minute.spread()
+
+
+def test_a_day_takes_no_more_memory_than_a_minute() -> None:
+    def size(figures: Figures) -> int:
+        return sum(
+            sys.getsizeof(histogram._buckets)
+            for figure in figures._figures.values()
+            for histogram in (figure._past, *figure._slots)
+        )
+
+    figures = Figures()
+    for second in range(60):
+        figures.add("period_lateness", second * NS_PER_S, second * US)
+    after_a_minute = size(figures)
+    for second in range(60, 86_400, 7):
+        figures.add("period_lateness", second * NS_PER_S, second * US)
+    assert size(figures) == after_a_minute
+
+
+def test_what_happened_counts_for_a_minute_and_then_no_more() -> None:
+    happened = LastMinute()
+    assert happened.count(0) == 0
+    happened.add(0, 3)
+    happened.add(SLOT_NS - 1, 2)
+    happened.add(SLOT_NS, 1)
+    assert happened.count(SLOT_NS) == 6
+    assert happened.count(MINUTE_NS - 1) == 6
+    assert happened.count(MINUTE_NS) == 1
+    assert happened.count(MINUTE_NS + SLOT_NS) == 0
+
+
+def test_counting_by_the_minute_takes_no_more_room_with_the_hours() -> None:
+    happened = LastMinute()
+    for second in range(3600):
+        happened.add(second * NS_PER_S, 1)
+    assert happened.count(3599 * NS_PER_S) == 60
+    assert len(happened._slots) == SLOTS

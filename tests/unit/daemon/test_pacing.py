@@ -1,0 +1,158 @@
+"""A line leaves every period, and at once for a new command, but never two too close together."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.daemon.pacing import BREATH_NS, IDLE_WAKES, Pace
+
+MS = 1_000_000
+WIRE_NS = 3 * MS
+PERIOD_NS = 10 * MS
+GAP_NS = WIRE_NS + BREATH_NS
+
+
+class Paced:
+    """A pace and the calls of its control loop."""
+
+    def __init__(self, period_ns: int = PERIOD_NS) -> None:
+        self.pace = Pace(WIRE_NS, period_ns)
+        self.sent_ns = -GAP_NS
+        """Time of the last sent line, as the port remembers it."""
+
+    def ticks(self, at_ns: int, missed: int = 0) -> bool:
+        """End a period without a new command and return whether its line left."""
+        due = self.pace.period_ended(missed)
+        self.pace.note(due, due, due, False, False)
+        self.sent_ns = at_ns if due else self.sent_ns
+        return due
+
+    def hears(self, at_ns: int, *, news: bool = True, goes: bool = True) -> bool:
+        """Take a command between two periods and return whether a line for it was tried."""
+        due = news and self.at_once(at_ns)
+        self.pace.note(False, due, due and goes, news, True)
+        self.sent_ns = at_ns if due and goes else self.sent_ns
+        return due
+
+    def at_once(self, at_ns: int) -> bool:
+        return self.pace.at_once(at_ns, self.sent_ns)
+
+    @property
+    def retry_ns(self) -> int | None:
+        return self.pace.retry_ns(self.sent_ns)
+
+
+def ticked() -> Paced:
+    """Return a pace after the line of a period at 0."""
+    paced = Paced()
+    assert paced.ticks(0)
+    return paced
+
+
+def test_every_period_has_its_line() -> None:
+    paced = Paced()
+    assert all(paced.ticks(number * PERIOD_NS) for number in range(5))
+
+
+def test_a_line_at_once_keeps_the_gap() -> None:
+    paced = ticked()
+    assert not paced.at_once(GAP_NS - 1)
+    assert paced.at_once(GAP_NS)
+
+
+def test_the_gap_counts_from_when_the_line_left() -> None:
+    paced = Paced()
+    paced.pace.period_ended(0)
+    paced.pace.note(True, True, True, False, False)
+    paced.sent_ns = 2 * MS
+    assert not paced.at_once(2 * MS + GAP_NS - 1)
+    assert paced.at_once(2 * MS + GAP_NS)
+
+
+def test_a_line_at_once_takes_the_next_periods_place() -> None:
+    paced = ticked()
+    assert paced.hears(6 * MS)
+    assert not paced.hears(9 * MS), "only one"
+    assert not paced.ticks(10 * MS)
+    assert paced.ticks(20 * MS)
+
+
+def test_after_missed_periods_the_clocks_line_goes_in_any_case() -> None:
+    paced = ticked()
+    assert paced.hears(6 * MS)
+    assert paced.ticks(50 * MS, missed=4)
+
+
+def test_a_line_that_could_not_go_leaves_the_period_its_own() -> None:
+    paced = ticked()
+    assert paced.hears(6 * MS, goes=False)
+    assert not paced.hears(7 * MS), "one try a period"
+    assert paced.retry_ns is None
+    assert not paced.pace.listens
+    assert paced.ticks(10 * MS)
+    assert paced.pace.listens
+
+
+def test_what_comes_too_soon_is_sent_as_soon_as_the_gap_has_passed() -> None:
+    paced = ticked()
+    assert not paced.hears(1 * MS)
+    assert paced.retry_ns == GAP_NS
+    assert not paced.pace.listens, "it is awake for the newest command anyway"
+    assert paced.hears(GAP_NS)
+    assert paced.retry_ns is None
+
+
+def test_there_is_nothing_to_retry_without_news() -> None:
+    paced = ticked()
+    paced.hears(1 * MS, news=False)
+    assert paced.retry_ns is None
+    assert paced.pace.listens
+
+
+def test_a_stranger_wakes_it_only_so_often_a_period() -> None:
+    paced = ticked()
+    for _ in range(IDLE_WAKES):
+        paced.hears(5 * MS, news=False)
+        assert paced.pace.listens
+    paced.hears(5 * MS, news=False)
+    assert not paced.pace.listens
+    paced.ticks(10 * MS)
+    assert paced.pace.listens
+
+
+def test_the_line_before_the_first_is_long_ago() -> None:
+    assert Paced().at_once(0)
+
+
+def test_where_the_next_period_comes_before_the_gap_has_passed_nobody_is_woken() -> None:
+    paced = Paced(period_ns=GAP_NS)
+    paced.ticks(0)
+    assert not paced.pace.listens
+    assert not paced.hears(GAP_NS)
+    assert paced.retry_ns is None
+
+
+@given(st.lists(st.tuples(st.integers(1, 12), st.booleans(), st.booleans()), max_size=200))
+def test_no_traffic_makes_more_lines_than_the_clock_or_closer_ones(
+    wakes: list[tuple[int, bool, bool]],
+) -> None:
+    pace, now_ns, due_ns, periods = Pace(WIRE_NS, PERIOD_NS), 0, PERIOD_NS, 0
+    lines: list[int] = []
+    for wait_ms, news, blocked in wakes:
+        now_ns += wait_ms * MS
+        expired = max(0, (now_ns - due_ns) // PERIOD_NS + 1)
+        due_ns += expired * PERIOD_NS
+        periods += expired
+        tick = expired > 0 and pace.period_ended(expired - 1)
+        sent_ns = lines[-1] if lines else -GAP_NS
+        due = tick or (news and pace.at_once(now_ns, sent_ns))
+        sent = due and not blocked and (not lines or now_ns - lines[-1] >= WIRE_NS)
+        pace.note(tick, due, sent, news, news)
+        lines += [now_ns] * sent
+        retry_ns = pace.retry_ns(lines[-1] if lines else -GAP_NS)
+        assert retry_ns is None or retry_ns > now_ns
+    assert len(lines) <= periods + 1
+    assert all(after - before >= WIRE_NS for before, after in pairwise(lines))

@@ -1,0 +1,123 @@
+"""The period follows the daemon's own clock, whatever the kernel's timers do."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.daemon import wakeup
+from acsard.daemon.pacing import Period
+from acsard.daemon.wakeup import Alarm, Ticker
+
+PERIOD_NS = 10_000_000
+
+
+class Kernel:
+    """A timer whose clock NTP slews, so that it waits `rate` times too long."""
+
+    def __init__(self) -> None:
+        self.now_ns, self.rate, self.at_ns = 5_000_000_000, 1.0, 0
+        self.count = 1
+
+    def set(self, at_ns: int) -> None:
+        self.at_ns = self.now_ns + round((at_ns - self.now_ns) * self.rate)
+
+    def expirations(self) -> int:
+        return self.count
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> Kernel:
+    kernel = Kernel()
+    monkeypatch.setattr(wakeup, "TimerFd", lambda: kernel)
+    return kernel
+
+
+def goes_off(kernel: Kernel, one: Ticker, late_ns: int = 0) -> Period:
+    kernel.now_ns = kernel.at_ns + late_ns
+    one._expire()
+    return one.take(kernel.now_ns)
+
+
+@pytest.mark.parametrize("rate", [0.92, 1.0, 1.08])
+def test_while_the_timer_is_slewed_no_period_is_lost_nor_does_it_drift(
+    kernel: Kernel, rate: float
+) -> None:
+    one = Ticker(PERIOD_NS, lambda: None)
+    kernel.rate = rate
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    for number in range(1, 1001):
+        assert goes_off(kernel, one) == Period(1, start_ns + number * PERIOD_NS)
+        assert abs(kernel.now_ns - start_ns - number * PERIOD_NS) < PERIOD_NS / 10
+
+
+def test_periods_that_were_missed_are_counted_from_the_first(kernel: Kernel) -> None:
+    one = Ticker(PERIOD_NS, lambda: None)
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    assert goes_off(kernel, one, late_ns=3 * PERIOD_NS) == Period(4, start_ns + PERIOD_NS)
+    assert goes_off(kernel, one) == Period(1, start_ns + 5 * PERIOD_NS)
+
+
+def test_a_timer_that_goes_off_again_before_it_is_heard_ends_no_period_twice(
+    kernel: Kernel,
+) -> None:
+    woken: list[int] = []
+    one = Ticker(PERIOD_NS, lambda: woken.append(1))
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    kernel.now_ns = kernel.at_ns
+    for _ in range(3):
+        one._expire()
+    assert len(woken) == 3
+    assert one.take(kernel.now_ns) == Period(1, start_ns + PERIOD_NS)
+    assert one.take(kernel.now_ns).expired == 0
+
+
+def test_what_is_due_is_told_to_whoever_wakes_us_first(kernel: Kernel) -> None:
+    """After a stall, the loop may get a waiting command before it gets the timer."""
+    one = Ticker(PERIOD_NS, lambda: None)
+    start_ns = kernel.now_ns
+    one.start(start_ns)
+    kernel.now_ns += 39 * PERIOD_NS + PERIOD_NS // 2
+    assert one.take(kernel.now_ns) == Period(39, start_ns + PERIOD_NS)
+    assert kernel.at_ns == start_ns + 40 * PERIOD_NS
+    kernel.now_ns = kernel.at_ns - PERIOD_NS // 20
+    assert one.take(kernel.now_ns).expired == 0, "only a timer goes off early"
+    assert goes_off(kernel, one) == Period(1, start_ns + 40 * PERIOD_NS)
+
+
+def test_a_timer_that_goes_off_much_too_early_is_set_again(kernel: Kernel) -> None:
+    one = Ticker(PERIOD_NS, lambda: None)
+    start_ns = kernel.now_ns
+    kernel.rate = 0.5
+    one.start(start_ns)
+    kernel.rate = 1.0
+    assert goes_off(kernel, one).expired == 0
+    assert kernel.at_ns == start_ns + PERIOD_NS
+
+
+def test_an_alarm_that_went_off_too_early_may_be_set_for_the_same_time_again(
+    kernel: Kernel,
+) -> None:
+    woken: list[int] = []
+    alarm = Alarm(lambda: woken.append(1))
+    at_ns = kernel.now_ns + PERIOD_NS
+    alarm.set(at_ns)
+    kernel.at_ns = 0
+    alarm.set(at_ns)
+    assert kernel.at_ns == 0, "it is set for that already"
+    alarm._expire()
+    alarm.set(at_ns)
+    assert kernel.at_ns == at_ns
+    assert woken == [1]
+
+
+def test_what_went_off_before_it_was_set_anew_wakes_nobody(kernel: Kernel) -> None:
+    woken: list[int] = []
+    one = Ticker(PERIOD_NS, lambda: woken.append(1))
+    one.start(kernel.now_ns)
+    kernel.count = 0
+    one._expire()
+    assert not woken
+    assert one.take(kernel.now_ns).expired == 0

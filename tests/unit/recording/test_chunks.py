@@ -1,0 +1,147 @@
+"""A chunk can be read after each of its seconds, and as far as it is whole."""
+
+from __future__ import annotations
+
+import io
+import random
+import struct
+import time
+
+import pytest
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.records import Chunk
+from mcap.stream_reader import breakup_chunk
+
+from acsard.recording.chunks import (
+    GROWING,
+    LAST_BLOCK,
+    MOST_IN_MESSAGE,
+    PARAMETERS,
+    ZSTD,
+    Growing,
+    Message,
+    content,
+    places,
+)
+from acsard.recording.walk import MAGIC, walk
+
+DICE = random.Random(1)
+
+SECONDS = [
+    [Message(1, 1_000 * n + k, b"a line of the board " * 40 + DICE.randbytes(60)) for k in range(3)]
+    for n in range(10)
+]
+"""The messages of ten seconds."""
+
+ALL = [message for second in SECONDS for message in second]
+
+
+def grown(seconds: list[list[Message]]) -> tuple[bytes, list[int], bytes]:
+    """Return the chunk that still grows, where each second ends in it, and the complete chunk."""
+    chunk, data, ends = Growing(), GROWING, []
+    for second in seconds:
+        for message in second:
+            chunk.add(message)
+        data += chunk.take()
+        ends.append(len(data))
+    last, head = chunk.end()
+    return data, ends, head + (data + last)[len(head) :]
+
+
+GROWS, ENDS, COMPLETE = grown(SECONDS)
+
+
+def test_a_chunk_that_grows_has_all_seconds_so_far() -> None:
+    for number, end in enumerate(ENDS, start=1):
+        got = content(GROWS[:end], 0)
+        assert got is not None
+        assert got.messages == [message for second in SECONDS[:number] for message in second]
+        assert (got.end, got.complete) == (end, False)
+
+
+@pytest.mark.parametrize("torn", [b"", bytes(700), DICE.randbytes(64)])
+def test_a_cut_anywhere_costs_the_second_that_it_is_in(torn: bytes) -> None:
+    for cut in range(len(GROWING), len(GROWS), 7):
+        whole = sum(end <= cut for end in ENDS)
+        got = content(GROWS[:cut] + torn, 0)
+        assert got is not None
+        assert got.messages[: 3 * whole] == ALL[: 3 * whole]
+        assert got.messages == ALL[: len(got.messages)]
+        assert len(got.messages) <= 3 * (whole + 1)
+
+
+def test_the_formats_own_reader_reads_a_complete_chunk_and_one_that_was_cut_and_ended() -> None:
+    cut = content(GROWS[: ENDS[6] + 9], 0)
+    assert cut is not None
+    ended = cut.head(GROWS) + GROWS[len(GROWING) : cut.end] + LAST_BLOCK
+    for data, messages in ((COMPLETE, ALL), (ended, ALL[:21])):
+        got = content(data, 0)
+        assert got is not None
+        assert (got.messages, got.end, got.complete) == (messages, len(data), True)
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(data[9:])))
+        read = breakup_chunk(chunk, validate_crc=True)
+        assert [Message(m.channel_id, m.log_time, m.data) for m in read] == messages  # type: ignore[attr-defined]
+        assert (chunk.message_start_time, chunk.message_end_time) == (0, messages[-1].wall_ns)
+        assert struct.unpack_from("<Q", data, 1)[0] == len(data) - 9
+
+
+def test_no_damage_changes_a_message_and_none_in_the_head_costs_one() -> None:
+    for at in range(len(COMPLETE)):
+        bad = bytearray(COMPLETE)
+        bad[at] ^= 1 << DICE.randrange(8)
+        got = content(bytes(bad), 0)
+        if at < len(GROWING):
+            assert got is None or got.messages == ALL
+            continue
+        assert got is not None
+        second = sum(end <= at for end in ENDS)
+        assert got.messages == ALL[: len(got.messages)]
+        assert len(got.messages) >= 3 * second
+
+
+def test_a_chunk_may_begin_wherever_the_name_of_its_compression_is() -> None:
+    assert list(places(bytes(100) + COMPLETE + COMPLETE, 0)) == [100, 100 + len(COMPLETE)]
+    assert content(bytes(100), 0) is None
+    assert content(ZSTD, 0) is None
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        pytest.param(bytes(1 << 28), id="zeros"),
+        pytest.param(struct.pack("<BQ", 5, 1 << 28) + bytes(1 << 28), id="one long message"),
+        pytest.param(struct.pack("<BQ", 5, MOST_IN_MESSAGE) + bytes(1 << 23), id="a wrong one"),
+    ],
+)
+def test_a_few_bytes_that_ask_for_gigabytes_get_nothing(inside: bytes) -> None:
+    packed = zstandard.ZstdCompressor(compression_params=PARAMETERS).compress(inside)
+    began = time.process_time()
+    got = content(GROWING + packed, 0)
+    assert got is not None
+    assert (got.messages, got.complete) == ([], False)
+    assert time.process_time() - began < 0.5
+
+
+def test_a_chunk_of_very_many_blocks_takes_a_time_in_proportion() -> None:
+    chunk, data, message = Growing(), GROWING, Message(1, 5, b"")
+    parts = []
+    for _ in range(20_000):
+        chunk.add(message)
+        parts.append(chunk.take())
+    data += b"".join(parts)
+    began = time.process_time()
+    got = content(data, 0)
+    assert got is not None
+    assert got.messages == [message] * 20_000
+    assert time.process_time() - began < 2.0
+
+
+def test_many_chunks_that_ask_for_megabytes_take_a_time_in_proportion() -> None:
+    """Each claims a message of 4 MB that does not end, so each must be decompressed."""
+    inside = struct.pack("<BQ", 5, MOST_IN_MESSAGE - 100) + bytes(MOST_IN_MESSAGE - 200)
+    packed = zstandard.ZstdCompressor(compression_params=PARAMETERS).compress(inside)
+    data = MAGIC + (GROWING + packed[:-20]) * 1000
+    began = time.process_time()
+    assert [found.messages for found in walk(data)] == [[]]
+    assert time.process_time() - began < 3.0

@@ -1,0 +1,396 @@
+"""A directory of recordings stays within its bounds, and protected files are deleted last."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import RecordConfig
+from acsard.core.values import NS_PER_S, Instant
+from acsard.recording import directory
+from acsard.recording.closing import closing
+from acsard.recording.directory import (
+    DIRECTORY_MODE,
+    KEPT,
+    NEAR,
+    OPEN_DIRECTORY_MODE,
+    PART,
+    Ring,
+    Run,
+    listed,
+)
+from acsard.recording.file import About, Recording, Writing
+from acsard.recording.room import KEPT_FILES, STEADY_NS, Kind
+
+DAY_NS = 86_400_000_000_000
+NOW_NS = 1_800_000_000_000_000_000
+
+
+def about(wall_ns: int = NOW_NS) -> About:
+    return About("acsar", "0.1.0", "3.11.0", 5, wall_ns, "")
+
+
+def ring(where: Path, megabytes: float = 10.0, days: float = 14.0) -> Ring:
+    return Ring(RecordConfig(str(where), megabytes, days))
+
+
+def record(one: Ring, size: int = 10, kind: Kind = "plain", days: int = 0) -> Path:
+    writing = one.begin(about())
+    writing.add("steps", NOW_NS, os.urandom(size))
+    path = one.end(writing, kind)
+    os.utime(path, ns=(0, NOW_NS - days * DAY_NS))
+    return path
+
+
+def later(one: Ring) -> None:
+    """Trim after the clock has run steadily for long enough."""
+    for mono_ns in (0, STEADY_NS):
+        now = Instant(mono_ns, NOW_NS + mono_ns)
+        one.tend(now)
+    one.trim(now)
+
+
+def sizes(where: Path) -> int:
+    return sum(path.stat().st_size for path in listed(where))
+
+
+def test_files_are_numbered_on_whatever_the_clock_says(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    for wall_ns in (NOW_NS, 0, NOW_NS - DAY_NS):
+        one.end(one.begin(about(wall_ns)), "plain")
+    one.close()
+    names = [path.name for path in listed(tmp_path)]
+    assert [name[:6] for name in names] == ["000001", "000002", "000003"]
+    assert names[1] == "000002-19700101T000000Z.mcap"
+    again = ring(tmp_path)
+    assert record(again).name.startswith("000004")
+
+
+@pytest.mark.parametrize("umask", [0, 0o077])
+def test_the_directory_is_the_services_and_its_groups(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        one = ring(tmp_path / "b")
+        path = record(one)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "b").stat().st_mode & 0o777 == DIRECTORY_MODE == 0o750
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def modes(where: Path) -> set[int]:
+    return {path.stat().st_mode & 0o777 for path in listed(where)}
+
+
+def test_the_service_s_directory_lets_in_whoever_gets_there_but_to_its_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = tmp_path / "b"
+    one = ring(where)
+    record(one)  # as an older version did, which had one directory for one robot
+    cut = one.begin(about())
+    cut.add("steps", NOW_NS, b"whole")
+    cut.flush()
+    one.close()
+    assert modes(where) == {0o640}
+    monkeypatch.setenv("ACSARD_RECORD", str(tmp_path))
+    ring(where).close()
+    assert modes(where) == {0o640}, "it is another directory"
+    monkeypatch.setenv("ACSARD_RECORD", str(where))
+    ring(where).close()
+    assert modes(where) == {0o640}, "everybody gets there, not only root"
+    monkeypatch.setattr(directory, "PRIVATE", tmp_path)
+    before = os.umask(0o077)
+    try:
+        one = ring(where)
+        record(one)
+        one.begin(about())
+    finally:
+        os.umask(before)
+    assert where.stat().st_mode & 0o777 == OPEN_DIRECTORY_MODE == 0o755
+    assert (len(listed(where)), modes(where)) == (4, {0o644})
+    assert not (where / ".lock").stat().st_mode & 0o007
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="gives a directory away")
+def test_a_directory_that_is_somebody_else_s_is_recorded_to_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ACSARD_RECORD", ".")
+    monkeypatch.setattr(directory, "PRIVATE", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    tmp_path.chmod(0o777)
+    child = os.fork()
+    if child == 0:
+        try:
+            os.setresuid(65534, 65534, 65534)
+            one = ring(Path())
+            record(one)
+            one.close()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert modes(tmp_path) == {0o644}
+
+
+def test_bytes_are_bounded_the_oldest_goes_first_and_what_is_kept_last(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    kept = record(one, 400_000, kind="kept")
+    first = record(one, 400_000)
+    for _ in range(40):
+        record(one, 400_000)
+        one.trim(None)
+        assert sizes(tmp_path) <= 10e6
+    assert kept.exists()
+    assert not first.exists()
+    assert len(listed(tmp_path)) > 20
+
+
+@pytest.mark.slow
+def test_room_is_made_among_many_files_in_a_time_that_grows_as_they_do(tmp_path: Path) -> None:
+    first = record(ring(tmp_path / "first"))
+
+    def seconds(count: int, turn: int) -> float:
+        where = tmp_path / f"{count}-{turn}"
+        one = ring(where, 1e-3)
+        for number in range(count):
+            os.link(first, where / f"{number:06}-20270115T080000Z.mcap")
+        began = time.process_time()
+        one.trim(None)
+        took = time.process_time() - began
+        assert listed(where) == []
+        return took
+
+    many, few = (min(seconds(count, turn) for turn in range(3)) for count in (4000, 500))
+    assert many < 24 * few, "8 times as many; their square would be 64 times"
+
+
+def test_only_kept_files_are_bounded_in_bytes_too(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    for _ in range(30):
+        newest = record(one, 400_000, kind="kept")
+    one.trim(None)
+    assert sizes(tmp_path) <= 10e6
+    assert newest.exists()
+
+
+def test_days_are_bounded_but_not_of_the_last_fifty_in_which_something_happened(
+    tmp_path: Path,
+) -> None:
+    one = ring(tmp_path, days=2.0)
+    kept = [record(one, kind="kept", days=3) for _ in range(KEPT_FILES + 3)]
+    fresh = record(one, kind="kept", days=1)
+    old, new = record(one, days=3), record(one, days=1)
+    one.close()
+    later(ring(tmp_path, days=2.0))
+    assert [path.exists() for path in kept] == [False] * 4 + [True] * (KEPT_FILES - 1)
+    assert [path.exists() for path in (fresh, old, new)] == [True, False, True]
+
+
+def test_what_ended_in_this_run_is_not_old_and_a_clock_that_was_just_set_tells_no_age(
+    tmp_path: Path,
+) -> None:
+    before = ring(tmp_path, days=2.0)
+    old = record(before, days=3)
+    before.close()
+    one = ring(tmp_path, days=2.0)
+    mine = record(one, days=3)
+    for mono_ns, jump_ns in ((0, 0), (STEADY_NS - 1, 0), (STEADY_NS, 400 * DAY_NS)):
+        now = Instant(mono_ns, NOW_NS + mono_ns + jump_ns)
+        one.tend(now)
+        one.trim(now)
+        assert old.exists()
+    for mono_ns in (STEADY_NS + 1, 2 * STEADY_NS + 1):
+        now = Instant(mono_ns, NOW_NS + mono_ns)
+        one.tend(now)
+        one.trim(now)
+    assert (old.exists(), mine.exists()) == (False, True)
+
+
+def test_what_ended_before_the_clock_was_set_is_no_older_for_that(tmp_path: Path) -> None:
+    one = ring(tmp_path, days=2.0)
+    mine = record(one)
+    ended_ns = mine.stat().st_mtime_ns
+    one.tend(Instant(0, NOW_NS))
+    one.tend(Instant(NS_PER_S, NOW_NS + NS_PER_S + 20 * DAY_NS))
+    assert mine.stat().st_mtime_ns == ended_ns + 20 * DAY_NS
+    one.close()
+    again = ring(tmp_path, days=2.0)
+    for mono_ns in (0, STEADY_NS):
+        now = Instant(mono_ns, NOW_NS + 21 * DAY_NS + mono_ns)
+        again.tend(now)
+        again.trim(now)
+    assert mine.exists()
+
+
+def test_where_others_have_taken_the_disk_the_oldest_go_and_what_is_kept_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = ring(tmp_path)
+    kept = record(one, 100_000, kind="kept")
+    plain = [record(one, 100_000) for _ in range(10)]
+    total, others = 10_000_000, 0
+    real = os.statvfs(tmp_path)
+
+    def told(_: object) -> os.statvfs_result:
+        free = max(0, total - others - sizes(tmp_path)) // 1000
+        return os.statvfs_result((1000, 1000, total // 1000, free, free, *real[5:]))
+
+    monkeypatch.setattr(os, "statvfs", told)
+    one.tend(Instant(0, NOW_NS))
+    assert all(path.exists() for path in plain)
+    others = 8_500_000
+    one.tend(Instant(1, NOW_NS + 1))
+    assert [path.exists() for path in plain] == [False] * 2 + [True] * 8
+    left = []
+    for _ in range(4):  # other programs repeatedly use all free space
+        others = total - sizes(tmp_path)
+        one.tend(Instant(2, NOW_NS + 2))
+        left.append((sum(path.exists() for path in plain), kept.exists()))
+    assert left == [(3, True), (1, True), (0, True), (0, False)]
+
+
+def test_what_is_being_written_and_what_is_not_ours_stays(tmp_path: Path) -> None:
+    one = ring(tmp_path, days=0.01)
+    (tmp_path / "notes.mcap").write_bytes(b"mine")
+    (tmp_path / "notes-1.txt").write_bytes(b"mine")
+    writing = one.begin(about(0))
+    one.trim(None)
+    assert writing.path.exists()
+    assert (tmp_path / "notes.mcap").exists()
+    assert len(listed(tmp_path)) == 1
+
+
+def test_a_file_becomes_a_kept_one_later(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    path = record(one)
+    one.keep(path)
+    (near,) = listed(tmp_path)
+    assert near.name == path.name.replace(".mcap", NEAR)
+    for _ in range(2):
+        one.keep(near)
+    assert listed(tmp_path) == [near]
+
+
+def test_what_a_crash_has_cut_is_made_whole_and_kept(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    writing.add("steps", NOW_NS, b"whole")
+    writing.flush()
+    with writing.path.open("ab") as file:
+        file.write(b"\x06torn")
+    empty = one.begin(about())
+    empty.path.write_bytes(b"\x89MC")
+    one.close()
+    again = ring(tmp_path)
+    (path,) = listed(tmp_path)
+    assert path.name.endswith(KEPT)
+    recording = Recording(path)
+    assert [data for _, _, data in recording.messages()] == [b"whole"]
+    assert recording.whole
+    last = closing(path)
+    assert last is not None
+    assert last.cut == "crash"
+    again.close()
+
+
+def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    writing.add("steps", NOW_NS, b"whole")
+    writing.flush()
+    writing.close()
+    one.close()
+    Ring(RecordConfig(str(tmp_path)), Run(cut={writing.path.name: "plain"}))
+    (path,) = listed(tmp_path)
+    assert path.name == writing.path.name.removesuffix(".part")
+    last = closing(path)
+    assert last is not None
+    assert last.cut == "disk"
+
+
+def test_two_daemons_do_not_record_to_one_place(tmp_path: Path) -> None:
+    one = ring(tmp_path)
+    writing = one.begin(about())
+    with pytest.raises(OSError, match="another daemon records there"):
+        ring(tmp_path)
+    assert writing.path.name.endswith(PART)
+    assert writing.path.exists()
+    one.close()
+    ring(tmp_path).close()
+
+
+def test_what_only_has_a_recording_s_name_is_none_of_them(tmp_path: Path) -> None:
+    """A pipe would block its reader forever, and a link leads elsewhere."""
+    whole = tmp_path / "000001-20260101T000000Z.mcap"
+    whole.touch()
+    os.mkfifo(tmp_path / "000002-20260101T000000Z.mcap")
+    (tmp_path / "000003-20260101T000000Z.mcap").symlink_to("/etc/passwd")
+    (tmp_path / "000004-20260101T000000Z.mcap").symlink_to(tmp_path / "nothing")
+    (tmp_path / "000005-20260101T000000Z.mcap").mkdir()
+    assert listed(tmp_path) == [whole]
+
+
+@pytest.mark.parametrize("event", [b"", b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'])
+def test_what_was_cut_and_cannot_be_read_here_stays_and_is_told(
+    tmp_path: Path, event: bytes
+) -> None:
+    """The file comes from a later version, or contains an event that no version writes."""
+    part = tmp_path / f"000007-20270115T080000Z{PART}"
+    writing = Writing(part, replace(about(), format="acsard/99") if not event else about())
+    writing.add("events" if event else "steps", NOW_NS, event or b"later")
+    writing.flush()
+    writing.close()
+    before = part.read_bytes()
+    one = Ring(RecordConfig(str(tmp_path)))
+    (path,) = listed(tmp_path)
+    assert path.read_bytes() == before
+    assert path.name.endswith(KEPT)
+    (said,) = one.said
+    assert path.name in said
+    assert ("acsard/99" if not event else "an event that is none") in said
+
+
+def test_a_copy_that_did_not_become_whole_goes(tmp_path: Path) -> None:
+    (left := tmp_path / f".000007-20270115T080000Z{PART}.new").write_bytes(b"half")
+    Ring(RecordConfig(str(tmp_path)), run=Run())
+    assert not left.exists()
+
+
+def test_a_file_that_somebody_removes_meanwhile_costs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file disappears between the listing and the look at it.
+
+    This is tested while space is freed, when the clock is set, and while a truncated file is
+    recovered.
+    """
+
+    def found(where: Path) -> list[Path]:
+        paths = listed(where)
+        for path in removed:
+            path.unlink(missing_ok=True)
+        return paths
+
+    removed = list[Path]()
+    monkeypatch.setattr(directory, "listed", found)
+    one = ring(tmp_path)
+    first, second = record(one), record(one)
+    removed = [first]
+    one.trim(None)
+    one.tend(Instant(0, NOW_NS))
+    removed = [second]
+    one.tend(Instant(1, NOW_NS + DAY_NS))
+    third, part = record(one), one.begin(about())
+    part.add("steps", NOW_NS, b"cut")
+    part.flush()
+    one.close()
+    monkeypatch.setattr(Ring, "trim", lambda *_: None)  # the trim would find the third file first
+    removed = [third]
+    again = ring(tmp_path)
+    assert again.cut_ns is not None
+    assert [path.name.endswith(KEPT) for path in listed(tmp_path)] == [True]

@@ -1,0 +1,314 @@
+"""Exported files can be read by third-party programs.
+
+The tests also cover files that are already in their place.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import stat
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from msgspec.structs import replace
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from acsard.core.config.settings import Config
+from acsard.core.ros.channels import CHANNELS
+from acsard.host.errors import RecordingError
+from acsard.recording.beside import beside
+from acsard.recording.export import Kind, Span, export, measured
+from acsard.recording.file import Recording
+from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.world import START, World
+
+SECONDS = 2.0
+
+KINDS: tuple[Kind, ...] = ("mcap", "csv", "rosbag2")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Record a drive with two sources."""
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.3, 0.4)
+    world.drive(0.3, 0.0, 0.3, source="teleop")
+    world.call("stop")
+    world.run(SECONDS - (world.now_ns - START.mono_ns) / 1e9)
+    path = tmp_path_factory.mktemp("recorded") / "drive.mcap"
+    tape.write(path, Config())
+    return path
+
+
+TOPICS = {
+    "/odom", "/tf", "/tf_static", "/joint_states", "/cmd_vel_out", "/diagnostics", "/state", "/log",
+    "/cmd_vel_in/app", "/cmd_vel_in/teleop",
+}  # fmt: skip
+
+
+def test_the_library_of_mcap_finds_it_finished_indexed_and_compressed(
+    path: Path, tmp_path: Path
+) -> None:
+    new = tmp_path / "new.mcap"
+    done = export(Recording(path), new, "mcap")
+    with new.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == done.count > 500
+        assert {one.topic for one in summary.channels.values()} == TOPICS
+        assert {one.compression for one in summary.chunk_indexes} == {"zstd"}
+        kinds = {one.name: one.encoding for one in summary.schemas.values()}
+        assert kinds == {one.schema_name: "ros2msg" for one in CHANNELS}
+        first, last = (
+            (t - START.wall_ns) / 1e9
+            for t in (summary.statistics.message_start_time, summary.statistics.message_end_time)
+        )
+        assert first == pytest.approx(0.0)
+        assert last == pytest.approx(SECONDS, abs=0.1)
+        odom = [one for _, _, one in reader.iter_messages("/odom")]
+    assert [one.sequence for one in odom] == [*range(1, len(odom) + 1)]
+    assert done.trouble == ""
+
+
+def counted(reader: Any) -> Counter[str]:
+    """Return the number of messages per topic, all decoded."""
+    counts: Counter[str] = Counter()
+    with reader:
+        for connection, _, data in reader.messages():
+            message = reader.deserialize(data, connection.msgtype)
+            assert message.__msgtype__ == connection.msgtype
+            counts[connection.topic] += 1
+    return counts
+
+
+def test_rosbags_reads_every_message_by_what_stands_in_the_file_alone(
+    path: Path, tmp_path: Path
+) -> None:
+    recording = Recording(path)
+    one = export(recording, tmp_path / "one.mcap", "mcap")
+    other = export(recording, tmp_path / "bag", "rosbag2")
+    alone, bag = (
+        counted(AnyReader([tmp_path / name], default_typestore=get_typestore(Stores.EMPTY)))
+        for name in ("one.mcap", "bag")
+    )
+    assert alone == bag
+    assert set(bag) == TOPICS
+    assert bag.total() == one.count == other.count
+
+
+def test_a_bag_is_a_directory_whose_metadata_are_those_of_its_file(
+    path: Path, tmp_path: Path
+) -> None:
+    export(Recording(path), tmp_path / "bag", "rosbag2")
+    assert {one.name for one in (tmp_path / "bag").iterdir()} == {"bag_0.mcap", "metadata.yaml"}
+    with Reader(tmp_path / "bag") as reader:
+        times = [time for _, time, _ in reader.messages()]
+        assert reader.message_count == len(times)
+        assert (reader.start_time, reader.end_time - 1) == (min(times), max(times))
+        latched = {
+            one.topic: one.ext.offered_qos_profiles[0].durability.name  # type: ignore[union-attr]
+            for one in reader.connections
+        }
+    assert latched.pop("/tf_static") == "TRANSIENT_LOCAL"
+    assert set(latched.values()) == {"VOLATILE"}
+
+
+def test_a_namespace_is_in_front_of_every_topic(path: Path, tmp_path: Path) -> None:
+    config = replace(Config(), ros=replace(Config().ros, namespace="robot1"))
+    export(Recording(path), tmp_path / "new.mcap", "mcap", config)
+    with (tmp_path / "new.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert {one.topic for one in summary.channels.values()} == {f"/robot1{one}" for one in TOPICS}
+
+
+def test_only_what_was_in_a_time_is_written(path: Path, tmp_path: Path) -> None:
+    new = tmp_path / "new.mcap"
+    begin_ns, end_ns = START.wall_ns + 5 * 10**8, START.wall_ns + 10**9
+    export(Recording(path), new, "mcap", span=Span(0.5, 1.0))
+    with new.open("rb") as stream:
+        times = [
+            m.log_time for _, c, m in make_reader(stream).iter_messages() if c.topic == "/odom"
+        ]
+    assert begin_ns <= min(times) < begin_ns + 20_000_000
+    assert end_ns - 20_000_000 < max(times) <= end_ns
+
+
+def test_a_time_with_nothing_in_it_writes_nothing(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="nothing in that time"):
+        export(Recording(path), tmp_path / "new.mcap", "mcap", span=Span(1000.0))
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_stands_there_stays_unless_it_is_to_go(kind: Kind, path: Path, tmp_path: Path) -> None:
+    new, recording = tmp_path / "new", Recording(path)
+    first = export(recording, new, kind)
+    with pytest.raises(FileExistsError):
+        export(recording, new, kind)
+    half = Span(end=1.0)
+    again = export(recording, new, kind, span=half, force=True)
+    assert again.count < first.count
+    assert [*tmp_path.iterdir()] == [new]
+
+
+def test_a_directory_that_is_no_bag_never_goes(path: Path, tmp_path: Path) -> None:
+    new = tmp_path / "thesis"
+    new.mkdir()
+    (new / "chapter").write_text("1")
+    for kind in ("mcap", "rosbag2"):
+        with pytest.raises(FileExistsError, match="no bag"):
+            export(Recording(path), new, kind, force=True)
+    assert (new / "chapter").read_text() == "1"
+    assert [*tmp_path.iterdir()] == [new]
+
+
+def test_a_bag_with_anything_else_in_it_never_goes(path: Path, tmp_path: Path) -> None:
+    for name in ("notes.txt", "photos", "kept.mcap"):
+        new = tmp_path / f"bag {name}"
+        export(Recording(path), new, "rosbag2")
+        match name:
+            case "photos":
+                (new / name).mkdir()
+            case "kept.mcap":
+                (new / name).write_bytes(path.read_bytes())
+            case _:
+                (new / name).write_text("1")
+        before = sorted(new.iterdir())
+        for kind in KINDS:
+            with pytest.raises(FileExistsError, match=name):
+                export(Recording(path), new, kind, force=True)
+        assert sorted(new.iterdir()) == before
+
+
+def test_a_link_to_a_bag_goes_and_the_bag_stays(path: Path, tmp_path: Path) -> None:
+    bag, link = tmp_path / "bag", tmp_path / "link"
+    export(Recording(path), bag, "rosbag2")
+    link.symlink_to(bag)
+    export(Recording(path), link, "rosbag2", force=True)
+    assert not link.is_symlink()
+    assert {one.name for one in bag.iterdir()} == {"bag_0.mcap", "metadata.yaml"}
+    assert {one.name for one in tmp_path.iterdir()} == {"bag", "link"}
+
+
+def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    for name in ("metadata.yaml", "bag_0.db3"):
+        (bag / name).write_text("1")
+    with pytest.raises(FileNotFoundError), beside(bag, force=True):
+        pass  # the block writes no file that could replace it
+    assert {one.name for one in bag.iterdir()} == {"metadata.yaml", "bag_0.db3"}
+    assert [*tmp_path.iterdir()] == [bag]
+
+
+def test_what_is_no_file_never_goes(path: Path, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for kind in KINDS:
+        with pytest.raises(FileExistsError, match="it is no file"):
+            export(Recording(path), pipe, kind, force=True)
+    assert pipe.is_fifo()
+
+
+def test_a_recording_never_goes(path: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
+    before = path.read_bytes()
+    other.write_bytes(before)
+    for recording in (other, path):
+        with pytest.raises(FileExistsError, match="it is a recording"):
+            export(Recording(recording), other, "mcap", force=True)
+    assert other.read_bytes() == before
+
+
+@contextmanager
+def umask(mask: int) -> Iterator[None]:
+    before = os.umask(mask)
+    try:
+        yield
+    finally:
+        os.umask(before)
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077])
+def test_who_may_read_it_is_what_the_umask_says(mask: int, path: Path, tmp_path: Path) -> None:
+    begin = Span(end=0.1)
+    with umask(mask):
+        export(Recording(path), tmp_path / "a.csv", "csv", span=begin)
+        export(Recording(path), tmp_path / "bag", "rosbag2", span=begin)
+    modes = {stat.S_IMODE(p.stat().st_mode) for p in tmp_path.rglob("*") if p.is_file()}
+    assert modes == {0o666 & ~mask}
+    assert stat.S_IMODE((tmp_path / "bag").stat().st_mode) == 0o777 & ~mask
+
+
+def test_of_a_recording_that_was_cut_what_is_whole_is_written(path: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    begin, end = chunks(path.read_bytes())[-1]
+    cut.write_bytes(path.read_bytes()[: (begin + end) // 2])
+    recording = Recording(cut)
+    done = export(recording, tmp_path / "new.mcap", "mcap")
+    assert not recording.whole
+    with (tmp_path / "new.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == done.count > 100
+
+
+def test_steps_that_are_missing_end_it_and_are_told(path: Path, tmp_path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    begin, end = chunks(data)[-2]
+    data[(begin + end) // 2] ^= 0xFF
+    holed = tmp_path / "holed.mcap"
+    holed.write_bytes(data)
+    done = export(Recording(holed), tmp_path / "new.csv", "csv")
+    assert "steps are missing after step" in done.trouble
+    assert 50 < done.count < export(Recording(path), tmp_path / "whole.csv", "csv").count
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_a_file_cut_and_damaged_anywhere_something_is_written_or_it_is_said_why_not(
+    seed: int, path: Path, tmp_path: Path
+) -> None:
+    dice = random.Random(seed)
+    data = bytearray(path.read_bytes())
+    data = data[: dice.randrange(len(data) // 2, len(data))]
+    for _ in range(dice.randrange(3)):
+        data[dice.randrange(len(data))] ^= 1 << dice.randrange(8)
+    harmed = tmp_path / "harmed.mcap"
+    harmed.write_bytes(data)
+    why = done = None
+    try:
+        recording = Recording(harmed)
+        done = export(recording, tmp_path / "new.csv", "csv")
+    except RecordingError as error:
+        why = str(error)
+    if done is None:
+        assert str(harmed) in str(why)
+        assert [*tmp_path.iterdir()] == [harmed]
+    else:
+        assert done.count > 0
+        assert done.trouble or not recording.whole
+
+
+def test_how_far_it_has_come_is_told_now_and_then(path: Path, tmp_path: Path) -> None:
+    told: list[int] = []
+    export(Recording(path), tmp_path / "new.csv", "csv", progress=told.append)
+    assert told[0] >= START.wall_ns
+    assert told == sorted(told)
+
+
+def test_a_recording_without_a_gyro_is_no_use_for_calibration(path: Path) -> None:
+    with pytest.raises(RecordingError, match="no gyro"):
+        measured(Recording(path))

@@ -1,0 +1,374 @@
+"""A damaged recording gives all its whole chunks and never a traceback."""
+
+from __future__ import annotations
+
+import os
+import random
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from msgspec.structs import replace
+
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.writing import document
+from acsard.core.values import NS_PER_S, Instant
+from acsard.host.errors import RecordingError
+from acsard.recording.closing import Closing, closing
+from acsard.recording.file import CHUNK_BYTES, MODE, About, Recording, Writing, rewrite
+from acsard.recording.replayed import config_of, live, steps
+from acsard.recording.rows import encode
+from acsard.recording.steps import status_of
+from tests.scenarios.taped import BATCH, Tape, chunks
+from tests.scenarios.world import World
+
+
+@pytest.fixture(scope="module")
+def tape() -> Tape:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=6.0)
+    world.call("stop")
+    return tape
+
+
+@pytest.fixture(scope="module")
+def whole(tape: Tape, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("record") / "whole.mcap"
+    tape.write(path, Config())
+    return path
+
+
+def numbers(path: Path) -> list[int]:
+    return [step.number for step in steps(Recording(path))]
+
+
+def test_all_comes_back(tape: Tape, whole: Path) -> None:
+    recording = Recording(whole)
+    read = list(steps(recording))
+    assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
+    assert [step.said.status for step in read] == [status_of(t.outputs) for t in tape.taken]
+    assert (recording.whole, recording.damaged) == (True, 0)
+    assert config_of(recording) == Config()
+    assert live(recording).tally.same
+
+
+def test_the_formats_own_reader_reads_it(tape: Tape, whole: Path) -> None:
+    with whole.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        got = [channel.topic for _, channel, _ in reader.iter_messages()]
+        (config,) = list(reader.iter_attachments())
+    assert got.count("steps") == -(-len(tape.taken) // BATCH)
+    assert summary.statistics.message_count == len(got)
+    assert config.name == "acsard.toml"
+
+
+def on_a_machine(tape: Tape) -> None:
+    """Replace the times by those of a quiet machine.
+
+    A step is some tens of us late, and a read is noticed some us late.
+    """
+    dice = random.Random(1)
+    for at, taken in enumerate(tape.taken):
+        late = 1000 * round(dice.expovariate(1 / 30))
+        mono, wall = taken.inputs.now.mono_ns + late, taken.inputs.now.wall_ns + late
+        now = Instant(mono, wall + 1000 * dice.randint(0, 1))
+        reads = tuple(
+            replace(read, at=Instant(mono - age, wall - age))
+            for read in taken.inputs.received
+            if (age := 1000 * dice.randint(5, 15))
+        )
+        tape.taken[at] = taken._replace(inputs=replace(taken.inputs, now=now, received=reads))
+
+
+@pytest.mark.parametrize(("speed", "most"), [(None, 90e6), (0.5, 400e6)])
+def test_an_idle_day_is_less_than_90_mb_and_one_of_driving_less_than_400(
+    speed: float | None, most: float, tmp_path: Path
+) -> None:
+    tape, sizes = Tape(), []
+    world = World(recorder=tape)
+    world.run(3.0)
+    if speed is not None:
+        world.drive(speed, 0.2, seconds=1.0, hz=20.0)
+    del tape.taken[:-BATCH]
+    for seconds in (0.0, 10.0):
+        if speed is None:
+            world.run(seconds)
+        else:
+            world.hold(speed, 0.2, seconds=seconds)
+        path, now_ns = tmp_path / f"{seconds}.mcap", world.now_ns
+        on_a_machine(tape)
+        tape.write(path, Config(), apart=False)
+        sizes.append((path.stat().st_size, now_ns))
+    (little, began_ns), (much, ended_ns) = sizes
+    assert 0 < (much - little) / ((ended_ns - began_ns) / 1e9) * 86_400 < most
+
+
+def test_the_service_and_its_group_may_read_it_and_nobody_else(whole: Path) -> None:
+    assert whole.stat().st_mode & 0o777 == MODE == 0o640
+
+
+@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
+def test_of_a_file_that_was_cut_anywhere_every_whole_chunk_is_read(
+    whole: Path, tmp_path: Path, cuts: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(1), tmp_path / "cut.mcap"
+    (first, _), *_ = ends = chunks(data)
+    every = numbers(whole)
+    for _ in range(cuts):
+        size = dice.randrange(first, len(data))
+        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
+        path.write_bytes(data[:size] + tail)
+        kept = sum(end <= size for _, end in ends)
+        got = numbers(path)
+        assert got == every[: len(got)]
+        assert len(got) >= kept * BATCH or got == every
+
+
+def test_every_second_that_was_synced_can_be_read_before_its_chunk_ends(
+    tape: Tape, tmp_path: Path
+) -> None:
+    path, now = tmp_path / "part.mcap", tape.taken[0].inputs.now
+    config = "\n".join(document(effective(Config())))
+    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config))
+    for at in range(0, len(tape.taken), BATCH):
+        batch = tape.taken[at : at + BATCH]
+        writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
+        writing.flush()
+        assert numbers(path) == list(range(at + len(batch)))
+        ((_, claimed),) = chunks(path.read_bytes())
+        assert claimed > path.stat().st_size
+        recording = Recording(path)
+        list(recording.messages())
+        assert (recording.ended, recording.damaged) == (False, 0)
+    writing.finish()
+    assert len(chunks(path.read_bytes())) == 1
+    assert numbers(path) == list(range(len(tape.taken)))
+
+
+SECTOR = 512
+"""Bytes that a disk writes at once."""
+
+
+def test_a_power_cut_in_the_middle_of_a_sync_costs_nothing_of_the_syncs_before(
+    tape: Tape, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any sectors of a sync may reach the disk, also at the end of a chunk or of the file."""
+    path, cut, now = tmp_path / "part.mcap", tmp_path / "cut.mcap", tape.taken[0].inputs.now
+    monkeypatch.setattr("acsard.recording.file.CHUNK_NS", 3 * NS_PER_S)
+    synced: list[bytes] = []
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(path.read_bytes()))
+    config = "\n".join(document(effective(Config())))
+    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", now.mono_ns, now.wall_ns, config))
+    for at in range(0, len(tape.taken), BATCH):
+        batch = tape.taken[at : at + BATCH]
+        writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
+        writing.flush()
+    writing.finish()
+    assert len(chunks(synced[-1])) > 1
+    dice = random.Random(7)
+    for before, after in pairwise(synced[1:]):
+        path.write_bytes(before)
+        safe = numbers(path)
+        for _ in range(20):
+            old = before.ljust(len(after), b"\0")
+            sectors = range(0, dice.choice([len(before), len(after)]), SECTOR)
+            cut.write_bytes(b"".join(dice.choice([old, after])[at : at + SECTOR] for at in sectors))
+            assert numbers(cut)[: len(safe)] == safe
+
+
+def test_a_chunk_covers_about_ten_seconds_and_a_clock_that_is_set_ends_it(tmp_path: Path) -> None:
+    path = tmp_path / "long.mcap"
+    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    for second in (*range(25), 1_000_000, 3):
+        writing.add("steps", second * NS_PER_S, b"steps of one second")
+        writing.flush()
+    writing.finish()
+    with path.open("rb") as stream:
+        found = [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
+    times = [(r.message_start_time // NS_PER_S, r.message_end_time // NS_PER_S) for r in found]
+    assert times == [(0, 9), (10, 19), (20, 24), (1_000_000, 1_000_000), (3, 3)]
+
+
+def test_a_chunk_has_at_most_about_a_mebibyte(tmp_path: Path) -> None:
+    path = tmp_path / "much.mcap"
+    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    for _ in range(40):
+        writing.add("steps", 5, bytes(100_000))
+    writing.finish()
+    with path.open("rb") as stream:
+        found = [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
+    assert len(found) == 4
+    assert max(chunk.uncompressed_size for chunk in found) < CHUNK_BYTES + 110_000
+
+
+@pytest.mark.parametrize("cuts", [30, pytest.param(1000, marks=pytest.mark.slow)])
+def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
+    whole: Path, tmp_path: Path, cuts: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
+    (first, _), *_ = chunks(data)
+    config_end = data.index(b"acsard.Told")
+    for _ in range(cuts):
+        size = dice.randrange(first)
+        tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
+        path.write_bytes(data[:size] + tail)
+        with pytest.raises(RecordingError) as refused:
+            live(Recording(path))
+        told = str(refused.value)
+        assert (str(path) in told, told.isprintable()) == (True, True)
+        if not tail:
+            lacks = "whole second" if size > config_end else "its beginning is missing"
+            assert lacks in told
+
+
+@pytest.mark.parametrize("files", [15, pytest.param(200, marks=pytest.mark.slow)])
+def test_of_a_file_with_damaged_chunks_all_others_are_read(
+    whole: Path, tmp_path: Path, files: int
+) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(2), tmp_path / "damaged.mcap"
+    spans, hits = chunks(data), 0
+    for _ in range(files):
+        bad = bytearray(data)
+        hit = dice.randrange(len(spans))
+        start, end = spans[hit]
+        # The damage includes the chunk's head: its type, length, times and compression.
+        at = dice.randrange(start, dice.choice([start + 60, end]))
+        bad[at] ^= 1 << dice.randrange(8)
+        path.write_bytes(bad)
+        recording = Recording(path)
+        got = [step.number for step in steps(recording)]
+        assert recording.damaged == 1 or got == numbers(whole)  # the bit has no meaning
+        assert recording.whole == (recording.damaged == 0)
+        hits += recording.damaged
+        assert recording.ended
+        assert set(range(max(numbers(whole)) + 1)) - set(got) <= set(
+            range(hit * BATCH, (hit + 1) * BATCH)
+        )
+    assert files / 2 < hits < files
+
+
+@pytest.mark.parametrize("hit", [0, 2, -1])
+@pytest.mark.parametrize("place", [0, 1, 8])
+def test_a_chunk_whose_head_is_damaged_costs_nothing(
+    place: int, hit: int, whole: Path, tmp_path: Path
+) -> None:
+    """Each byte of the type and the length is damaged in turn."""
+    bad, path = bytearray(whole.read_bytes()), tmp_path / "head.mcap"
+    bad[chunks(bad)[hit][0] + place] ^= 0x41
+    path.write_bytes(bad)
+    assert numbers(path) == numbers(whole)
+
+
+def test_where_two_chunks_beside_one_another_are_damaged_all_others_are_read(
+    whole: Path, tmp_path: Path
+) -> None:
+    """The first chunk claims the length of both, and its content is damaged as well."""
+    bad, path = bytearray(whole.read_bytes()), tmp_path / "two.mcap"
+    (begin, middle), (_, end) = chunks(bad)[1:3]
+    bad[begin + 1 : begin + 9] = (end - begin - 9).to_bytes(8, "little")
+    bad[begin + 80 : middle + 80] = bytes(middle - begin)
+    path.write_bytes(bad)
+    every = numbers(whole)
+    assert numbers(path) == every[:BATCH] + every[3 * BATCH :]
+    recording = Recording(path)
+    list(recording.messages())
+    assert (recording.ended, recording.whole) == (True, False)
+
+
+def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_path: Path) -> None:
+    data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
+    said: list[str] = []
+    for _ in range(100):
+        bad = bytearray(data)
+        for _ in range(dice.randint(1, 20)):
+            bad[dice.randrange(len(bad))] = dice.randrange(256)
+        path.write_bytes(bad)
+        try:
+            live(Recording(path))
+        except RecordingError as error:
+            said.append(str(error))
+    assert said
+    assert all(str(path) in text for text in said)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89MCAP", b"hello" * 100])
+def test_another_file_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "other"
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match="no recording of acsard"):
+        Recording(path)
+    with pytest.raises(RecordingError, match="cannot read"):
+        Recording(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["wall_ns", "mono_ns", "started_ns"])
+def test_a_time_that_no_calendar_has_is_refused(name: str, tmp_path: Path) -> None:
+    now = Config()
+    about = About(now.robot.id, "0.1.0", "3.11.0", 1, 2, "\n".join(document(effective(now))))
+    path = tmp_path / "far.mcap"
+    Writing(path, replace(about, **{name: 1 << 63})).finish()
+    with pytest.raises(RecordingError, match=name):
+        Recording(path)
+
+
+def test_an_event_of_no_time_is_none(tape: Tape, tmp_path: Path) -> None:
+    path = tmp_path / "far.mcap"
+    tape.write(path, Config())
+    recording, far = Recording(path), b'{"seconds": 1e300, "name": "stop", "text": "stopped"}'
+    writing = Writing(tmp_path / "new.mcap", recording.about)
+    writing.add("events", 1, far)
+    writing.finish()
+    with pytest.raises(RecordingError, match="an event that is none"):
+        rewrite(Recording(tmp_path / "new.mcap"), tmp_path / "other.mcap")
+
+
+def test_what_was_cut_becomes_a_finished_file(whole: Path, tmp_path: Path) -> None:
+    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
+    cut.write_bytes(whole.read_bytes()[: chunks(whole.read_bytes())[3][1] + 20])
+    rewrite(Recording(cut), new)
+    recording = Recording(new)
+    assert [step.number for step in steps(recording)] == numbers(cut) == list(range(4 * BATCH))
+    assert recording.whole
+    assert recording.about == Recording(whole).about
+    with new.open("rb") as stream:
+        assert len(list(make_reader(stream).iter_messages())) > 0
+
+
+def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_path: Path) -> None:
+    data, path = whole.read_bytes(), tmp_path / "gap.mcap"
+    start, _ = chunks(data)[2]
+    path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
+    tally, trouble, _ = live(Recording(path))
+    assert tally.steps == 2 * BATCH
+    assert tally.same
+    assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
+
+
+def test_a_finished_file_says_at_its_end_what_happened(
+    tape: Tape, whole: Path, tmp_path: Path
+) -> None:
+    first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
+    said = closing(whole)
+    assert said is not None
+    assert (said.wall_ns, said.said) == (
+        first.wall_ns,
+        "start, 1 change of who drives, 1 stop (stopped by unnamed (native))",
+    )
+    assert 0 <= last.wall_ns - said.last_ns < 2e9
+    cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    assert closing(cut) is None
+    rewrite(Recording(cut), new)
+    assert closing(new) == replace(said, cut="open")
+    assert said == Closing(said.wall_ns, said.last_ns, said.said)
+    rewrite(Recording(new), tmp_path / "again.mcap", "crash")
+    assert closing(tmp_path / "again.mcap") == closing(new), "it was finished before"
+    assert closing(tmp_path / "none") is None

@@ -1,0 +1,53 @@
+"""A robot gets another configuration in the middle of a replay.
+
+The state derived from the configuration changes.
+"""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config
+from acsard.core.guard import Memory
+from acsard.core.robot import Robot
+from acsard.recording.merge import adopt
+from acsard.recording.state import freeze
+from tests.scenarios.world import World
+
+PLAIN = Config()
+
+
+def driven() -> Robot:
+    world = World()
+    world.drive(0.5, 0.2, seconds=2.0)
+    return world.loop.robot
+
+
+def test_the_same_configuration_changes_nothing() -> None:
+    robot = driven()
+    before = freeze(robot, Memory())
+    adopt(robot, Robot(PLAIN), Robot(PLAIN))
+    assert freeze(robot, Memory()) == before
+
+
+def test_what_follows_from_the_configuration_is_of_the_other_and_what_happened_stays() -> None:
+    other = replace(
+        PLAIN,
+        drive=replace(PLAIN.drive, wheel_radius=0.1),
+        limits=replace(PLAIN.limits, linear_speed=0.25),
+    )
+    robot = driven()
+    pose, counters = robot.snapshot(0).pose, robot.counters.copy()
+    adopt(robot, Robot(PLAIN), Robot(other))
+    assert robot.snapshot(0).pose == pose
+    assert robot.counters == counters
+    assert robot.session.link == "up"
+    assert vars(robot._kinematics) == vars(Robot(other)._kinematics)
+    assert robot._kinematics is robot._odometry._kinematics
+
+
+def test_a_part_that_the_state_does_not_know_begins_as_a_new_one_does() -> None:
+    robot = driven()
+    del robot._dropped
+    adopt(robot, Robot(PLAIN), Robot(PLAIN))
+    assert vars(robot._dropped) == vars(Robot(PLAIN)._dropped)

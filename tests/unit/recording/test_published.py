@@ -1,0 +1,74 @@
+"""Tests of the messages that a replayed robot publishes.
+
+`scenarios/test_export.py` proves that they equal the original messages.
+"""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
+from acsard.recording.published import MEASURED, Published, Publisher
+from acsard.recording.replay import lived
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import START, World
+
+
+def said(tape: Tape, config: Config) -> list[Published]:
+    robot = Robot(config)
+    publisher = Publisher(robot, START.wall_ns)
+    return [m for step in tape.steps() for m in publisher.step(step, lived(robot, step))]
+
+
+def names(published: list[Published]) -> set[str]:
+    return {one.channel.name for one in published}
+
+
+def driven() -> Tape:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.4, 1.0)
+    return tape
+
+
+def test_a_switched_off_transform_is_not_said() -> None:
+    tape, config = driven(), Config()
+    quiet = replace(
+        config,
+        odometry=replace(config.odometry, publish_tf=False),
+        lidar=replace(config.lidar, publish_tf=False),
+        footprint=replace(config.footprint, publish_tf=False),
+    )
+    assert names(said(tape, config)) - names(said(tape, quiet)) == {"tf", "tf_static"}
+
+
+def test_other_parameters_move_the_pose_and_nothing_that_came_in() -> None:
+    tape, config = driven(), Config()
+    wider = replace(config, drive=replace(config.drive, wheel_separation=0.6))
+    then, now = said(tape, config), said(tape, wider)
+    (last, other) = ([m for m in one if m.channel.name == "odom"][-1] for one in (then, now))
+    turned, less = (m.message.pose.pose.orientation.z for m in (last, other))
+    assert 0.3 < less / turned < 0.7
+    heard = [[m for m in one if m.channel.name.startswith("cmd_vel_in")] for one in (then, now)]
+    assert heard[0] == heard[1] != []
+
+
+def test_a_message_went_when_its_step_was_and_a_command_came_before() -> None:
+    published = said(driven(), Config())
+    odom = [m for m in published if m.channel.name == "odom"]
+    assert all(m.message.header.stamp.to_ns() <= m.wall_ns for m in odom)
+    went = [m.wall_ns for m in odom]
+    assert went == sorted(went)
+    heard = [m for m in published if m.source == "app"]
+    assert all(m.message.header.stamp.to_ns() == m.wall_ns for m in heard)
+
+
+def test_what_no_recording_knows_is_not_said() -> None:
+    published = said(driven(), Config())
+    rows = {
+        row.name for m in published if m.channel.name == "diagnostics" for row in m.message.status
+    }
+    assert rows
+    assert not rows & MEASURED
+    states = [m.message for m in published if m.channel.name == "state"]
+    assert all(one.figures == {} and one.certificate == "" for one in states)

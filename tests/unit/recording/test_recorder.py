@@ -1,0 +1,809 @@
+"""Tests of the recorder between a loop that never waits and a disk that may fail in any way."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import resource
+import shutil
+import stat
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config, RecordConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.link.gate import Offered
+from acsard.core.robot import Robot
+from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
+from acsard.recording import disk, room
+from acsard.recording import recorder as module
+from acsard.recording.closing import closing, how_it_ends
+from acsard.recording.directory import KEPT, Ring, listed
+from acsard.recording.export import export
+from acsard.recording.file import About, Recording, Writing, rewrite
+from acsard.recording.recorder import MOST, Recorder
+from acsard.recording.replayed import live, steps
+from acsard.recording.steps import unfinished
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import START, World
+
+SECRET = "PRIVATE KEY of a robot"
+
+
+def config(where: Path, megabytes: float = 10.0) -> Config:
+    return replace(Config(), record=RecordConfig(str(where), megabytes))
+
+
+class Bench:
+    """A world whose recorder writes on request, because its thread waits for the end."""
+
+    def __init__(
+        self,
+        where: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        megabytes: float = 10.0,
+        latches: Latches = Latches(),  # noqa: B008
+    ) -> None:
+        monkeypatch.setattr(module, "FLUSH_S", 1000.0)
+        monkeypatch.setattr(module, "CLOSE_S", 20.0)
+        self.said: list[Event] = []
+        self.where = where
+        self.recorder = Recorder(config(where, megabytes), self.said.append)
+        self.world = World(config(where, megabytes), recorder=self.recorder, latches=latches)
+
+    def write(self) -> None:
+        """Do the work that the thread does each second."""
+        self.recorder._disk.round(self.recorder._taken(), False)
+
+    def drive(self, seconds: float) -> None:
+        """Drive on, and write each second."""
+        for _ in range(round(seconds)):
+            self.world.hold(0.5, 0.2, seconds=1.0)
+            self.write()
+
+    def end(self) -> list[Path]:
+        self.recorder.close()
+        return listed(self.where)
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(tmp_path, monkeypatch)
+
+
+def test_a_drive_is_recorded_and_lives_again(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    (path,) = bench.end()
+    lived = live(Recording(path))
+    assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
+    assert lived.tally.steps == bench.world.steps
+    assert [event.text for event in bench.said] == [f"to {bench.where}"]
+    assert bench.recorder.status.missing == 0
+
+
+def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stop = Latch(5, START.wall_ns, "ann", "stopped by ann", kept=True)
+    latches = Latches(stop=stop, lowered={"limits.linear_speed": 0.3})
+    bench = Bench(tmp_path, monkeypatch, latches=latches)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    assert bench.world.call("clear").success
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    assert bench.world.state.mode == "driving"
+    (path,) = bench.end()
+    lived = live(Recording(path))
+    assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
+    assert lived.tally.steps == bench.world.steps
+
+
+def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(disk, "LONGEST_NS", 3_000_000_000)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(10.0)
+    paths = bench.end()
+    assert len(paths) > 2
+    count = 0
+    for path in paths:
+        lived = live(Recording(path))
+        assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
+        count += lived.tally.steps
+    assert count == bench.world.steps
+
+
+def test_a_loop_that_is_not_heard_loses_steps_counts_them_and_never_waits(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    while bench.recorder.status.missing == 0:
+        bench.world.hold(0.5, 0.2, seconds=1.0)
+    assert bench.recorder.status.trouble == "the disk is too slow"
+    bench.world.hold(0.5, 0.2, seconds=1.0)
+    assert len(bench.recorder._queue) == MOST
+    bench.drive(3.0)
+    missing = bench.recorder.status.missing
+    assert bench.recorder.status.trouble == ""
+    assert missing > 100
+    before, after = bench.end()
+    assert [e.level for e in bench.said].count("warning") == 1
+    numbers = [step.number for path in (before, after) for step in steps(Recording(path))]
+    assert len(numbers) == bench.world.steps - missing
+    for path in (before, after):
+        assert live(Recording(path)).tally.same
+    assert after.name.endswith(KEPT) == before.name.endswith(KEPT)
+
+
+def test_a_disk_that_takes_nothing_is_said_tried_again_and_costs_only_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = tmp_path / "record"
+    where.write_bytes(b"no directory")
+    bench = Bench(where, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    assert "record: File exists" in bench.recorder.status.trouble
+    assert bench.recorder.status.missing > 100
+    assert bench.world.state.recording == bench.recorder.status.trouble
+    where.unlink()
+    bench.drive(10.0)
+    assert bench.recorder.status.trouble == ""
+    levels = [event.level for event in bench.said]
+    assert levels == ["warning", "info"]
+    (path,) = bench.end()
+    assert live(Recording(path)).tally.same
+    assert next(steps(Recording(path))).number > 100
+
+
+def happen_stop(world: World) -> None:
+    world.call("stop")
+
+
+def happen_loss(world: World) -> None:
+    world.port.unplug()
+    world.run(0.5)
+    world.port.plug(world.mcu)
+
+
+def happen_silence(world: World) -> None:
+    with world.mcu.mute():
+        world.run(0.5)
+
+
+def happen_fault(world: World) -> None:
+    with world.mcu.stuck_encoder(0):
+        world.hold(0.5, seconds=3.0)
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(
+    "happen",
+    [happen_stop, happen_fault]
+    + [pytest.param(other, marks=pytest.mark.slow) for other in (happen_loss, happen_silence)],
+)
+def test_the_minute_before_and_after_what_happened_is_kept(
+    happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    minute = 6  # one tenth of a minute in s, to save time
+    monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
+    monkeypatch.setattr(room, "AROUND_NS", minute * 10**9)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.bus.wanted = set()
+
+    def rest(seconds: float) -> None:
+        for _ in range(round(seconds * 2)):
+            bench.world.run(0.5)
+            bench.write()
+
+    bench.world.drive(0.5, seconds=1.0)
+    rest(14.0)
+    began_s = bench.world.now_ns / 1e9
+    happen(bench.world)
+    ended_s = bench.world.now_ns / 1e9
+    rest(14.0)
+    paths = bench.end()
+    kept = [not path.name.endswith("Z.mcap") for path in paths]
+    began = [Recording(path).about.mono_ns / 1e9 for path in paths]
+    spans = list(zip(began, [*began[1:], bench.world.now_ns / 1e9], strict=True))
+    close = [s < began_s + minute - 0.5 and e > ended_s - minute + 0.5 for s, e in spans]
+    near = [s < ended_s + minute + 2 and e > began_s - minute - 2 for s, e in spans]
+    assert 2 <= sum(close) <= sum(near) <= len(paths) - 2, (close, near)
+    for has, must, may in zip(kept, close, near, strict=True):
+        assert must <= has <= may
+
+
+def die(bench: Bench) -> None:
+    """Close the open files and nothing else, as the kernel does for a killed process."""
+    side = bench.recorder._disk
+    assert side._writing is not None
+    assert side._ring is not None
+    side._writing.close()
+    side._ring.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("after_s", [5.0, 300.0])
+def test_the_minute_before_and_after_a_crash_is_kept(
+    after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(14.0)
+    die(bench)
+    cut_s = START.wall_ns / 1e9 - after_s
+    *before, cut = listed(tmp_path)
+    assert len(before) > 2
+    for number, path in enumerate([cut, *reversed(before)]):
+        os.utime(path, (0, cut_s - 40.0 * number))  # as if each had lasted for 40 s
+    again = Bench(tmp_path, monkeypatch)
+    again.world.run(1.0)
+    again.write()
+    kept = [not path.name.endswith("Z.mcap") for path in again.end()]
+    assert kept == [False] * (len(before) - 1) + [True, True, after_s < 60]
+
+
+@pytest.mark.parametrize("fault_before", [True, False])
+@pytest.mark.parametrize(
+    ("after_s", "near"),
+    [(20.0, True)] + [pytest.param(s, False, marks=pytest.mark.slow) for s in (70.0, -20.0)],
+)
+def test_the_minute_before_and_after_what_happened_is_kept_over_a_restart(
+    after_s: float,
+    near: bool,
+    fault_before: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A fault is followed by an orderly restart, or the other way round."""
+    before = Bench(tmp_path, monkeypatch)
+    before.world.drive(0.5, 0.2, seconds=1.0)
+    if fault_before:
+        before.world.call("stop")
+    (ended,) = before.end()
+    ended_s = START.wall_ns / 1e9 - after_s
+    os.utime(ended, (0, ended_s))
+    again = Bench(tmp_path, monkeypatch)
+    again.world.drive(0.5, 0.2, seconds=0.5)
+    if not fault_before:
+        again.world.call("stop")
+    again.write()
+    other = "near" if near else ""
+    kinds = ["kept", other] if fault_before else [other, "kept"]
+    assert [name.partition("Z.")[2] for name in map(str, again.end())] == [
+        f"{kind}.mcap".lstrip(".") for kind in kinds
+    ]
+
+
+BUG = "a fault of our own"
+
+
+def ends_by(bench: Bench, error: Exception) -> list[Path]:
+    """Close the recorder as the daemon does after such an error in a task of the loop."""
+    bench.recorder.close(ExceptionGroup("unhandled errors in a TaskGroup", [error]))
+    return listed(bench.where)
+
+
+def break_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the robot raise an error at the next request."""
+    whole = Robot.step
+
+    def step(robot: Robot, inputs: Inputs) -> Outputs:
+        if inputs.requests:
+            raise ZeroDivisionError(BUG)
+        return whole(robot, inputs)
+
+    monkeypatch.setattr(Robot, "step", step)
+
+
+@pytest.mark.parametrize("broken", ["robot", "port"])
+def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_it_ended(
+    broken: str, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+
+    def offer(line: bytes, now: Instant) -> Offered:
+        raise ZeroDivisionError(BUG)
+
+    with monkeypatch.context() as patched:
+        if broken == "robot":
+            break_robot(patched)
+        else:
+            patched.setattr(bench.world.port, "offer", offer)
+        with pytest.raises(ZeroDivisionError) as raised:
+            bench.world.call("stop")
+        (path,) = ends_by(bench, raised.value)
+        ended = live(Recording(path)).again
+    last, number = closing(path), bench.world.steps
+    why = f"in step {number}, ZeroDivisionError: {BUG}"
+    assert path.name.endswith(KEPT)
+    assert last is not None
+    assert (last.cut, last.why) == ("bug", why)
+    assert how_it_ends(last.cut, last.why) == f"cut: the daemon ended by a fault of its own: {why}"
+    recording = Recording(path)
+    lived = live(recording)
+    assert (lived.tally.same, lived.tally.steps, lived.trouble) == (True, number, "")
+    assert (recording.whole, recording.cut, recording.why) == (True, "bug", why)
+    assert recording.unfinished is not None
+    step = unfinished(recording.unfinished)
+    assert step.number == number
+    assert [one.verb for one in step.inputs.requests] == ["stop"]
+    assert step.inputs.now.mono_ns <= bench.world.now_ns
+    assert "does not end the robot of this version" in lived.again
+    assert ("ends this version too, by ZeroDivisionError" in ended) is (broken == "robot")
+    rewrite(recording, new := path.with_name("new.mcap"))
+    assert closing(new) == last
+    assert live(Recording(new)) == lived
+
+
+def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
+    bench.world.run(1.0)
+    bench.write()
+    (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
+    last = closing(path)
+    assert last is not None
+    told = how_it_ends(last.cut, last.why)
+    assert told.startswith("cut: the daemon ended by a fault of its own: ValueError: ")
+    assert (told.isprintable(), len(told) < 300) == (True, True)
+
+
+def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench) -> None:
+    class MuteError(Exception):
+        def __str__(self) -> str:
+            raise ValueError
+
+    bench.world.run(1.0)
+    (path,) = ends_by(bench, MuteError())
+    last = closing(path)
+    assert last is not None
+    assert (last.cut, last.why) == ("bug", "MuteError")
+
+
+def test_what_came_into_the_step_is_left_out_where_no_file_takes_it(bench: Bench) -> None:
+    bench.world.run(1.0)
+    tape = Tape()
+    World(recorder=tape).run(0.1)
+    bench.recorder.died(replace(tape.taken[0].inputs, missed=1 << 80))
+    (path,) = ends_by(bench, OverflowError("a name that is none: \udc80"))
+    last, recording = closing(path), Recording(path)
+    assert last is not None
+    told = f"in step {bench.world.steps}, OverflowError: a name that is none: "
+    assert (last.cut, last.why.startswith(told)) == ("bug", True)
+    assert [topic for topic, _, _ in recording.messages()].count("unfinished") == 0
+    assert (live(recording).tally.same, recording.whole) == (True, True)
+
+
+@pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
+def test_an_end_that_was_asked_for_is_no_fault_of_our_own(
+    error: BaseException | None, bench: Bench
+) -> None:
+    bench.world.run(1.0)
+    bench.recorder.close(error)
+    assert cuts(listed(bench.where)) == [("mcap", "")]
+
+
+def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.world.bus.arrivals.append(Arrival("stop", True, b"", "", bench.world.now_ns, None, ""))
+    break_robot(monkeypatch)
+    with pytest.raises(ZeroDivisionError) as raised:
+        bench.world.run(1.0)
+    (path,) = ends_by(bench, raised.value)
+    recording = Recording(path)
+    ((topic, _, data),) = recording.messages()
+    assert (topic, unfinished(data).number, recording.cut) == ("unfinished", 0, "bug")
+    last = closing(path)
+    assert last is not None
+    assert last.said == "start"
+
+
+def test_the_minute_before_a_fault_of_our_own_is_kept(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(6.0)
+    told = cuts(ends_by(bench, ValueError(BUG)))
+    assert len(told) > 2
+    assert told == [("near.mcap", "")] * (len(told) - 1) + [("kept.mcap", "bug")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("jumps", [(20,), (20, -20), (-20,)])
+def test_a_clock_that_is_set_costs_no_recording(
+    jumps: tuple[int, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot without a real-time clock was off for weeks.
+
+    It gets the time only while it drives.
+    """
+    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(room, "AROUND_NS", 0)
+    seen = set[str]()
+
+    def there() -> set[str]:
+        return {path.name.partition(".")[0] for path in listed(tmp_path)}
+
+    for _ in range(2):  # one run after another
+        bench = Bench(tmp_path, monkeypatch)
+        bench.world.drive(0.5, 0.2, seconds=1.0)
+        for days in (0, *jumps):
+            bench.world.wall_offset_ns += days * 86_400 * 10**9
+            bench.drive(6.0)
+            seen |= there()
+        bench.end()
+    assert len(seen) > 6
+    assert seen <= there()
+
+
+def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    bench.world.call("stop")
+    bench.world.run(1.0)
+    bench.write()
+    bench.recorder._disk._fail(OSError(errno.ENOSPC, "No space left on device"))
+    bench.drive(disk.RETRY_ROUNDS + 3.0)
+    first, second = bench.end()
+    assert first.name.endswith(KEPT)
+    last = closing(first)
+    assert last is not None
+    assert last.cut == "disk"
+    assert live(Recording(second)).tally.same
+
+
+def no_copies(handle: int) -> None:
+    """Fail each sync of a recovered copy."""
+    if os.readlink(f"/proc/self/fd/{handle}").endswith(".new"):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+
+def full(handle: int) -> None:
+    """Fail as a disk without free space, which reports that only at a sync."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """Return a bench that drives and retries a failed disk in the next round."""
+    monkeypatch.setattr(disk, "RETRY_ROUNDS", 0)
+    bench.world.drive(0.5, 0.2, seconds=0.5)
+    rounds(bench)
+    return bench
+
+
+def rounds(bench: Bench, count: int = 3) -> None:
+    """Run short rounds: the first one retries the disk, the second one starts a file."""
+    for _ in range(count):
+        bench.world.hold(0.5, 0.2, seconds=0.1)
+        bench.write()
+
+
+def refuse(bench: Bench) -> None:
+    """Make the disk refuse a write, then let the retry succeed."""
+    bench.recorder._disk._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
+    rounds(bench)
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Limit the size of files in bytes; writes beyond it fail as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize(
+    ("happened", "error", "told"),
+    [
+        (False, None, ("mcap", "late")),
+        (True, None, ("kept.mcap", "late")),
+        (False, ValueError(BUG), ("kept.mcap", "crash")),
+    ],
+)
+def test_an_end_that_the_disk_was_too_slow_for_is_no_crash_unless_it_was_one(
+    happened: bool,
+    error: Exception | None,
+    told: tuple[str, str],
+    eager: Bench,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if happened:
+        eager.world.call("stop")
+        rounds(eager)
+    goes, sync = threading.Event(), os.fsync
+    synced = listed(eager.where)[0].stat().st_size
+
+    def hangs(handle: int) -> None:
+        goes.wait(20.0)
+        sync(handle)
+
+    monkeypatch.setattr(module, "CLOSE_S", 0.01)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", hangs)
+        eager.recorder.close(error)
+        # This is the state of the disk after the process has ended.
+        shutil.copytree(eager.where, where := tmp_path_factory.mktemp("again") / "record")
+    goes.set()
+    eager.recorder._thread.join(20.0)
+    (part,) = listed(where)
+    part.write_bytes(part.read_bytes()[:synced])
+    again = Bench(where, monkeypatch)
+    rounds(again)
+    assert cuts(again.end()) == [told, ("mcap", "")]
+    assert not list(where.glob(".0*"))
+
+
+def numbers_of(paths: list[Path]) -> list[int]:
+    return [step.number for path in paths for step in steps(Recording(path))]
+
+
+def test_what_a_disk_did_not_take_any_more_is_counted_to_the_step(eager: Bench) -> None:
+    (part,) = listed(eager.where)
+    with files_of_at_most(part.stat().st_size + 20):
+        rounds(eager, 1)
+    assert eager.recorder.status.trouble.endswith("File too large")
+    rounds(eager)
+    missing = eager.recorder.status.missing
+    numbers = numbers_of(eager.end())
+    assert numbers == sorted(set(numbers))
+    gap = max(b - a - 1 for a, b in pairwise(numbers))
+    assert missing == gap == eager.world.steps - len(numbers) > 10
+
+
+@pytest.mark.parametrize("over", [False, True])
+def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
+    over: bool, eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sync fails for a chunk, or at the end of a file."""
+    (part,) = listed(eager.where)
+    synced = part.stat().st_size
+    if over:
+        eager.recorder._ask()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(eager, 1)
+    part.write_bytes(part.read_bytes()[:synced])  # data that was not synced never reached the disk
+    rounds(eager)
+    missing = eager.recorder.status.missing
+    numbers = numbers_of(eager.end())
+    assert missing == eager.world.steps - len(numbers) > 10
+
+
+def cuts(paths: list[Path]) -> list[tuple[str, str]]:
+    """Return the suffix of each file and the reason why it was finished late."""
+    return [(p.name.partition(".")[2], last.cut) for p in paths if (last := closing(p))]
+
+
+def test_what_a_crash_has_cut_stays_a_crash_s_however_late_it_is_made_whole(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    die(eager)
+    again = Bench(eager.where, monkeypatch)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", no_copies)
+        rounds(again)
+    refuse(again)
+    assert any("cannot be made whole" in event.text for event in again.said)
+    assert cuts(again.end()) == [("kept.mcap", "crash"), ("mcap", "disk"), ("mcap", "")]
+
+
+def test_each_file_that_the_disk_cut_stays_what_it_was(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eager.world.call("stop")
+    rounds(eager)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", no_copies)
+        refuse(eager)
+    refuse(eager)
+    told = [("kept.mcap", "disk"), ("near.mcap", "disk"), ("near.mcap", "")]
+    assert cuts(eager.end()) == told
+
+
+def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eager.recorder._ask()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(eager, 1)
+    assert eager.recorder.status.trouble.endswith("No space left on device")
+    (part,) = listed(eager.where)
+    part.write_bytes(part.read_bytes()[:-40])  # data that was not synced never reached the disk
+    rounds(eager)
+    assert cuts(eager.end()) == [("mcap", "disk"), ("mcap", "")]
+
+
+@pytest.mark.parametrize(
+    ("happened", "error", "told"),
+    [
+        (False, None, ("mcap", "disk")),
+        (True, None, ("kept.mcap", "disk")),
+        (False, ValueError(BUG), ("kept.mcap", "crash")),
+    ],
+)
+def test_a_disk_that_refuses_the_end_is_no_crash_to_the_next_daemon(
+    happened: bool,
+    error: Exception | None,
+    told: tuple[str, str],
+    eager: Bench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    if happened:
+        eager.world.call("stop")
+        rounds(eager)
+    (part,) = listed(eager.where)
+    synced = part.stat().st_size
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        eager.recorder.close(error)
+    part.write_bytes(part.read_bytes()[:synced])
+    again = Bench(eager.where, monkeypatch)
+    rounds(again)
+    assert cuts(again.end())[0] == told
+    assert not list(eager.where.glob(".0*"))
+
+
+def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    goes = threading.Event()
+
+    def hangs(*_: object) -> None:
+        goes.wait(60.0)
+
+    monkeypatch.setattr(module, "CLOSE_S", 0.01)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", hangs)
+        patched.setattr(disk, "leave", hangs)
+        eager.recorder.close()
+        assert eager.recorder._thread.is_alive()
+    goes.set()
+    eager.recorder._thread.join(20.0)
+
+
+def test_what_is_kept_does_not_go_one_by_one_for_a_disk_that_refuses_all_the_same(
+    eager: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk may lack inodes, for example, and another program takes each one that is freed."""
+    die(eager)
+    ring = Ring(config(eager.where).record)
+    before = [
+        ring.end(ring.begin(About("acsar", "0.1.0", "3.11.0", 1, number)), "kept")
+        for number in range(4)
+    ]
+    ring.close()
+    again = Bench(eager.where, monkeypatch)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        rounds(again, 10)
+    assert again.recorder.status.trouble.endswith("No space left on device")
+    assert all(path.exists() for path in before), "the oldest, of the crash, was worth a try"
+    rounds(again)
+    assert again.recorder.status.trouble == ""
+    assert len(again.end()) == 5
+
+
+def test_what_cannot_be_made_whole_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "000001-20270115T080000Z.mcap.part"
+    Writing(path, About("acsar", "9.0", "3.13", 1, 2, format="later")).close()
+    bench = Bench(tmp_path, monkeypatch)
+    bench.world.run(1.0)
+    bench.write()
+    bench.world.run(1.0)
+    assert ("warning", True) in [(one.level, path.name[:24] in one.text) for one in bench.said]
+    assert len(bench.end()) == 2
+
+
+def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -> None:
+    bench.world.drive(0.5, 0.2, seconds=1.0)
+    bench.drive(2.0)
+    shutil.rmtree(bench.where)
+    bench.drive(1.0)
+    assert "has been removed" in bench.recorder.status.trouble
+    bench.drive(disk.RETRY_ROUNDS + 3.0)
+    status = bench.recorder.status
+    assert status.trouble == ""
+    assert status.missing > 0
+    (path,) = bench.end()
+    lived = live(Recording(path))
+    assert (lived.tally.same, lived.trouble) == (True, "")
+
+
+def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand steps pass while the thread hangs in a sync."""
+    asked, goes, sync = threading.Event(), threading.Event(), os.fsync
+    who = set[str]()
+
+    def hangs(handle: int) -> None:
+        who.add(name := threading.current_thread().name)
+        asked.set()
+        if name == "record":
+            goes.wait(20.0)
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", hangs)
+    monkeypatch.setattr(module, "FLUSH_S", 0.01)
+    monkeypatch.setattr(module, "CLOSE_S", 20.0)
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=0.5)
+    taken = tape.taken[-1]
+    recorder = Recorder(config(tmp_path), lambda event: None)
+    recorder.step(*taken, world.loop.robot, world.loop._guard)
+    assert asked.wait(20.0)
+    before = len(recorder._queue)
+    for _ in range(1000):
+        recorder.step(*taken, world.loop.robot, world.loop._guard)
+    hung = not goes.is_set()
+    assert (len(recorder._queue) - before, who, hung) == (1000, {"record"}, True)
+    assert recorder._queue[-1][0] is taken.inputs
+    goes.set()
+    recorder.close()
+    assert len(numbers_of(listed(tmp_path))) == 1001
+
+
+def test_nothing_secret_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tls = tmp_path / "tls"
+    tls.mkdir()
+    for name in ("key.pem", "cert.pem", "ca.pem"):
+        (tls / name).write_text("-----BEGIN SECRET-----")
+    monkeypatch.setenv("ACSARD_SECRET", "BEGIN SECRET")
+    bench = Bench(tmp_path / "record", monkeypatch)
+    bench.end()
+    settings = config(tmp_path / "record")
+    settings = replace(settings, bus=replace(settings.bus, tls=str(tls), connect=("tls/r:7449",)))
+    recorder = Recorder(settings, bench.said.append)
+    world = World(settings, recorder=recorder)
+    world.put("cmd/app", b'{"password": "BEGIN SECRET"}')
+    world.drive(0.5, seconds=1.0)
+    recorder.close()
+    recording = Recording(listed(tmp_path / "record")[-1])
+    assert str(tls) in recording.about.config
+    read = [recording.about.config.encode(), *[data for _, _, data in recording.messages()]]
+    assert len(read) > 5
+    assert not any(b"BEGIN" in data for data in read)
+
+
+def test_a_recording_and_what_is_exported_of_it_tell_where_keys_are_and_hold_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certificates, where = tmp_path / "tls", tmp_path / "record"
+    certificates.mkdir()
+    for name in ("ca.pem", "robot.pem", "robot-key.pem"):
+        (certificates / name).write_text(f"-----BEGIN {SECRET} {name}-----")
+    plain = config(where)
+    bus = replace(
+        plain.bus, tls=str(certificates), listen=("tcp/127.0.0.1:7448", "tls/0.0.0.0:7449")
+    )
+    monkeypatch.setattr(module, "CLOSE_S", 20.0)
+    recorder = Recorder(replace(plain, bus=bus), lambda event: None)
+    World(replace(plain, bus=bus), recorder=recorder).drive(0.3, 0.0, 0.5)
+    recorder.close()
+    (path,) = listed(where)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    recording = Recording(path)
+    export(recording, tmp_path / "new.mcap", "mcap")
+    export(recording, tmp_path / "new.csv", "csv")
+    held = [path.read_bytes(), recording.about.config.encode()]
+    held += [data for _, _, data in recording.messages()]
+    held += [(tmp_path / name).read_bytes() for name in ("new.mcap", "new.csv")]
+    with (tmp_path / "new.mcap").open("rb") as stream:
+        held += [message.data for _, _, message in make_reader(stream).iter_messages()]
+    assert len(held) > 200
+    assert not [data for data in held if SECRET.encode() in data]
+    assert str(certificates) in recording.about.config

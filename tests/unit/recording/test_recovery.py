@@ -1,0 +1,177 @@
+"""A truncated file is recovered in place if there is no room for a copy."""
+
+from __future__ import annotations
+
+import errno
+import os
+import random
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from acsard.core.config.settings import Config
+from acsard.recording.chunks import GROWING, LAST_BLOCK
+from acsard.recording.closing import closing
+from acsard.recording.file import Recording
+from acsard.recording.recovery import NOTHING_BYTES, recover
+from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.world import World
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    tape, path = Tape(), tmp_path_factory.mktemp("record") / "whole.mcap"
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=4.0)
+    world.call("stop")
+    world.run(0.5)
+    tape.write(path, Config())
+    return path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def growing(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A file whose only chunk still grows, as a crash leaves it."""
+    tape, path = Tape(), tmp_path_factory.mktemp("record") / "part.mcap"
+    World(recorder=tape).drive(0.5, 0.2, seconds=8.0)
+    tape.write(path, Config(), apart=False)
+    data = path.read_bytes()
+    ((begin, end),) = chunks(data)
+    return data[:begin] + GROWING + data[begin + len(GROWING) : end - len(LAST_BLOCK)]
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    return list(Recording(path).messages())
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
+    data: bytes, room: bool, tmp_path: Path
+) -> None:
+    part, whole, dice = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(4)
+    (_, first), *_ = chunks(data)
+    for _ in range(20):
+        tail = dice.choice([b"", bytes(700), dice.randbytes(64)])
+        part.write_bytes(data[: dice.randrange(first + 1, len(data) - 8)] + tail)
+        os.utime(part, (0, 1e9))
+        before = messages(part)
+        assert recover(part, whole, "crash", room) == ""
+        assert messages(whole) == before
+        recording = Recording(whole)
+        assert len(list(recording.messages())) == len(before) > 0
+        assert (recording.whole, part.exists()) == (True, False)
+        assert whole.stat().st_mtime == 1e9
+        last = closing(whole)
+        assert last is not None
+        assert recording.cut == last.cut
+        assert last.last_ns == max(wall_ns for _, wall_ns, _ in before)
+        with whole.open("rb") as stream:
+            assert len(list(make_reader(stream).iter_messages())) == len(before)
+
+
+@pytest.mark.parametrize("torn", [b"", b"torn", bytes(700)])
+def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
+    data: bytes, torn: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk without free space repeats its error, sometimes only at a sync."""
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    cut = data[: chunks(data)[-1][1]] + torn
+    part.write_bytes(cut)
+    os.utime(part, (0, 1e9))
+
+    def full(handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    told = recover(part, whole, "crash", room=False)
+    assert whole.read_bytes() == cut
+    assert "a.mcap was cut and has no end, for want of room" in told
+    assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
+
+
+def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
+    data: bytes, tmp_path: Path
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(data[: chunks(data)[-1][1] + 3])
+    recover(part, whole, "crash", room=False)
+    last = closing(whole)
+    assert last is not None
+    assert last.cut == "crash"
+    assert last.said == "start, 1 change of who drives, 1 stop (stopped by unnamed (native))"
+
+
+def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(
+    data: bytes, tmp_path: Path
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    torn = bytearray(data)
+    for begin, end in (chunks(data)[1], chunks(data)[-1]):
+        torn[begin + 80 : end] = bytes(end - begin - 80)
+    part.write_bytes(torn[: chunks(data)[-1][1]])
+    recover(part, whole, "crash", room=False)
+    recording = Recording(whole)
+    assert len(list(recording.messages())) > 2
+    assert (recording.ended, recording.damaged) == (True, 1)
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_a_damaged_head_costs_nothing_of_what_is_behind_it(
+    data: bytes, room: bool, tmp_path: Path
+) -> None:
+    part, whole, before = tmp_path / "a.part", tmp_path / "a.mcap", tmp_path / "b.mcap"
+    before.write_bytes(data)
+    bad = bytearray(data[: chunks(data)[-1][1]])
+    for (begin, _), place in zip(chunks(data)[1:], (0, 1, 7), strict=False):
+        bad[begin + place] ^= 0x41
+    part.write_bytes(bad)
+    recover(part, whole, "crash", room)
+    assert messages(whole) == messages(before)
+
+
+def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_path: Path) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    (begin, end), *_ = chunks(data)
+    part.write_bytes(data[:8] + bytes(begin - 8) + data[begin:end])
+    assert part.stat().st_size < NOTHING_BYTES
+    assert "stays so" in recover(part, whole, "crash", room=True)
+    assert list(tmp_path.iterdir()) == [whole]
+
+
+@pytest.mark.parametrize("room", [False, True])
+def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
+    growing: bytes, room: bool, tmp_path: Path
+) -> None:
+    part, whole, dice, counts = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(6), set()
+    begin = growing.index(GROWING) + len(GROWING)
+    for number in range(30):
+        tail = dice.choice([b"", bytes(700), dice.randbytes(64)])
+        size = dice.randrange(begin, len(growing)) if number else len(growing)
+        part.write_bytes(growing[:size] + tail)
+        before = messages(part)
+        recover(part, whole, "crash", room)
+        counts.add(len(before))
+        if before:
+            recording, last = Recording(whole), closing(whole)
+            assert list(recording.messages()) == before
+            assert last is not None
+            assert (recording.whole, recording.cut, last.cut) == (True, "crash", "crash")
+            with whole.open("rb") as stream:
+                assert len(list(make_reader(stream).iter_messages())) == len(before)
+            whole.unlink()
+        assert list(tmp_path.iterdir()) == []
+    assert len(counts) > 5
+
+
+def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    for content, told in ((b"", ""), (b"\x89MC", "it has no beginning")):
+        part.write_bytes(content)
+        said = recover(part, whole, "crash", room=True)
+        assert told in said
+        assert bool(said) == bool(told)
+        assert list(tmp_path.iterdir()) == []
+    part.write_bytes(b"\x89MC" + bytes(NOTHING_BYTES))
+    assert "stays so" in recover(part, whole, "crash", room=True)
+    assert list(tmp_path.iterdir()) == [whole]

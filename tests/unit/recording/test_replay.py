@@ -1,0 +1,32 @@
+"""Tests of the counters of a replay; the scenarios prove that it finds each kind of difference."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.settings import Config
+from acsard.recording.replay import Replay
+from acsard.recording.rows import decode, encode
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+@pytest.mark.slow
+def test_it_counts_lines_poses_and_modes_and_knows_the_end() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    replay = Replay(Config())
+    for step in decode(encode(0, tape.taken)):
+        assert replay.step(step) is None
+    tally = replay.tally
+    assert tally.same
+    assert tally.steps == tally.modes_same == len(tape.taken)
+    assert tally.lines == tally.lines_same == sum(t.outputs.line is not None for t in tape.taken)
+    assert tally.poses == tally.poses_same == sum(len(t.outputs.estimates) for t in tape.taken)
+    assert tally.fastest == (1000, 1000)
+    assert tally.end is not None
+    then, now = tally.end
+    assert then == now
+    assert 0.5 < then[0] / 1e6 < 1.0
+    assert tally.apart == 0.0

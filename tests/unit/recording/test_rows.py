@@ -1,0 +1,216 @@
+"""A batch of steps reproduces exactly its inputs and outputs.
+
+A batch of steps that no daemon can have recorded is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+import msgspec
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config
+from acsard.core.robot import Robot
+from acsard.core.values import (
+    Command,
+    Event,
+    GyroSample,
+    Inputs,
+    Instant,
+    Pose,
+    Received,
+    Refusal,
+    Request,
+    Twist,
+)
+from acsard.recording.rows import MOST_ROWS, Batch, BatchError, Rare, decode, encode, first_of
+from acsard.recording.steps import Taken, microposes, status_of
+from tests.scenarios.taped import Tape, drive_through_faults
+from tests.scenarios.world import World
+
+INSTANTS = st.builds(Instant, st.integers(0, 1 << 60), st.integers(0, 1 << 60))
+READS = st.builds(Received, INSTANTS, st.binary(max_size=9))
+TEXT = st.text(max_size=20)
+COMMANDS = st.builds(
+    Command,
+    source=TEXT,
+    twist=st.builds(Twist, st.floats(-9, 9), st.floats(-9, 9)),
+    arrived_ns=st.integers(0, 1 << 60),
+    stamp_ns=st.none() | st.integers(-(1 << 61), 1 << 61),
+    sender=TEXT,
+    sequence=st.none() | st.integers(0, (1 << 63) - 1),
+    cancelled=st.booleans(),
+    shared=st.booleans(),
+)
+REQUESTS = st.builds(
+    Request,
+    verb=st.sampled_from(["stop", "clear", "set_pose"]),
+    id=st.integers(0, 1 << 40),
+    pose=st.none() | st.builds(Pose, st.floats(-9, 9)),
+    by=TEXT,
+)
+PARTS: dict[str, st.SearchStrategy[object]] = {
+    "now": INSTANTS,
+    "tick": st.booleans(),
+    "port_open": st.booleans(),
+    "opened": st.integers(0, 3),
+    "port_trouble": st.sampled_from(["", "gone"]),
+    "received": st.lists(READS, max_size=3).map(tuple),
+    "commands": st.lists(COMMANDS, max_size=2).map(tuple),
+    "requests": st.lists(REQUESTS, max_size=2).map(tuple),
+    "gyro": st.lists(
+        st.builds(GyroSample, st.integers(0, 1 << 60), st.none(), st.floats(-1, 1)), max_size=2
+    ).map(tuple),
+    "refusals": st.lists(st.builds(Refusal, TEXT, TEXT), max_size=2).map(tuple),
+    "guard_trip": st.sampled_from(["", "a wheel grows"]),
+    "superseded": st.booleans(),
+    "missed": st.integers(0, 5),
+    "events": st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
+    "at_once": st.booleans(),
+    "leaving": st.booleans(),
+}
+INPUTS = st.builds(Inputs, **PARTS)
+
+
+def test_whatever_comes_into_a_step_is_recorded() -> None:
+    assert set(PARTS) == set(Inputs.__struct_fields__)
+
+
+@given(st.lists(INPUTS, min_size=1, max_size=6), st.integers(0, 1 << 40))
+def test_all_that_can_come_in_comes_back(inputs: list[Inputs], first: int) -> None:
+    outputs = Robot(Config()).step(Inputs(Instant(1, 2), True, True))
+    steps = decode(encode(first, [Taken(one, outputs, b"other") for one in inputs]))
+    assert [step.inputs for step in steps] == inputs
+    assert [step.number for step in steps] == [first + n for n in range(len(inputs))]
+    assert {step.said.left for step in steps} == {b"other"}
+
+
+def driven() -> list[Taken]:
+    tape = Tape()
+    drive_through_faults(World(recorder=tape), 3.0)
+    return tape.taken
+
+
+TAKEN = driven()
+
+
+def test_what_went_out_comes_back() -> None:
+    for at in range(0, len(TAKEN), 100):
+        batch = TAKEN[at : at + 100]
+        for taken, step in zip(batch, decode(encode(at, batch)), strict=True):
+            said, outputs = step.said, taken.outputs
+            assert (said.line, said.left) == (outputs.line, taken.left)
+            assert said.status == status_of(outputs)
+            assert said.poses == microposes(outputs.estimates)
+            assert said.events == outputs.events
+
+
+def test_a_second_at_rest_takes_little() -> None:
+    tape = Tape()
+    World(recorder=tape).run(3.0)
+    batch = tape.taken[-200:]
+    assert len(zstandard.compress(encode(0, batch))) < 5 * len(batch)
+
+
+def test_steps_at_one_time_come_back_in_their_order() -> None:
+    tick, other = Inputs(Instant(5, 5), True, True), Inputs(Instant(5, 5), False, True)
+    outputs = Robot(Config()).step(tick)
+    for inputs in ([tick, other, other], [other, tick], [tick, other, tick, other]):
+        steps = decode(encode(0, [Taken(one, outputs, None) for one in inputs]))
+        assert [step.inputs for step in steps] == inputs
+
+
+def test_bytes_that_are_no_batch_are_refused_and_never_more() -> None:
+    whole, dice = encode(0, TAKEN[:100]), random.Random(1)
+    for _ in range(500):
+        data = bytearray(whole)
+        for _ in range(dice.randint(1, 4)):
+            data[dice.randrange(len(data))] = dice.randrange(256)
+        try:
+            decode(bytes(data[: dice.randint(1, 3 * len(data))]))
+        except BatchError:
+            pass
+    for other in (b"", b"\x90", msgspec.msgpack.encode({"first": 1})):
+        with pytest.raises(BatchError):
+            decode(other)
+
+
+def test_the_number_of_the_first_step_is_read_alone() -> None:
+    tape = Tape()
+    World(recorder=tape).run(0.5)
+    assert [first_of(encode(number, tape.taken)) for number in (0, 7)] == [0, 7]
+    assert first_of(b"none") is None
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    return msgspec.msgpack.decode(encode(0, TAKEN[:100]), type=Batch)
+
+
+def steps_of(batch: Batch) -> int:
+    return len(decode(msgspec.msgpack.encode(batch)))
+
+
+def with_rare(batch: Batch, rare: Rare) -> Batch:
+    """Return the batch with these values in its fourth step."""
+    rows = list(batch.rows)
+    rows[3] = replace(rows[3], rare=rare)
+    return replace(batch, rows=tuple(rows))
+
+
+@pytest.mark.parametrize("far", [1 << 62, (1 << 63) - 1, -(1 << 63)])
+@pytest.mark.parametrize("name", ["mono_ns", "offset_ns", "unit"])
+def test_a_time_that_no_clock_shows_is_refused(name: str, far: int, batch: Batch) -> None:
+    with pytest.raises(BatchError, match=r"no clock|>= 1"):
+        steps_of(replace(batch, **{name: far}))
+
+
+def test_a_read_of_an_age_that_no_clock_shows_is_refused(batch: Batch) -> None:
+    rows = list(batch.rows)
+    index = next(index for index, row in enumerate(rows) if row.reads)
+    read = rows[index].reads[0]
+    rows[index] = replace(rows[index], reads=(read._replace(age=(1 << 61) // batch.unit + 1),))
+    with pytest.raises(BatchError, match="no clock"):
+        steps_of(replace(batch, rows=tuple(rows)))
+
+
+@pytest.mark.parametrize(
+    "rare",
+    [
+        Rare(requests=(Request("set_pose", pose=Pose(0.0, math.inf)),)),
+        Rare(gyro=(GyroSample(1, None, -math.inf),)),
+        Rare(gyro=(GyroSample(1, None, 0.0, math.nan),)),
+    ],
+    ids=["pose", "rate", "variance"],
+)
+def test_a_number_that_no_step_gets_is_refused(rare: Rare, batch: Batch) -> None:
+    with pytest.raises(BatchError, match="no number"):
+        steps_of(with_rare(batch, rare))
+
+
+def test_a_command_that_the_robot_refuses_itself_is_recorded(batch: Batch) -> None:
+    rare = Rare(commands=(Command("app", Twist(math.nan, 0.0), 1),))
+    assert steps_of(with_rare(batch, rare)) == steps_of(batch) == 100
+
+
+def test_a_batch_without_what_every_first_step_has_or_of_too_many_steps_is_refused(
+    batch: Batch,
+) -> None:
+    assert batch.rows[0].rare is not None
+    for rows in ((), batch.rows[1:], (batch.rows[1],) * (MOST_ROWS + 1)):
+        with pytest.raises(BatchError):
+            steps_of(replace(batch, rows=rows))
+
+
+def test_a_line_in_whose_place_none_or_another_was_sent_comes_back() -> None:
+    tick = Inputs(Instant(5, 5), True, True)
+    outputs = Robot(Config()).step(tick)
+    sent = [None, b"", outputs.line, b"other"]
+    steps = decode(encode(0, [Taken(tick, outputs, left) for left in sent]))
+    assert [step.said.left for step in steps] == sent

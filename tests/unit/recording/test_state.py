@@ -1,0 +1,176 @@
+"""A robot survives the round trip through bytes, and bytes from others run no code."""
+
+from __future__ import annotations
+
+import pickle
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acsard.core.config.settings import Config
+from acsard.core.guard import Memory
+from acsard.core.link.lattice import Search
+from acsard.core.motion.freshness import Freshness
+from acsard.core.robot import Robot
+from acsard.core.values import NS_PER_S, REST, Command, Instant
+from acsard.host.errors import RecordingError
+from acsard.recording.export import export
+from acsard.recording.file import Recording
+from acsard.recording.replayed import Onlooker, live
+from acsard.recording.state import StateError, freeze, thaw
+from acsard.report.course import Course
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+MEMORY = Memory(b"line", 5, None, 7, 8)
+
+
+def test_it_comes_back_as_it_was() -> None:
+    world = World()
+    world.drive(0.5, 0.3, seconds=2.0)
+    memory = world.loop._guard.memory
+    assert memory.commanded_ns is not None
+    state = thaw(freeze(world.loop.robot, memory))
+    assert state.memory == memory
+    assert state.robot.snapshot(world.now_ns) == world.loop.robot.snapshot(world.now_ns)
+    again = freeze(state.robot, Memory())
+    assert freeze(thaw(again).robot, Memory()) == again
+
+
+def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
+    """The state is saved in a step of the loop whenever a file begins, so it must stay small."""
+    freshness = Freshness()
+    for number in range(5000):
+        stamp_ns = number * NS_PER_S // 1000
+        command = Command("app", REST, stamp_ns, stamp_ns, f"sender {number}")
+        freshness.judge(command, NS_PER_S // 4)
+    later_ns = 8 * NS_PER_S
+    freshness.judge(Command("app", REST, later_ns, later_ns, "me"), NS_PER_S // 4)
+    assert len(pickle.dumps(freshness)) < len(freeze(Robot(Config()), Memory())) / 10
+
+
+@pytest.mark.parametrize("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
+def test_what_is_no_robot_is_refused(value: object) -> None:
+    with pytest.raises(StateError):
+        thaw(pickle.dumps(value))
+
+
+def test_damaged_bytes_are_refused_in_words(tmp_path: Path) -> None:
+    data = freeze(World().loop.robot, Memory())
+    with pytest.raises(StateError, match="this version"):
+        thaw(data[:1000])
+    with pytest.raises(StateError):
+        thaw(b"")
+    assert isinstance(thaw(data).robot, Robot)
+
+
+def test_whatever_bit_is_another_it_is_a_robot_or_refused() -> None:
+    data, dice, refused = freeze(World().loop.robot, Memory()), random.Random(1), list[str]()
+    for _ in range(60):
+        bad = bytearray(data)
+        bad[dice.randrange(len(bad))] ^= 1 << dice.randrange(8)
+        try:
+            assert isinstance(thaw(bytes(bad)).robot, Robot)
+        except StateError as error:
+            refused.append(str(error))
+    assert len(refused) > 20
+    assert all(words.isprintable() for words in refused)
+
+
+def of_older_code(path: Path, forget: Callable[[Robot], None]) -> Recording:
+    """Record a drive from its middle, with a saved robot from which `forget` removed something."""
+    first, tape = 100, Tape(every=100)
+    World(recorder=tape).drive(0.5, seconds=2.0)
+    robot, memory = thaw(tape.states[first])
+    forget(robot)
+    tape.states[first] = freeze(robot, memory)
+    tape.write(path, Config(), first)
+    return Recording(path)
+
+
+def test_what_a_part_of_an_older_robot_lacks_begins_as_in_a_new_one(tmp_path: Path) -> None:
+    def forget(robot: Robot) -> None:
+        for wheel in robot._sanity._wheels:
+            del wheel.suspected
+
+    recording = of_older_code(tmp_path / "old.mcap", forget)
+    looked = Onlooker(recording)
+    assert len([*looked.steps()]) == looked.replay.tally.steps > 100
+    assert looked.replay.tally.same
+    assert live(recording).tally.same
+
+
+SPOILERS: dict[str, Callable[[Robot], None]] = {
+    "a number for the session": lambda robot: setattr(robot, "session", 5),
+    "words for what was said last": lambda robot: setattr(robot, "_made", ("fast", "now")),
+    "a list for a counter": lambda robot: setattr(robot, "counters", []),
+    "no wheels": lambda robot: setattr(robot._sanity, "_wheels", ()),
+    "itself, almost": lambda robot: setattr(robot, "_odometry", Robot(Config())),
+}
+
+
+@pytest.fixture(scope="module")
+def taped() -> Tape:
+    tape = Tape(every=100)
+    World(recorder=tape).drive(0.5, seconds=1.0)
+    return tape
+
+
+@pytest.mark.parametrize("how", SPOILERS)
+def test_a_robot_with_something_else_in_place_of_a_part_is_a_sentence(
+    how: str, taped: Tape, tmp_path: Path
+) -> None:
+    robot, memory = thaw(taped.states[100])
+    SPOILERS[how](robot)
+    spoilt = replace_state(taped, freeze(robot, memory))
+    spoilt.write(path := tmp_path / "spoilt.mcap", Config(), 100)
+    recording = Recording(path)
+    words = r"spoilt\.mcap: this version cannot read the state at its start: "
+    with pytest.raises(RecordingError, match=words):
+        live(recording)
+    with pytest.raises(RecordingError, match=words):
+        drawn(recording)
+
+
+def replace_state(tape: Tape, state: bytes) -> Tape:
+    """Return the same drive with another robot as its first state."""
+    other = Tape()
+    other.taken, other.states = tape.taken, {100: state}
+    return other
+
+
+def drawn(recording: Recording) -> None:
+    """Replay a recording as a report does."""
+    looked = Onlooker(recording)
+    course = Course(looked.config)
+    with looked.living():
+        for step, outputs, robot in looked.steps():
+            course.step(step, outputs, robot)
+    if looked.notes:
+        raise RecordingError(looked.notes[0])
+
+
+def test_a_search_that_a_stranger_has_begun_ends() -> None:
+    search = Search({1.0: 3})
+    search._tried = -(1 << 60)
+    assert not search.go_on()
+
+
+def test_what_no_new_robot_has_is_a_sentence_and_no_traceback(tmp_path: Path) -> None:
+    def forget(robot: Robot) -> None:
+        for sender in robot._arbiter._sources["app"].senders.values():
+            del sender.arrived_ns
+
+    recording = of_older_code(tmp_path / "old.mcap", forget)
+    words = (
+        r"old\.mcap: this version cannot read the state at its start: .*'arrived_ns'.* by acsard"
+    )
+    with pytest.raises(RecordingError, match=words):
+        live(recording)
+    with pytest.raises(RecordingError, match=words):
+        list(Onlooker(recording).steps())
+    with pytest.raises(RecordingError, match=words):
+        export(recording, tmp_path / "new.mcap", "mcap")
+    assert [*tmp_path.iterdir()] == [recording.path]

@@ -1,0 +1,114 @@
+"""A pickled robot is read back, and pickles from others are refused without any effect."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import pickletools
+import resource
+import subprocess
+import sys
+from collections import Counter, deque
+
+import pytest
+
+from acsard.core.guard import Memory
+from acsard.core.motion.modes import Mode
+from acsard.core.values import Twist
+from acsard.recording.state import TABLE, freeze, part, thaw
+from acsard.recording.unpickling import DEEPEST, MOST_BYTES, MOST_OPCODES, MOST_PARTS, unpickled
+from tests.recordings.__main__ import CHECKED
+from tests.scenarios.taped import Tape, drive_through_faults
+from tests.scenarios.world import World
+from tests.unit.recording.attacks import ATTACKS, doubled, whole
+
+BYTES = 2 << 30
+
+PROCESSOR_S = 60
+"""All attacks together take a second; without a limit one of them takes years."""
+
+
+def limits() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (BYTES, BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (PROCESSOR_S, PROCESSOR_S))
+
+
+@pytest.fixture(scope="module")
+def said() -> dict[str, str]:
+    """Return the refusal of each attack; it is empty for one that was read or had an effect."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.unit.recording.attacks"],
+        capture_output=True, text=True, check=True, preexec_fn=limits,
+    )  # fmt: skip
+    words: dict[str, str] = json.loads(done.stdout)
+    return words
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[str, str]) -> None:
+    words = said[name]
+    assert "the state at its start" in words
+    assert words.isprintable()
+    assert len(words) < 300
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None, True, -(1 << 90), 1.5, "text", "t" * 300, b"bytes", b"b" * 300, (), (1,),
+        (1, 2, 3, 4), [1, [2, 3]], {"a": 1, 2: (3,), (1, 2): None}, {1, 2},
+        frozenset({"a"}), [*range(3000)], Counter(a=2), deque([1, 2], 3), deque(["a"]),
+        Mode.DRIVING, Twist(0.5, 1.0),
+    ],
+    ids=lambda value: f"{value!r:.12}",
+)  # fmt: skip
+def test_a_value_comes_back_as_it_was(value: object) -> None:
+    again = unpickled(pickled(value), part)
+    assert again == value
+    assert type(again) is type(value)
+    assert getattr(again, "maxlen", None) == getattr(value, "maxlen", None)
+
+
+def pickled(value: object) -> bytes:
+    class Pickler(pickle.Pickler):
+        dispatch_table = TABLE
+
+    written = io.BytesIO()
+    Pickler(written, 5).dump(value)
+    return written.getvalue()
+
+
+def test_what_is_there_twice_is_one_thing() -> None:
+    inner = [1]
+    again = unpickled(pickled((inner, [inner])), part)
+    assert isinstance(again, tuple)
+    assert again[0] is again[1][0]
+
+
+def test_what_is_nested_is_read_down_to_a_depth_and_what_doubles_up_to_a_size() -> None:
+    def nested(times: int) -> bytes:
+        return whole(pickle.EMPTY_TUPLE + pickle.TUPLE1 * times)
+
+    unpickled(nested(DEEPEST), part)
+    with pytest.raises(ValueError, match="deep"):
+        unpickled(nested(DEEPEST + 1), part)
+    most = MOST_PARTS.bit_length() - 2
+    unpickled(whole(doubled(most)), part)
+    with pytest.raises(ValueError, match="more parts"):
+        unpickled(whole(doubled(most + 1)), part)
+
+
+def test_a_robot_with_all_there_is_has_room() -> None:
+    tape = Tape(every=100)
+    world = World(CHECKED, recorder=tape)
+    drive_through_faults(world, 1.0)
+    for number in range(40):
+        world.send(0.1, source=f"somebody-{number}")
+        world.run(0.02)
+    states = [*tape.states.values(), freeze(world.loop.robot, Memory())]
+    for data in states:
+        assert 8 * len(data) < MOST_BYTES
+        assert 8 * sum(1 for _ in pickletools.genops(data)) < MOST_OPCODES
+        state = thaw(data)
+        assert freeze(*state) == freeze(*thaw(freeze(*state)))
