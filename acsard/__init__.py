@@ -17,7 +17,7 @@ The packages follow, each with the packages that it may import below it. `pyproj
 this order as contracts, and `lint-imports` checks them.
 
     cli/             one file per verb: its options, one call into another package, its output
-    asking/          how a verb asks the person beside the robot: at a terminal or by a program
+    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     bench/           `acsard bench`: measures a daemon from outside
     doctor/          `acsard doctor`: what is wrong with this installation
     foxglove/        `acsard foxglove`: a live server for Foxglove

@@ -9,9 +9,9 @@ import sys
 
 from msgspec.structs import replace
 
-from acsard.core.messages.short import short
+from acsard.core.messages.one_line import short
 from acsard.core.motion.arbiter import Choice
-from acsard.core.motion.words import chosen
+from acsard.core.motion.arbiter_text import chosen
 from acsard.top.roster import table
 from acsard.top.teleop import lines
 from tests.unit.top import test_roster, test_teleop

@@ -17,10 +17,10 @@ from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, ExitError, UsageError
 
 if TYPE_CHECKING:
-    from acsard.asking.json_lines import JsonAttendant
     from acsard.calibration.solve import Calibration
     from acsard.calibration.tape_distance import Tape
     from acsard.core.config.settings import DriveConfig
+    from acsard.prompts.json_lines import JsonAttendant
 
 DESCRIPTION = """\
 Find the wheels' radii and the effective track, each with its standard deviation, and tell what they
@@ -79,7 +79,7 @@ def main(args: argparse.Namespace) -> int:
         return _calibrate(args, None)
     if args.yes:
         raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
-    from acsard.asking.json_lines import JsonAttendant
+    from acsard.prompts.json_lines import JsonAttendant
 
     with JsonAttendant() as lines:
         return _calibrate(args, lines)
@@ -152,7 +152,7 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
     from acsard.calibration.log_table import AS_CSV, LogError, noted, read
     from acsard.calibration.runs import runs
     from acsard.calibration.solve import calibrate
-    from acsard.recording.walk import MAGIC
+    from acsard.recording.mcap_records import MAGIC
 
     if log.is_dir():
         raise LogError(f"it is a directory (a bag of ROS, perhaps): {AS_CSV}")

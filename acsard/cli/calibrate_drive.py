@@ -15,14 +15,14 @@ from acsard.host.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
-    from acsard.asking.attendant import Attendant
-    from acsard.asking.json_lines import JsonAttendant
     from acsard.calibration.guided.legs import Setup
     from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
     from acsard.client.legs import Robot
     from acsard.core.config.settings import Config
+    from acsard.prompts.calibration_prompts import Attendant
+    from acsard.prompts.json_lines import JsonAttendant
 
 DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
 
@@ -181,7 +181,7 @@ def _way(args: argparse.Namespace, config: Config) -> str:
 
 @contextmanager
 def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterator[Attendant]:
-    from acsard.asking.attendant import Nobody, attending, interrupted_by
+    from acsard.prompts.calibration_prompts import Nobody, attending, interrupted_by
 
     if args.yes:
         yield Nobody()

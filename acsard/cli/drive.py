@@ -81,7 +81,7 @@ def _show(ride: Ride) -> None:
 
 def _plain(ride: Ride) -> None:
     """Print some lines after each change, and at intervals."""
-    from acsard.top.keys import keys, until_told
+    from acsard.top.key_reader import keys, until_told
     from acsard.top.teleop import news
 
     due, page = News(), Page()

@@ -128,8 +128,8 @@ def _print(
 def _shortened(key: str) -> Decoder[Any]:
     """Return the decoder of a key that has a short form. Raises `ExitError` for any other key."""
     from acsard.core.messages.encodings import Decoder
+    from acsard.core.messages.one_line import SHORT
     from acsard.core.messages.schema import MESSAGES
-    from acsard.core.messages.short import SHORT
     from acsard.core.messages.topics import TOPICS, by_key
 
     kinds = {kind.__name__: kind for kind in SHORT}
@@ -143,7 +143,7 @@ def _shortened(key: str) -> Decoder[Any]:
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
     """Return a message as a printable line. A message that cannot be decoded is printed as JSON."""
     from acsard.core.messages.encodings import DecodeError
-    from acsard.core.messages.short import short
+    from acsard.core.messages.one_line import short
 
     if decoder is not None:
         try:

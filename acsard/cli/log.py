@@ -17,9 +17,9 @@ from acsard.core.formatting import json_line, many, printable
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
-    from acsard.recording.closing import Closing
+    from acsard.recording.end_record import EndRecord
     from acsard.recording.file import Recording
-    from acsard.recording.story import Told
+    from acsard.recording.timeline import TimelineEntry
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
@@ -80,7 +80,7 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 def list_all(args: argparse.Namespace) -> int:
     """Print a line for each recording."""
     from acsard.host.errors import RecordingError
-    from acsard.recording.closing import closing
+    from acsard.recording.end_record import closing
     from acsard.recording.file import Recording
     from acsard.terminal.output import show
     from acsard.terminal.tables import table
@@ -100,8 +100,8 @@ def list_all(args: argparse.Namespace) -> int:
     return int(Exit.OK)
 
 
-def _row(path: Path, last: Closing, note: str = "") -> tuple[str, ...]:
-    from acsard.recording.closing import how_it_ends
+def _row(path: Path, last: EndRecord, note: str = "") -> tuple[str, ...]:
+    from acsard.recording.end_record import how_it_ends
 
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
@@ -136,7 +136,7 @@ def _state(recording: Recording) -> str:
 
 def _ending(recording: Recording) -> str:
     """Return why the recording ended other than by a normal end of the daemon, or ""."""
-    from acsard.recording.closing import how_it_ends
+    from acsard.recording.end_record import how_it_ends
 
     if not recording.ended:
         return "no end: cut, or being written"
@@ -146,11 +146,11 @@ def _ending(recording: Recording) -> str:
 def show_one(args: argparse.Namespace) -> int:
     """Print the timeline of a recording."""
     from acsard.recording.replayed import steps
-    from acsard.recording.story import Story, Told
+    from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
     recording = _recording(args)
     begin, end = log_span.span(args, recording)
-    story, last = Story(), recording.about.wall_ns / 1e9
+    story, last = TimelineWriter(), recording.about.wall_ns / 1e9
     inside = begin <= 0.0
     for step in steps(recording):
         now = step.inputs.now
@@ -161,14 +161,14 @@ def show_one(args: argparse.Namespace) -> int:
                 _tell(one, args.json)
     ending = _ending(recording)
     if ending and inside:
-        _tell(Told(last, "cut", ending.removeprefix("cut: "), "warning"), args.json)
+        _tell(TimelineEntry(last, "cut", ending.removeprefix("cut: "), "warning"), args.json)
     note = _state(recording)
     if note:
         print(f"{recording.path}:{note}", file=sys.stderr)
     return int(Exit.OK)
 
 
-def _tell(one: Told, as_json: bool) -> None:
+def _tell(one: TimelineEntry, as_json: bool) -> None:
     import msgspec
 
     if as_json:
@@ -213,7 +213,7 @@ def replay_one(args: argparse.Namespace) -> int:
 
 def recover_one(args: argparse.Namespace) -> int:
     """Rewrite an unfinished or damaged recording as a finished file."""
-    from acsard.recording.beside import beside
+    from acsard.recording.atomic_output import beside
     from acsard.recording.file import rewrite
 
     recording, new = _recording(args), Path(args.new)
@@ -280,7 +280,7 @@ def _recording(args: argparse.Namespace) -> Recording:
     return Recording(files[-1])
 
 
-def _sentence(one: Told) -> str:
+def _sentence(one: TimelineEntry) -> str:
     from acsard.core.ros.shapes import how_often
 
     by = f" (by {one.by})" if one.by else ""

@@ -17,7 +17,7 @@ def telling(recording: Recording) -> Iterator[Callable[[int], None]]:
 
     The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
     """
-    from acsard.recording.closing import closing
+    from acsard.recording.end_record import closing
 
     if not sys.stderr.isatty():
         yield lambda wall_ns: None

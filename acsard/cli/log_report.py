@@ -66,7 +66,7 @@ def report_one(
     recording: Recording, args: argparse.Namespace, plotly: str, words: Words
 ) -> list[str]:
     """Write the report, print a summary, and return notes about the recording."""
-    from acsard.recording.beside import beside
+    from acsard.recording.atomic_output import beside
 
     if args.held:
         return _held(recording, args, plotly, words)
@@ -90,7 +90,7 @@ def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Wo
     The progress in percent goes to standard error.
     """
     from acsard.host.processes import end_with_parent
-    from acsard.recording.closing import closing
+    from acsard.recording.end_record import closing
 
     end_with_parent(signal.SIGKILL)
     last, began = closing(recording.path), recording.about.wall_ns / 1e9

@@ -1,7 +1,7 @@
 """`acsard mcu check`: test the microcontroller on the real robot with its wheels lifted.
 
-`checkup/procedure.py` decides what is tested and in which order. `asking/person.py` asks the
-operator.
+`checkup/procedure.py` decides what is tested and in which order. `prompts/check_prompts.py` asks
+the operator.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.asking.person import SIMULATOR, Nobody, Person, answering, ended_by_signals
 from acsard.cli.common import JSON_LINES, Overrides, add_config, load
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
+from acsard.prompts.check_prompts import SIMULATOR, Nobody, Person, answering, ended_by_signals
 
 if TYPE_CHECKING:
-    from acsard.asking.json_lines import JsonPerson
     from acsard.checkup.board import Wire
     from acsard.checkup.findings import Finding
     from acsard.core.config.settings import Config
+    from acsard.prompts.json_lines import JsonPerson
 
 DESCRIPTION = """\
 Find out on your own robot, wheels lifted, what its microcontroller speaks and whether it keeps

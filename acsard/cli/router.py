@@ -54,7 +54,7 @@ async def _kept(file: str, log: Log) -> int:
     """Run one router process after the other, until a signal or an exit code that is final."""
     import signal
 
-    from acsard.daemon.doorkeeper import ROUTER, keep_door
+    from acsard.daemon.supervisor import ROUTER, keep_door
 
     keeper = asyncio.ensure_future(keep_door(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

@@ -22,10 +22,12 @@ from acsard.core.config.settings import Config
 from acsard.core.link.contract import WATCHDOG_S
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.session import McuSession
-from acsard.core.motion.answered import Answered
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.dropped import Dropped
+from acsard.core.motion.arbiter_text import REFUSED, chosen
+from acsard.core.motion.command_events import CommandEvents, missed, refused
+from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.gyro import Gyro
+from acsard.core.motion.impossible_lines import ImpossibleLines
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import LearnedTrack
 from acsard.core.motion.lifecycle import Lifecycle
@@ -33,9 +35,7 @@ from acsard.core.motion.limits import Limiter
 from acsard.core.motion.modes import LEAVING, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
-from acsard.core.motion.tally import Tally
-from acsard.core.motion.told import Told, missed, refused
-from acsard.core.motion.words import REFUSED, chosen
+from acsard.core.motion.unanswered_lines import UnansweredLines
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -121,12 +121,12 @@ class Robot:
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
-        self._dropped = Dropped()
-        self._answered = Answered(config.mcu.reply_period)
-        self._tally = Tally()
+        self._dropped = ImpossibleLines()
+        self._answered = UnansweredLines(config.mcu.reply_period)
+        self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
         """The last request. A stop arrives twice: on a key of its own, and as a query."""
-        self._told = Told(self._life.mode)
+        self._told = CommandEvents(self._life.mode)
         self._port_trouble = ""
         self._linked_once = False
         self._arbiter.require_neutral()

@@ -225,7 +225,7 @@ class Estimate(Struct, frozen=True, gc=False):
 
 
 class Wait(Struct, frozen=True):
-    """The thing that a source waits for, with the details for `core/motion/words.py`."""
+    """The thing that a source waits for, with the details for `core/motion/arbiter_text.py`."""
 
     what: Literal[
         "nothing", "command", "proof", "late", "neutral", "zeros", "higher", "equal", "senders"

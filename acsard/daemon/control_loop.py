@@ -19,7 +19,7 @@ from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, DoorTold,
 from acsard.core.incoming.commands import Receiver, asker, parts, sender
 from acsard.core.incoming.imu import ImuTold
 from acsard.core.incoming.queries import Queries, Query, refused
-from acsard.core.link.gate import Port
+from acsard.core.link.line_gate import Port
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import Info, Message
@@ -44,7 +44,7 @@ from acsard.core.values import (
 from acsard.daemon.kept_latches import ANSWER_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
-from acsard.recording.steps import BlackBox
+from acsard.recording.recorded_steps import BlackBox
 
 FEEDBACK = ("odom", "tf", "wheel_states")
 """Keys that are published from the feedback lines."""

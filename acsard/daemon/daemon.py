@@ -30,10 +30,10 @@ from acsard.daemon.bus.tls import ends_ns as ends_ns_of
 from acsard.daemon.bus.tls import require_usable
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.control_loop import ControlLoop
-from acsard.daemon.doorkeeper import DOOR, PAGE, Kind, keep_door
 from acsard.daemon.latch_file import LatchFile
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulated_board import Simulated
+from acsard.daemon.supervisor import DOOR, PAGE, Kind, keep_door
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
 from acsard.host.logs import Log

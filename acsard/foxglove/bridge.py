@@ -22,10 +22,10 @@ from acsard.core.messages.topics import full_key
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.drives import Drives
-from acsard.foxglove.facts import Facts, learn
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.objections import Objections
+from acsard.foxglove.refusal_notices import Objections
 from acsard.foxglove.relay import Relay
+from acsard.foxglove.robot_facts import Facts, learn
 from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
 from acsard.foxglove.services import CALLED, STOPS, services
 from acsard.foxglove.settings import Settings

@@ -22,9 +22,9 @@ from acsard.core.messages.topics import by_key
 from acsard.core.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.core.ros.shapes import Log
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
-from acsard.foxglove.facts import Facts, key_of
-from acsard.foxglove.heard import Commanders
-from acsard.foxglove.news import News
+from acsard.foxglove.command_subscriptions import Commanders
+from acsard.foxglove.log_messages import News
+from acsard.foxglove.robot_facts import Facts, key_of
 
 MOST = 100
 """Maximum number of messages of a topic per round; a second's worth at 100 Hz."""

@@ -88,7 +88,7 @@ Form = Literal["console", "json", "logfmt", "journal"]
 
 QUEUED_LINES = 1000
 """Largest number of queued lines: more than the daemon logs in a minute with all faults at once
-(`core/motion/tally.py`).
+(`core/motion/event_throttle.py`).
 """
 
 MAX_VALUE = 500

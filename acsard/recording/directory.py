@@ -25,10 +25,10 @@ from msgspec import Struct, field
 
 from acsard.core.config.settings import RECORD, RecordConfig
 from acsard.core.values import NS_PER_S, Instant
-from acsard.recording.closing import CUTS
+from acsard.recording.end_record import CUTS
 from acsard.recording.file import MODE, About, Writing
 from acsard.recording.recovery import recover
-from acsard.recording.room import AROUND_NS, Bounds, Disk, Ended, Kind, Steady, share, too_much
+from acsard.recording.retention import AROUND_NS, Bounds, Disk, Ended, Kind, Steady, share, too_much
 
 DIRECTORY_MODE = 0o750
 

@@ -21,11 +21,11 @@ from acsard.core.config.writing import document
 from acsard.core.values import NS_PER_S, Event, Instant
 from acsard.recording.directory import Ring, Run, leave
 from acsard.recording.file import About, Writing
+from acsard.recording.recorded_steps import Start, Taken, runs
 from acsard.recording.recovery import FULL
-from acsard.recording.room import Around
+from acsard.recording.retention import Around
 from acsard.recording.rows import encode
-from acsard.recording.steps import Start, Taken, runs
-from acsard.recording.story import told
+from acsard.recording.timeline import told
 
 RETRY_ROUNDS = 5
 """Rounds to wait, about one second each, after the disk refused."""

@@ -16,13 +16,13 @@ from acsard.core.ros.channels import ENCODING, SCHEMA_ENCODING, Channel
 from acsard.core.ros.names import TYPE_HASHES
 from acsard.core.values import NS_PER_S, Outputs
 from acsard.host.errors import RecordingError
-from acsard.recording import bag, table
-from acsard.recording.beside import beside, synced
+from acsard.recording import csv_table, ros_bag
+from acsard.recording.atomic_output import beside, synced
 from acsard.recording.file import About, Recording
 from acsard.recording.published import Published, Publisher
+from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import lived
 from acsard.recording.replayed import EVERY, Course, Progress, quietly
-from acsard.recording.steps import Step
 
 Kind = Literal["mcap", "csv", "rosbag2"]
 
@@ -100,7 +100,7 @@ class _Messages:
             text = channel.schema.encode()
             self._schemas[kind] = self._writer.register_schema(kind, SCHEMA_ENCODING, text)
         topic = channel.topic(self._namespace, source)
-        about = {"offered_qos_profiles": bag.offered(channel.qos)}
+        about = {"offered_qos_profiles": ros_bag.offered(channel.qos)}
         if kind in TYPE_HASHES:
             about["topic_type_hash"] = TYPE_HASHES[kind]
         number: int = self._writer.register_channel(topic, ENCODING, self._schemas[kind], about)
@@ -112,9 +112,9 @@ class _Messages:
         self._writer.finish()
 
     @property
-    def topics(self) -> list[bag.Topic]:
+    def topics(self) -> list[ros_bag.Topic]:
         return [
-            bag.Topic(name, channel.schema_name, channel.qos, self._counts[number])
+            ros_bag.Topic(name, channel.schema_name, channel.qos, self._counts[number])
             for number, (name, channel) in self._topics.items()
         ]
 
@@ -124,11 +124,11 @@ class _Table:
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
-        self._stream.write(f"{table.HEADER}\n".encode())
+        self._stream.write(f"{csv_table.HEADER}\n".encode())
         self.count = 0
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        for row in table.rows(step, outputs):
+        for row in csv_table.rows(step, outputs):
             self._stream.write(f"{row}\n".encode())
             self.count += 1
 
@@ -171,7 +171,7 @@ def export(
             with file.open("wb") as stream:
                 written(sink := messages(stream), stream)
             with (part / "metadata.yaml").open("wb") as stream:
-                stream.write(bag.metadata(file.name, sink.topics, *sink.times).encode())
+                stream.write(ros_bag.metadata(file.name, sink.topics, *sink.times).encode())
                 synced(stream)
             return Done(sink.count, course.trouble)
         with part.open("wb") as stream:
@@ -198,10 +198,10 @@ def measured(recording: Recording) -> bytes:
     Raises `RecordingError` if the recording has no gyro samples, because calibration cannot use it.
     """
     course = Course(recording)
-    lines, turned = [table.MEASURED_HEADER], False
+    lines, turned = [csv_table.MEASURED_HEADER], False
     with course.living():
         for step in course.steps():
-            lines += table.measured(step, lived(course.robot, step))
+            lines += csv_table.measured(step, lived(course.robot, step))
             turned = turned or bool(step.inputs.gyro)
     if not turned:
         raise RecordingError(

@@ -41,11 +41,11 @@ from msgspec import Struct
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import GROWING, Growing, Message
-from acsard.recording.closing import END, Closing, Ns, fields
+from acsard.recording.end_record import END, EndRecord, Ns, fields
+from acsard.recording.mcap_records import MAGIC, walk
+from acsard.recording.recorded_steps import UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, first_of
-from acsard.recording.steps import UnfinishedError, unfinished
-from acsard.recording.story import NEWS, Told, summary
-from acsard.recording.walk import MAGIC, walk
+from acsard.recording.timeline import NEWS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
 """Longest time that a chunk covers. More saves little space, and damage costs more."""
@@ -93,7 +93,7 @@ class Gist:
 
     def __init__(self, about: About) -> None:
         self._wall_ns = self._last_ns = about.wall_ns
-        self._news: list[Told] = []
+        self._news: list[TimelineEntry] = []
         self._starts = False
 
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
@@ -105,19 +105,19 @@ class Gist:
             with suppress(UnfinishedError):
                 self._starts = self._starts or unfinished(data).number == 0
 
-    def event(self, told: Told) -> None:
+    def event(self, told: TimelineEntry) -> None:
         """Take an event for the summary."""
         if told.name in NEWS:
             self._news.append(told)
 
-    def closing(self, cut: str = "", why: str = "") -> Closing:
+    def closing(self, cut: str = "", why: str = "") -> EndRecord:
         """Return the closing of the file.
 
         `cut` is a key of `CUTS` and `why` its explanation if the daemon did not end in the ordinary
         way.
         """
         said = summary(self._news, self._starts)
-        return Closing(self._wall_ns, self._last_ns, said, cut, why)
+        return EndRecord(self._wall_ns, self._last_ns, said, cut, why)
 
 
 class Writing:
@@ -203,7 +203,7 @@ class Writing:
         totals.message_count += 1
         totals.channel_message_counts[NUMBERS[topic]] += 1
 
-    def event(self, told: Told) -> None:
+    def event(self, told: TimelineEntry) -> None:
         """Add an event, and take it for the summary."""
         wall_ns = int(told.seconds * NS_PER_S)
         self.add("events", wall_ns, msgspec.json.encode(told))
@@ -268,7 +268,7 @@ class Writing:
 
 def _definitions() -> Iterator[McapRecord]:
     """Yield the schema and the channels, as they are at the beginning and in the summary."""
-    schema = msgspec.json.encode(msgspec.json.schema(Told))
+    schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
     yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.Told")
     for topic, number in NUMBERS.items():
         encoding, of = ("json", EVENTS_SCHEMA) if topic == "events" else (f"acsard-{topic}", 0)
@@ -375,9 +375,9 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     return count
 
 
-def event_of(recording: Recording, data: bytes) -> Told:
+def event_of(recording: Recording, data: bytes) -> TimelineEntry:
     """Decode an event; raise `RecordingError` if the bytes are not an event."""
     try:
-        return msgspec.json.decode(data, type=Told)
+        return msgspec.json.decode(data, type=TimelineEntry)
     except msgspec.MsgspecError as error:
         raise RecordingError(f"{recording.path} has an event that is none: {error}") from None

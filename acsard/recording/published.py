@@ -19,7 +19,7 @@ from acsard.core.ros.channels import BY_KEY, CMD_VEL_IN, LOG, Channel, said
 from acsard.core.ros.shapes import asked, log
 from acsard.core.ros.transports import left_out
 from acsard.core.values import Command, Instant, Outputs
-from acsard.recording.steps import Step
+from acsard.recording.recorded_steps import Step
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
 """Rows of `diagnostics` that need more than the inputs of the steps."""

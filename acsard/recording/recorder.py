@@ -18,8 +18,8 @@ from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Outputs, Recording
 from acsard.recording.disk import Bug, OnDisk
+from acsard.recording.recorded_steps import Start, Taken, Unfinished
 from acsard.recording.state import freeze
-from acsard.recording.steps import Start, Taken, Unfinished
 
 MOST = 4096
 """Largest number of steps in the queue. At 100 Hz a disk may stall for 10 s without a loss."""

@@ -17,9 +17,9 @@ from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import LAST_BLOCK
-from acsard.recording.closing import END, Closing, fields
+from acsard.recording.end_record import END, EndRecord, fields
 from acsard.recording.file import Gist, Recording, event_of, rewrite
-from acsard.recording.walk import MAGIC, walk
+from acsard.recording.mcap_records import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a disk without room."""
@@ -135,7 +135,7 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
     os.fsync(stream.fileno())
 
 
-def _end(last: Closing) -> bytes:
+def _end(last: EndRecord) -> bytes:
     """Return the smallest end of a valid MCAP file, without an index. Readers do not need one."""
     builder = RecordBuilder()
     Metadata(END, fields(last)).write(builder)

@@ -16,7 +16,7 @@ from acsard.core.config.settings import Config
 from acsard.core.guard import Guard, Memory
 from acsard.core.robot import Robot
 from acsard.core.values import Instant, Outputs
-from acsard.recording.steps import (
+from acsard.recording.recorded_steps import (
     MICRO,
     Micropose,
     Status,
@@ -50,7 +50,7 @@ class Difference(Struct, frozen=True):
     now: Seen
 
 
-class Tally(Struct):
+class Comparison(Struct):
     """Totals of a replay so far."""
 
     steps: int = 0
@@ -107,7 +107,7 @@ class Replay:
         self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
         self._checksum = 0
         self._here: Micropose = (0, 0, 0)
-        self.tally = Tally()
+        self.tally = Comparison()
 
     def step(self, step: Step) -> Difference | None:
         """Replay a step.

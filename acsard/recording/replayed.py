@@ -17,10 +17,10 @@ from acsard.core.values import Outputs
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
 from acsard.recording.merge import adopt
-from acsard.recording.replay import Difference, Replay, Seen, Tally, fastest
+from acsard.recording.recorded_steps import MICRO, Step, UnfinishedError, unfinished
+from acsard.recording.replay import Comparison, Difference, Replay, Seen, fastest
 from acsard.recording.rows import BatchError, decode
 from acsard.recording.state import State, StateError, short, thaw
-from acsard.recording.steps import MICRO, Step, UnfinishedError, unfinished
 
 HUNDREDTHS = 100.0
 
@@ -44,7 +44,7 @@ LACKS = (
 class Lived(NamedTuple):
     """Result of a replay."""
 
-    tally: Tally
+    tally: Comparison
     trouble: str
     """Why the replay ended before the end of the file; "" if it is complete."""
     again: str = ""
@@ -249,7 +249,7 @@ def _foreign(recording: Recording, why: str) -> RecordingError:
     )
 
 
-def verdict(tally: Tally) -> str:
+def verdict(tally: Comparison) -> str:
     """Return the result of a replay in one line."""
     lines = f"{tally.lines_same:,} of {tally.lines:,} lines the same".replace(",", " ")
     poses = f"{tally.poses_same:,} of {tally.poses:,} poses".replace(",", " ")
@@ -300,7 +300,7 @@ SHAPE_LINES = ("limits.", "drive.", "mcu.wheels.")
 MOST_KEYS = 8
 
 
-def because(then: Config, now: Config, tally: Tally, began_ns: int) -> list[str]:
+def because(then: Config, now: Config, tally: Comparison, began_ns: int) -> list[str]:
     """Explain in lines why another configuration leads to other results.
 
     The lines name the changed settings, the first line that differs by them, and a new fault. They
@@ -332,7 +332,7 @@ def _set(key: str, settings: Mapping[str, object]) -> str:
     return show(settings[key]) if key in settings else "not there"
 
 
-def otherwise(tally: Tally) -> list[str]:
+def otherwise(tally: Comparison) -> list[str]:
     """Describe in lines how the robot would have behaved with other code or settings."""
     then_most, now_most = (speed / HUNDREDTHS for speed in tally.fastest)
     rows = [

@@ -29,7 +29,7 @@ from acsard.core.values import (
     Refusal,
     Request,
 )
-from acsard.recording.steps import (
+from acsard.recording.recorded_steps import (
     Micropose,
     Said,
     Status,

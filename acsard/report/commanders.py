@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from acsard.core.config.settings import Source
-from acsard.core.motion.words import REFUSED, waiting
+from acsard.core.motion.arbiter_text import REFUSED, waiting
 from acsard.core.robot import Robot
 from acsard.core.thinning import Band
 from acsard.core.values import NS_PER_S, Command, Outputs, Twist
-from acsard.recording.steps import Step
+from acsard.recording.recorded_steps import Step
 
 DOES = ("refused", "waits", "sends", "drives")
 """States of a source that is not silent, in the order in which they win when short spans are

@@ -18,8 +18,8 @@ from acsard.core.link.contract import WATCHDOG_S
 from acsard.core.robot import Robot
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
-from acsard.recording.steps import MICRO, Step
-from acsard.recording.story import Story, Told
+from acsard.recording.recorded_steps import MICRO, Step
+from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.commanders import LOOK_S, MOST_TEXT, Commanders
 
 GOOD = "lines"
@@ -245,7 +245,7 @@ class Course:
         self.fastest = Twist()
         """Highest measured speed of each axis, as a magnitude."""
         self.steps = self.missing = 0
-        self._story = Story()
+        self._story = TimelineWriter()
         self._mono_ns = self._wall_ns = 0
         self._wall = -math.inf
         """Wall-clock time of the last step, s since 1970."""
@@ -298,7 +298,7 @@ class Course:
             band.end(t)
         self.link.end()
 
-    def _mark(self, one: Told, t: float) -> Mark:
+    def _mark(self, one: TimelineEntry, t: float) -> Mark:
         text, by = one.text[:MOST_TEXT], one.by[:MOST_TEXT]
         return Mark(t, one.name, text, one.level, by, one.count, self._place)
 

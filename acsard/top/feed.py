@@ -11,7 +11,7 @@ from acsard.client.watch import Watch
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host.errors import MendableError, ReplyError
-from acsard.top.seen import Seen
+from acsard.top.screen_data import ScreenData
 
 SPAN_S = 1.0
 """Time over which rates are averaged; over less they would jump."""
@@ -60,10 +60,10 @@ class Feed:
         while len(self._past) > 2 and now - self._past[1][0] >= SPAN_S:
             self._past.popleft()
 
-    def seen(self, hint: str = "") -> Seen:
+    def seen(self, hint: str = "") -> ScreenData:
         """Return the data for the screen; `hint` is shown in the header."""
         now, watch, past = time.monotonic(), self._watch, self._past
-        return Seen(
+        return ScreenData(
             self._id,
             self._endpoint,
             watch.state,

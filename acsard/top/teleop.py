@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from msgspec import Struct
 
 from acsard.core.formatting import printable
+from acsard.core.messages.one_line import place, speeds
 from acsard.core.messages.schema import RobotState
-from acsard.core.messages.short import place, speeds
-from acsard.top.seen import MODES
+from acsard.top.screen_data import MODES
 
 if TYPE_CHECKING:
     from rich.text import Text

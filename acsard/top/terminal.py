@@ -14,9 +14,9 @@ from acsard.core.values import AcsardError
 from acsard.terminal.output import plain
 from acsard.top.feed import Feed
 from acsard.top.fleet import Fleet
-from acsard.top.held import PERIOD_S, be_lenient, hold, steer
-from acsard.top.keys import keys
+from acsard.top.key_reader import keys
 from acsard.top.roster import table
+from acsard.top.screen import PERIOD_S, be_lenient, hold, steer
 from acsard.top.teleop import Teleop, lines
 from acsard.top.view import screen
 

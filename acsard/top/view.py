@@ -15,23 +15,23 @@ from rich.text import Text
 
 from acsard.core.formatting import lasting, rough
 from acsard.core.messages.schema import RobotState
-from acsard.top import sections as beside
-from acsard.top import stacked
-from acsard.top.sections import WIDEST
-from acsard.top.seen import MODES, Seen
+from acsard.top import narrow_screen
+from acsard.top import wide_screen as beside
+from acsard.top.screen_data import MODES, ScreenData
 from acsard.top.text import clean, ends
+from acsard.top.wide_screen import WIDEST
 
 MOST_SOURCES = 32
 
 
-def screen(seen: Seen, width: int, height: int | None = None) -> Group:
+def screen(seen: ScreenData, width: int, height: int | None = None) -> Group:
     """Return the screen as lines of at most `width` cells, at most `height` of them (None: all)."""
     width = max(20, min(WIDEST, width))
     head = [_header(seen, width), *(_no_news(seen, width) if seen.silent else _mode(seen, width))]
     sections: list[list[Text]] = []
     if seen.state is not None:
         state = seen.state
-        parts = stacked if width < stacked.BELOW else beside
+        parts = narrow_screen if width < narrow_screen.BELOW else beside
         sections = [
             parts.motion(state if state.link == "up" else _unmeasured(state), width),
             parts.link(seen, state, width),
@@ -59,7 +59,7 @@ def _unmeasured(state: RobotState) -> RobotState:
     return replace(state, linear=math.nan, angular=math.nan, wheels=[])
 
 
-def _header(seen: Seen, width: int) -> Text:
+def _header(seen: ScreenData, width: int) -> Text:
     left = Text.assemble((clean(seen.robot_id), "bold"), "  ", clean(seen.endpoint))
     if seen.info is not None:
         left.append(f"  acsard {clean(seen.info.version)}", "dim")
@@ -69,7 +69,7 @@ def _header(seen: Seen, width: int) -> Text:
     return ends(left, right, width)
 
 
-def _mode(seen: Seen, width: int) -> list[Text]:
+def _mode(seen: ScreenData, width: int) -> list[Text]:
     """Return the mode as a badge with the reason next to it.
 
     A wide screen always uses two lines, so that a long reason does not move the rest. A narrow
@@ -81,8 +81,8 @@ def _mode(seen: Seen, width: int) -> list[Text]:
     badge = Text(f" {clean(state.mode).upper()[:12]} ", MODES.get(state.mode, "reverse"))
     words = clean(state.reason.removeprefix(f"{state.mode}: "))
     first, second = _split(words, width - badge.cell_len - 2)
-    if width < stacked.BELOW:
-        return [badge, *stacked.folded(words, width, 2)]
+    if width < narrow_screen.BELOW:
+        return [badge, *narrow_screen.folded(words, width, 2)]
     gap = " " * (badge.cell_len + 2)
     return [Text.assemble(badge, "  ", (first, "bold")), Text.assemble(gap, (second, "bold"))]
 
@@ -95,7 +95,7 @@ def _split(words: str, room: int) -> tuple[str, str]:
     return (words[:at], words[at + 1 :]) if at > 0 else (words[:room], words[room:])
 
 
-def _no_news(seen: Seen, width: int) -> list[Text]:
+def _no_news(seen: ScreenData, width: int) -> list[Text]:
     """Return a bar across the screen that marks the data below as old."""
     since = lasting(int(min(seen.age, 1e9)))
     words = f"NO NEWS FOR {since}: is the daemon running?"

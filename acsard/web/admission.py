@@ -18,13 +18,7 @@ from msgspec.structs import replace
 from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
-from acsard.web.counts import Counts
-from acsard.web.frames import MAX_BYTES
-from acsard.web.gate import Gate
-from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS, Buckets
-from acsard.web.routes import Route
-from acsard.web.tokens import Vault
-from acsard.web.who import (
+from acsard.web.callers import (
     MAINTAINER,
     Asked,
     Reason,
@@ -35,6 +29,12 @@ from acsard.web.who import (
     tokens_in,
     unmapped,
 )
+from acsard.web.counts import Counts
+from acsard.web.frames import MAX_BYTES
+from acsard.web.gate import Gate
+from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS, Buckets
+from acsard.web.routes import Route
+from acsard.web.tokens import Vault
 
 HOST = re.compile(r"([A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\])(:[0-9]{1,5})?")
 """Pattern of a valid `Host` header. It is strict because the value is copied into a response

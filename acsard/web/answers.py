@@ -6,9 +6,9 @@ import msgspec
 from aiohttp import web
 
 from acsard.core.values import AcsardError
+from acsard.web.callers import Reason
 from acsard.web.files import File
 from acsard.web.routes import JSON, Problem
-from acsard.web.who import Reason
 
 READ_S = 10.0
 """Time limit for reading from a disk."""

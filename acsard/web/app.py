@@ -27,6 +27,7 @@ from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi
 from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
+from acsard.web.callers import RefusedError, cookie_name
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
@@ -44,7 +45,6 @@ from acsard.web.settings import Setting, rows
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer
-from acsard.web.who import RefusedError, cookie_name
 
 BODY_S = 5.0
 """Time limit for a body of a few hundred bytes. A client that withholds its body occupies a

@@ -18,8 +18,8 @@ from acsard.daemon.bus.access import SERVICE_ROLES
 from acsard.daemon.bus.address import require_id
 from acsard.host.errors import MendableError, UsageError
 from acsard.host.threads import in_thread
+from acsard.web.callers import RefusedError, Who
 from acsard.web.robots import Robots
-from acsard.web.who import RefusedError, Who
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
 """Limits on concurrent requests of all viewers together. Stops have a separate limit; further stops

@@ -6,7 +6,7 @@ import threading
 from collections import Counter
 
 from acsard.core.values import Event
-from acsard.web.who import Reason
+from acsard.web.callers import Reason
 
 NAMED = 5
 """Number of origins that one log line names, starting with the most frequent."""

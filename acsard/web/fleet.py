@@ -19,8 +19,8 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.host import clock
 from acsard.host.threads import in_thread
 from acsard.web.robots import Robots
+from acsard.web.socket_messages import Row
 from acsard.web.streams import DECLARE_S, UNREADY
-from acsard.web.told import Row
 
 MOST = 200
 """Maximum number of robots. The bound is needed because any client of the bus can invent robot

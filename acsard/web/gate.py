@@ -15,9 +15,9 @@ from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
 from acsard.web.answers import HEADERS, problem
+from acsard.web.callers import unmapped
 from acsard.web.counts import Counts
 from acsard.web.limits import Places
-from acsard.web.who import unmapped
 
 SOCKETS, SOCKETS_OF_ONE = 256, 64
 """Maximum number of TCP connections per listening address, in all and from one client address. A

@@ -25,9 +25,9 @@ from acsard.host.errors import WORDS, Exit
 from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
 from acsard.web.calls import Ending
-from acsard.web.errands import Reach, words
 from acsard.web.frames import Begin, FrameError, Press, Reply
-from acsard.web.told import Ended, Guided, Running
+from acsard.web.jobs import Reach, words
+from acsard.web.socket_messages import Ended, Guided, Running
 
 ENDING_S = 1.0
 """Longest time that the answer to a STOP waits for the child to end."""

@@ -11,8 +11,8 @@ from acsard.host.errors import UsageError
 from acsard.web.frames import Subscribe, Unsubscribe
 from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 from acsard.web.robots import AGAIN_S, Robots
+from acsard.web.socket_sender import Following, Outgoing
 from acsard.web.streams import KEYS, UNREADY, Stream
-from acsard.web.to_browser import Following, Outgoing
 
 MOST = 32
 

@@ -10,7 +10,7 @@ from msgspec import Struct
 from acsard.daemon.bus.tls import names_in, require_usable
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
-from acsard.web.who import is_loopback
+from acsard.web.callers import is_loopback
 
 TRIES = 20
 """Number of ports that are tried, starting with the requested one."""

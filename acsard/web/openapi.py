@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.topics import IMU, PUBLISHED
-from acsard.web import lines, told
+from acsard.web import job_lines, socket_messages
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route
 
@@ -33,13 +33,13 @@ VALUE = "Value."
 GUIDED = "Guided"
 
 SENT = (
-    told.Hello, told.Way, told.LastMinute, told.Answer, told.Rows, told.Pong, told.Refused,
-    told.Gone,
+    socket_messages.Hello, socket_messages.Way, socket_messages.LastMinute, socket_messages.Answer,
+    socket_messages.Rows, socket_messages.Pong, socket_messages.Refused, socket_messages.Gone,
 )  # fmt: skip
 
 LINES = (
-    told.Running, told.Ended, lines.Subject, lines.Told, lines.Doing, lines.Progress,
-    lines.Question, lines.Found, lines.Result,
+    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobProgress,
+    job_lines.Doing, job_lines.Progress, job_lines.Question, job_lines.Found, job_lines.Result,
 )  # fmt: skip
 """Types of the content of `guide`."""
 
@@ -205,7 +205,7 @@ def _of_the_socket(refs: Refs) -> Described:
     guided = msgspec.defstruct(
         GUIDED,
         [("guide", _raw({"oneOf": [refs[kind] for kind in LINES]}))],
-        namespace={"__doc__": told.Guided.__doc__},
+        namespace={"__doc__": socket_messages.Guided.__doc__},
     )
     found, own = _components([guided])
     from_robot = [*(refs[kind] for kind in (*SENT, *VALUES)), own[guided]]

@@ -12,11 +12,11 @@ from msgspec import Meta, Struct
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.host.threads import in_thread
-from acsard.recording.closing import closing, how_it_ends
 from acsard.recording.directory import PART, STAMP, listed
+from acsard.recording.end_record import closing, how_it_ends
 from acsard.web.answers import READ_S, TroubleError
+from acsard.web.callers import RefusedError, is_loopback
 from acsard.web.robots import Robots
-from acsard.web.who import RefusedError, is_loopback
 
 
 class Recording(Struct, frozen=True):

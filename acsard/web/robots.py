@@ -25,7 +25,7 @@ from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
 from acsard.web.counts import Counts
-from acsard.web.minute import Minute, Plotted
+from acsard.web.last_minute import Minute, Plotted
 from acsard.web.streams import UNREADY, Stream, Streams
 
 LOOK_S = 0.1

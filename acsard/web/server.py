@@ -24,18 +24,18 @@ from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.logs import Log
 from acsard.host.processes import end_with_parent
 from acsard.web.app import Page
+from acsard.web.callers import is_loopback
 from acsard.web.calls import Calls
 from acsard.web.commands import SOURCE, Hand
 from acsard.web.counts import Counts
-from acsard.web.errands import Reach
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate, Reader
 from acsard.web.guide import Guide
+from acsard.web.jobs import Reach
 from acsard.web.listen import Listen, bound, own_name, require_certificate
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
-from acsard.web.who import is_loopback
 
 BEAT_S, TIDY_S, TELL_S = 0.5, 1.0, 1.0
 

@@ -21,7 +21,7 @@ from msgspec import Struct
 
 from acsard.core.values import Role
 from acsard.host.errors import NotPermittedError, UsageError
-from acsard.web.who import Who
+from acsard.web.callers import Who
 
 FILE, MODE = "tokens.json", 0o600
 

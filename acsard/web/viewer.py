@@ -19,7 +19,8 @@ from acsard.core.messages.signature import public_name
 from acsard.core.values import Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
-from acsard.web import told
+from acsard.web import socket_messages
+from acsard.web.callers import RefusedError, Who
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
@@ -41,8 +42,7 @@ from acsard.web.guide import Guide
 from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES, OVERRUNS, Bucket
 from acsard.web.robots import Robots
-from acsard.web.to_browser import Outgoing
-from acsard.web.who import RefusedError, Who
+from acsard.web.socket_sender import Outgoing
 
 HEARTBEAT_S = 10.0
 """Ping interval. The connection ends if the client has not answered after half of it."""
@@ -94,8 +94,8 @@ class Viewer:
     async def run(self) -> None:
         """Serve the connection until either side ends it."""
         self._greet()
-        self._out.say(told.Way(**self._robots.way()))
-        self._out.say(told.LastMinute(self._robots.minute()))
+        self._out.say(socket_messages.Way(**self._robots.way()))
+        self._out.say(socket_messages.LastMinute(self._robots.minute()))
         self._guide.join(self, self._out.say)
         pump = asyncio.create_task(self._out.pump(self._look_around))
         try:
@@ -161,7 +161,7 @@ class Viewer:
                 self._call(frame)
             case Ping():
                 now = clock.now().wall_ns / 1e6
-                self._out.say(told.Pong(frame.ping, now))
+                self._out.say(socket_messages.Pong(frame.ping, now))
             case Subscribe():
                 self._subscribe(frame)
             case Unsubscribe():
@@ -219,7 +219,7 @@ class Viewer:
         finally:
             if frame.call != "stop":
                 self._calling -= 1
-        self._out.say(told.Answer(frame.id, ok, text))
+        self._out.say(socket_messages.Answer(frame.id, ok, text))
 
     def _subscribe(self, frame: Subscribe) -> None:
         if frame.subscribe == FLEET:
@@ -240,28 +240,28 @@ class Viewer:
 
     def _greet(self) -> None:
         about = self._about = self._robots.about
-        greeting = told.Greeting(
+        greeting = socket_messages.Greeting(
             self._robots.id,
             about.version,
             self.who.role,
             self.sender,
-            told.Limits(about.linear, about.angular),
+            socket_messages.Limits(about.linear, about.angular),
             about.simulated,
             about.state_hz,
         )
-        self._out.say(told.Hello(greeting))
+        self._out.say(socket_messages.Hello(greeting))
 
     def _look_around(self, now: float) -> float:
         """Report changes of reachability, facts and fleet; return the time of the next look."""
         if self._robots.gone != self._gone:
             self._gone = self._robots.gone
             if self._gone:
-                self._out.say(told.Gone(self._gone))
+                self._out.say(socket_messages.Gone(self._gone))
         if self._robots.about is not self._about:
             self._greet()
         if self._fleet_due is not None and now >= self._fleet_due:
             self._fleet_due = now + FLEET_S
-            self._out.say(told.Rows(self._fleet.rows(), self._fleet.note))
+            self._out.say(socket_messages.Rows(self._fleet.rows(), self._fleet.note))
         return now + LOOK_S
 
     def _start(

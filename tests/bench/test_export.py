@@ -22,8 +22,8 @@ from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Inputs, Instant, Outputs, Recording
 from acsard.recording.file import About, Writing
+from acsard.recording.recorded_steps import Taken
 from acsard.recording.rows import encode
-from acsard.recording.steps import Taken
 from tests.scenarios.world import START, World
 from tests.system.harness import ROOT, finish
 

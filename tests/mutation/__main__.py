@@ -43,7 +43,7 @@ CORE = (
     "acsard/core/link/encoders.py",
     "acsard/core/link/codec.py",
     "acsard/core/link/negotiation.py",
-    "acsard/core/link/promptest.py",
+    "acsard/core/link/minimum_delay.py",
     "acsard/core/robot.py",
     "acsard/daemon/kept_latches.py",
 )

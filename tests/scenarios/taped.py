@@ -17,11 +17,11 @@ from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Fault
 from acsard.core.values import Inputs, Outputs, Recording
 from acsard.recording.file import About, Writing
+from acsard.recording.recorded_steps import Step, Taken
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode
 from acsard.recording.state import freeze, thaw
-from acsard.recording.steps import Step, Taken
-from acsard.recording.story import told
+from acsard.recording.timeline import told
 from tests.scenarios.world import START, World
 
 BATCH = 200

@@ -9,7 +9,7 @@ import pytest
 
 from acsard.core.config.settings import Config, OdometryConfig, SimConfig
 from acsard.core.messages.schema import DiagnosticArray
-from acsard.recording.steps import BlackBox
+from acsard.recording.recorded_steps import BlackBox
 from tests.scenarios.taped import Tape, replayed
 from tests.scenarios.world import World
 

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, FeedbackConfig, OdometryConfig, SimConfig
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus
 from acsard.core.simulator.faults import Fault
-from acsard.core.simulator.watched import WatchedMcu
+from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import NS_PER_S, WHEELS
 from tests.scenarios.world import World
 

@@ -17,19 +17,19 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.imu import OWN
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.link.codec import Codec
-from acsard.core.link.gate import Gate, Offered
+from acsard.core.link.line_gate import Gate, Offered
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Info, Message, Odometry, RobotState, ServiceReply
 from acsard.core.messages.signature import Signature
 from acsard.core.messages.topics import PUBLISHED
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.told import turn_rate
-from acsard.core.simulator.watched import Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
+from acsard.core.simulator.true_messages import turn_rate
 from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
 from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.kept_latches import LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
-from acsard.recording.steps import BlackBox
+from acsard.recording.recorded_steps import BlackBox
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
 

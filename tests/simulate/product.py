@@ -20,7 +20,7 @@ from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.encodings import encode as encode_message
-from acsard.core.simulator.watched import WatchedMcu
+from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
 from acsard.daemon.kept_latches import (

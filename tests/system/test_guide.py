@@ -14,8 +14,8 @@ from typing import Any, cast
 import aiohttp
 import pytest
 
-from acsard.asking.json_lines import HEARD_S
 from acsard.lan.authority import Authority
+from acsard.prompts.json_lines import HEARD_S
 from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost

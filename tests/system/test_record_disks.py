@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from acsard.core.config.settings import RecordConfig
-from acsard.recording.closing import closing
 from acsard.recording.directory import Ring, Run
 from acsard.recording.disk import HAPPENED
+from acsard.recording.end_record import closing
 from acsard.recording.file import About, Recording, Writing
 from acsard.recording.recovery import recover
 from acsard.web.recordings import rows

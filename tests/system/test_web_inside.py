@@ -22,14 +22,14 @@ from acsard.web.app import Page
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
-from acsard.web.errands import Reach
 from acsard.web.fleet import Fleet
 from acsard.web.gate import Gate
 from acsard.web.guide import Guide
+from acsard.web.jobs import Reach
 from acsard.web.limits import OVERRUNS
 from acsard.web.robots import About, Robots
 from acsard.web.server import Wanted, _until
-from acsard.web.to_browser import UNREAD_BYTES
+from acsard.web.socket_sender import UNREAD_BYTES
 from acsard.web.tokens import Vault
 from tests.system.browser import Hands, run
 from tests.system.harness import PATIENCE_S, Daemon, seconds

@@ -16,7 +16,7 @@ from msgspec import Struct
 from acsard.core.config.wire_time import FIELD
 from acsard.core.link.check import Reading
 from acsard.core.link.codec import Motors
-from acsard.core.link.promptest import Promptest
+from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.values import NS_PER_S
 
 SLACK_COUNTS = 4
@@ -63,7 +63,7 @@ class Encoders:
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
-        self._promptest = Promptest(DRIFT, LATEST_MS)
+        self._promptest = MinimumDelay(DRIFT, LATEST_MS)
         """The least delay of a reading, in ms."""
 
     def forget(self) -> None:

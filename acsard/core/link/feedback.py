@@ -21,11 +21,11 @@ from msgspec.structs import replace
 from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.core.link.check import Reading
-from acsard.core.link.clock_of_answers import Prompts
-from acsard.core.link.clock_of_reports import BRIDGED_S, Slots
 from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
-from acsard.core.link.habit import Habit
+from acsard.core.link.free_running_times import BRIDGED_S, Slots
+from acsard.core.link.prompted_times import Prompts
+from acsard.core.link.reply_style import ReplyStyle
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
@@ -69,7 +69,7 @@ class Feedback(Struct, frozen=True, gc=False):
     """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
 
 
-class Told(Struct, frozen=True, gc=False):
+class Placed(Struct, frozen=True, gc=False):
     """The place of a line on one of the clocks; `due_ns` is when it was due to be complete here."""
 
     clock: Literal["slots", "prompts", "reads"]
@@ -111,11 +111,11 @@ class Timeline:
         self._slots = Slots((*known, 1 / rate_hz))
         self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
         self._prompts = Prompts(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
-        self._habit = Habit(mcu.reply_period > 0)
+        self._habit = ReplyStyle(mcu.reply_period > 0)
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
-        self._told = Told("reads", 0)
+        self._told = Placed("reads", 0)
         """The place of the last good line."""
         self._later = 0.0
         """How much later a reply is due by its line than by the slots, mean in ns."""
@@ -212,7 +212,7 @@ class Timeline:
         since = 0.0 if silent else since
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
-    def _told_by(self, asked_ns: int | None, came_ns: int) -> Told:
+    def _told_by(self, asked_ns: int | None, came_ns: int) -> Placed:
         """Return the place of the next line on the best available clock."""
         speaks, slots = self._habit.speaks, self._slots
         if asked_ns is not None or not speaks:
@@ -224,8 +224,8 @@ class Timeline:
                     # The usual delay comes from a first reply that was read late, during a stall
                     # that the line before has already counted. This line's time is therefore its
                     # arrival.
-                    return Told("prompts", came_ns, early=True)
-                return Told("prompts", answered.due_ns, answered.dt, answered.bridged)
+                    return Placed("prompts", came_ns, early=True)
+                return Placed("prompts", answered.due_ns, answered.dt, answered.bridged)
         else:
             answered = None
         if slots.period is None:
@@ -235,16 +235,16 @@ class Timeline:
         if answered is not None:
             self._compare(answered.due_ns - slot_ns)
         if last.clock != "slots" or last.found != slots.found:
-            return Told("slots", due_ns, place=place, found=slots.found)
+            return Placed("slots", due_ns, place=place, found=slots.found)
         passed = place - last.place if place > last.place else 0.0
         missing = passed - 1.0 if passed > 1.0 else 0.0
         dt, bridged = passed * slots.period, missing * slots.period
-        return Told("slots", due_ns, dt, bridged, place, slots.found)
+        return Placed("slots", due_ns, dt, bridged, place, slots.found)
 
-    def _told_by_reads(self) -> Told:
-        return Told("reads", int(self._end_ns - self._share_ns * self._rest))
+    def _told_by_reads(self) -> Placed:
+        return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
-    def _since_last(self, told: Told) -> tuple[float, float]:
+    def _since_last(self, told: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it that no line reported, s.
 
         If different clocks placed the two lines, the host times of both decide, so changes of the
@@ -280,7 +280,7 @@ class Timeline:
     def _usual_ns(self) -> float:
         return self._slots.usual or self._period_ns
 
-    def _sampled(self, came_ns: int, told: Told, length: int) -> Instant:
+    def _sampled(self, came_ns: int, told: Placed, length: int) -> Instant:
         """Return when the sample of a line was taken: before its own bytes were on the wire."""
         mono_ns = min(came_ns, told.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at

@@ -13,20 +13,20 @@ from collections import Counter
 
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import FeedbackConfig, McuConfig
-from acsard.core.link import link_words
+from acsard.core.link import link_text
 from acsard.core.link.check import Reading, unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.contract import WATCHDOG_S
 from acsard.core.link.echo import EchoDetector
 from acsard.core.link.feedback import Feedback, Timeline
-from acsard.core.link.hearing import Hearing
+from acsard.core.link.host_stalls import Lateness
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_state import Link
 from acsard.core.link.link_state import State as LinkState
 from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
-from acsard.core.link.snapping import Snapping
+from acsard.core.link.quantization import Snapping
+from acsard.core.link.silence_diagnosis import SilenceDiagnosis
 from acsard.core.link.throttle import Throttle
-from acsard.core.link.whose_silence import Lateness
 from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
 NAMES: dict[LinkState, EventName] = {
@@ -75,7 +75,7 @@ class McuSession:
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
         self._echo = EchoDetector()
         self.snapping = Snapping()
-        self._hearing = Hearing()
+        self._hearing = SilenceDiagnosis()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
         self._rejected: dict[str, tuple[int, bytes]] = {}
@@ -180,9 +180,9 @@ class McuSession:
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
-            return link_words.BLOCKED
+            return link_text.BLOCKED
         heard, late = self._hearing, self.lateness
-        return link_words.words(self._link, self.negotiation, heard, late, self._longest_reply)
+        return link_text.words(self._link, self.negotiation, heard, late, self._longest_reply)
 
     @property
     def note(self) -> str:
@@ -281,12 +281,12 @@ class McuSession:
         if self._announced == before:
             return
         if link != before[0] or self.blocked > before[3]:
-            plain = not (self.blocked or link_words.damaged(self._link, check))
+            plain = not (self.blocked or link_text.damaged(self._link, check))
             text = self.lateness.words(link) if plain else self.words()
             good = link in ("up", "booting") and not self.blocked
             self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:
-            self.events.append(link_words.check_event(check, self._wants_samples))
+            self.events.append(link_text.check_event(check, self._wants_samples))
         if check.trouble and not before[2]:
             self.events.append(Event("link_check", MENDS[check.trouble], "error"))
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.link.lattice import FINEST, ROUNDING, Lattice, Search, on
-from acsard.core.link.steps import FLICKER, Steps
+from acsard.core.link.encoder_steps import FLICKER, Steps
+from acsard.core.link.quantization_step import FINEST, ROUNDING, Quantization, Search, on
 
 LEARNED_FROM = 100
 """Changes of a wheel's speed before a lattice is searched."""
@@ -37,7 +37,7 @@ class WheelCounter:
         self.quantum = self.angle = 0.0
         """One count in a period, as a speed in rad/s and as an angle in rad."""
         self.steps = Steps()
-        self.lattice: Lattice | None = None
+        self.lattice: Quantization | None = None
         self._search: Search | None = None
         self._told: dict[float, int] | None = {}
         """How often each speed was reported before the counts were known, forward minus backward.
@@ -121,6 +121,6 @@ class WheelCounter:
         if counts:
             self.counts, self.angle = counts, math.tau / counts
             self.quantum = self.angle / period
-            self.lattice = Lattice(self.quantum, 0.0)
+            self.lattice = Quantization(self.quantum, 0.0)
             self._search, self.off = None, 0
         return self.counts > 0

@@ -14,9 +14,9 @@ from msgspec import Struct
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_use
 from acsard.core.messages.schema import DiagnosticArray, DiagnosticStatus, Header, KeyValue, Time
+from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.gyro import WORDS
 from acsard.core.motion.learned_track import tracks
-from acsard.core.motion.words import waiting
 from acsard.core.values import (
     WHEELS,
     GyroStatus,

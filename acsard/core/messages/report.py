@@ -14,7 +14,7 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.covariances import UNKNOWN, Covariances
 from acsard.core.messages.diagnostics import diagnostics
 from acsard.core.messages.expiry import expiry
-from acsard.core.messages.happened import Happened
+from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     DiagnosticArray,
     Figure,
@@ -37,8 +37,8 @@ from acsard.core.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
+from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.learned_track import tracks
-from acsard.core.motion.words import waiting
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -87,7 +87,7 @@ class Report:
         self._start = start
         self._estimate: Estimate | None = None
         self._outputs: Outputs | None = None
-        self._happened = Happened()
+        self._happened = RecentEvents()
         self.use(config)
 
     def use(self, config: Config) -> None:

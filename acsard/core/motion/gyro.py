@@ -21,7 +21,7 @@ from typing import Protocol
 
 from msgspec import Struct
 
-from acsard.core.link.promptest import Promptest
+from acsard.core.link.minimum_delay import MinimumDelay
 from acsard.core.motion.gyro_bias import KNOWN_S, Bias
 from acsard.core.motion.gyro_match import WINDOW_S, Match
 from acsard.core.motion.gyro_trial import PROPORTIONS, Trial
@@ -119,7 +119,7 @@ class Gyro:
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples later than the last line."""
-        self._promptest = Promptest(DRIFT)
+        self._promptest = MinimumDelay(DRIFT)
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
@@ -225,7 +225,7 @@ class Gyro:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
         if late > LATEST_NS:
-            self._promptest = Promptest(DRIFT)
+            self._promptest = MinimumDelay(DRIFT)
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
 

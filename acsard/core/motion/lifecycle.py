@@ -19,8 +19,8 @@ import math
 
 from msgspec.structs import replace
 
-from acsard.core.motion.dates import utc
 from acsard.core.motion.modes import LEAVING, Mode, RefusedError, mode_of, require_allowed
+from acsard.core.motion.utc_text import utc
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0

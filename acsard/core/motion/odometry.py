@@ -21,16 +21,16 @@ from itertools import takewhile
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.bridging import NOWHERE, Rolled, Rolling, Step, count_of, plus
+from acsard.core.motion.gap_filling import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.core.motion.gap_variance import Gaps
 from acsard.core.motion.gyro import Heading, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import Track
-from acsard.core.motion.lying_wheels.verdict import Witness
 from acsard.core.motion.noise import columns, in_use
 from acsard.core.motion.path import Path
 from acsard.core.motion.twist_uncertainty import TwistUncertainty
 from acsard.core.motion.uncertainty import COARSE_COUNTS, PoseUncertainty
+from acsard.core.motion.wheel_faults.verdict import Witness
 from acsard.core.values import (
     REST,
     STILL,

@@ -41,7 +41,7 @@ class Log(Struct, frozen=True):
 
 
 NUMBERED = re.compile(r"\d+ (x|times)\b")
-"""Start of a text that `core/motion/tally.py` has combined from several events."""
+"""Start of a text that `core/motion/event_throttle.py` has combined from several events."""
 
 LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""

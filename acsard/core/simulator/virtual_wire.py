@@ -6,8 +6,8 @@ garbles both directions.
 
 from __future__ import annotations
 
+from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.garble import garbled
 
 Piece = tuple[int, bytes]
 

@@ -18,7 +18,7 @@ from types import TracebackType
 import serial
 import serial_asyncio
 
-from acsard.core.link.gate import Gate, Offered
+from acsard.core.link.line_gate import Gate, Offered
 from acsard.core.values import Event, Instant, Received
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, unsent
 from acsard.host import clock

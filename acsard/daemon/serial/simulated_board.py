@@ -21,10 +21,10 @@ from acsard.core.config.settings import Baud, Config
 from acsard.core.incoming.bus_interface import Bus
 from acsard.core.messages.schema import Message
 from acsard.core.messages.topics import IMU
+from acsard.core.simulator.baud_mismatch import garbled
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.core.simulator.garble import garbled
-from acsard.core.simulator.told import true_pose, turn_rate
-from acsard.core.simulator.watched import Sight, WatchedMcu
+from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
+from acsard.core.simulator.true_messages import true_pose, turn_rate
 from acsard.core.values import NS_PER_S
 from acsard.daemon.serial.device import unlock
 from acsard.host import clock

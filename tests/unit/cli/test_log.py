@@ -20,8 +20,8 @@ from acsard.core.values import Event
 from acsard.host.errors import Exit
 from acsard.recording.directory import Ring
 from acsard.recording.file import Recording, Writing
+from acsard.recording.recorded_steps import Taken, Unfinished
 from acsard.recording.recovery import recover
-from acsard.recording.steps import Taken, Unfinished
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 

@@ -14,8 +14,8 @@ import pytest
 
 from acsard.cli import main
 from acsard.recording.file import Recording
+from acsard.recording.recorded_steps import MICRO
 from acsard.recording.replayed import steps
-from acsard.recording.steps import MICRO
 from tests.scenarios.taped import chunks
 from tests.unit.report.seen import column
 

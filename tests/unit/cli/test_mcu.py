@@ -18,7 +18,6 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from acsard.asking.person import Person, ended_by_signals
 from acsard.checkup import procedure
 from acsard.cli import mcu
 from acsard.cli.exits import code_of
@@ -27,6 +26,7 @@ from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
+from acsard.prompts.check_prompts import Person, ended_by_signals
 from tests.unit.checkup.robots import Busy, Robot
 
 

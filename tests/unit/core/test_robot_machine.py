@@ -32,9 +32,9 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.guard import Guard
-from acsard.core.link.clock_of_reports import BRIDGED_S
+from acsard.core.link.free_running_times import BRIDGED_S
+from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.odometry import TAKEN_BACK
-from acsard.core.motion.words import waiting
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.daemon.daemon import _recorder
 from acsard.recording import recorder
-from acsard.recording.closing import closing
+from acsard.recording.end_record import closing
 from tests.scenarios.world import World
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.recording.room import AROUND_NS, Around, Kind
+from acsard.recording.retention import AROUND_NS, Around, Kind
 
 
 def kind(around: Around[str]) -> Kind:

@@ -24,7 +24,7 @@ from acsard.recording.chunks import (
     content,
     places,
 )
-from acsard.recording.walk import MAGIC, walk
+from acsard.recording.mcap_records import MAGIC, walk
 
 DICE = random.Random(1)
 

@@ -12,7 +12,6 @@ from msgspec.structs import replace
 from acsard.core.config.settings import RecordConfig
 from acsard.core.values import NS_PER_S, Instant
 from acsard.recording import directory
-from acsard.recording.closing import closing
 from acsard.recording.directory import (
     DIRECTORY_MODE,
     KEPT,
@@ -23,8 +22,9 @@ from acsard.recording.directory import (
     Run,
     listed,
 )
+from acsard.recording.end_record import closing
 from acsard.recording.file import About, Recording, Writing
-from acsard.recording.room import KEPT_FILES, STEADY_NS, Kind
+from acsard.recording.retention import KEPT_FILES, STEADY_NS, Kind
 
 DAY_NS = 86_400_000_000_000
 NOW_NS = 1_800_000_000_000_000_000

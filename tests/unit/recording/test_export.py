@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from acsard.core.config.settings import Config
 from acsard.core.ros.channels import CHANNELS
 from acsard.host.errors import RecordingError
-from acsard.recording.beside import beside
+from acsard.recording.atomic_output import beside
 from acsard.recording.export import Kind, Span, export, measured
 from acsard.recording.file import Recording
 from tests.scenarios.taped import Tape, chunks

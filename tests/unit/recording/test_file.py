@@ -18,11 +18,11 @@ from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.errors import RecordingError
-from acsard.recording.closing import Closing, closing
+from acsard.recording.end_record import EndRecord, closing
 from acsard.recording.file import CHUNK_BYTES, MODE, About, Recording, Writing, rewrite
+from acsard.recording.recorded_steps import status_of
 from acsard.recording.replayed import config_of, live, steps
 from acsard.recording.rows import encode
-from acsard.recording.steps import status_of
 from tests.scenarios.taped import BATCH, Tape, chunks
 from tests.scenarios.world import World
 
@@ -368,7 +368,7 @@ def test_a_finished_file_says_at_its_end_what_happened(
     assert closing(cut) is None
     rewrite(Recording(cut), new)
     assert closing(new) == replace(said, cut="open")
-    assert said == Closing(said.wall_ns, said.last_ns, said.said)
+    assert said == EndRecord(said.wall_ns, said.last_ns, said.said)
     rewrite(Recording(new), tmp_path / "again.mcap", "crash")
     assert closing(tmp_path / "again.mcap") == closing(new), "it was finished before"
     assert closing(tmp_path / "none") is None

@@ -20,18 +20,18 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.incoming.commands import Arrival
-from acsard.core.link.gate import Offered
+from acsard.core.link.line_gate import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
-from acsard.recording import disk, room
+from acsard.recording import disk, retention
 from acsard.recording import recorder as module
-from acsard.recording.closing import closing, how_it_ends
 from acsard.recording.directory import KEPT, Ring, listed
+from acsard.recording.end_record import closing, how_it_ends
 from acsard.recording.export import export
 from acsard.recording.file import About, Recording, Writing, rewrite
+from acsard.recording.recorded_steps import unfinished
 from acsard.recording.recorder import MOST, Recorder
 from acsard.recording.replayed import live, steps
-from acsard.recording.steps import unfinished
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -195,7 +195,7 @@ def test_the_minute_before_and_after_what_happened_is_kept(
 ) -> None:
     minute = 6  # one tenth of a minute in s, to save time
     monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
-    monkeypatch.setattr(room, "AROUND_NS", minute * 10**9)
+    monkeypatch.setattr(retention, "AROUND_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.bus.wanted = set()
 
@@ -427,7 +427,7 @@ def test_a_clock_that_is_set_costs_no_recording(
     It gets the time only while it drives.
     """
     monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
-    monkeypatch.setattr(room, "AROUND_NS", 0)
+    monkeypatch.setattr(retention, "AROUND_NS", 0)
     seen = set[str]()
 
     def there() -> set[str]:

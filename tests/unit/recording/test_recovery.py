@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
 from acsard.recording.chunks import GROWING, LAST_BLOCK
-from acsard.recording.closing import closing
+from acsard.recording.end_record import closing
 from acsard.recording.file import Recording
 from acsard.recording.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks

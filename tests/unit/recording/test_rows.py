@@ -29,8 +29,8 @@ from acsard.core.values import (
     Request,
     Twist,
 )
+from acsard.recording.recorded_steps import Taken, microposes, status_of
 from acsard.recording.rows import MOST_ROWS, Batch, BatchError, Rare, decode, encode, first_of
-from acsard.recording.steps import Taken, microposes, status_of
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
 

@@ -11,7 +11,7 @@ import pytest
 
 from acsard.core.config.settings import Config
 from acsard.core.guard import Memory
-from acsard.core.link.lattice import Search
+from acsard.core.link.quantization_step import Search
 from acsard.core.motion.freshness import Freshness
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, REST, Command, Instant

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from acsard.core.config.settings import Config
+from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import Replay
-from acsard.recording.steps import Step
 from acsard.report.course import Course
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from acsard.recording.steps import MICRO
+from acsard.recording.recorded_steps import MICRO
 from acsard.report.course import FIRST, LAST, Lateness, Link, Mark, Marks
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import course_of, drive_of_two, followed

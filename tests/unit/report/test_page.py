@@ -12,7 +12,7 @@ from html.parser import HTMLParser
 import pytest
 
 from acsard.core.values import Command, Event, Refusal, Twist
-from acsard.recording.steps import Step
+from acsard.recording.recorded_steps import Step
 from acsard.report.account import Origin
 from acsard.report.course import Course, Mark
 from acsard.report.page import MOST_OPEN, escaped, page

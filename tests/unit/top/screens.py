@@ -9,7 +9,7 @@ from rich.console import Console
 
 from acsard.core.messages.schema import Figure, Info, RobotState, SourceState, Spread, Time
 from acsard.daemon.latencies import NAMES
-from acsard.top.seen import Seen
+from acsard.top.screen_data import ScreenData
 from acsard.top.view import screen
 
 MEASURED = Figure(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
@@ -42,10 +42,12 @@ BEFORE = replace(
     counters={"lines": 1200, "lines_sent": 1201, "commands": 200, "missed_periods": 3},
 )
 INFO = Info("acsar", "0.1.0", 7, "/dev/acsar", False, 100.0, [], [])
-SEEN = Seen("acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leaves", passed=1.05)
+SEEN = ScreenData(
+    "acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leaves", passed=1.05
+)
 
 
-def lines_of(seen: Seen, width: int = 80, height: int | None = 24) -> list[str]:
+def lines_of(seen: ScreenData, width: int = 80, height: int | None = 24) -> list[str]:
     """Return the lines of the screen as a person reads them."""
     console = Console(width=width, file=io.StringIO(), color_system=None)
     with console.capture() as captured:
@@ -53,7 +55,7 @@ def lines_of(seen: Seen, width: int = 80, height: int | None = 24) -> list[str]:
     return captured.get().rstrip("\n").split("\n")
 
 
-def painted(seen: Seen, width: int = 80, height: int | None = 24) -> str:
+def painted(seen: ScreenData, width: int = 80, height: int | None = 24) -> str:
     """Return the screen as it is sent to a terminal."""
     console = Console(
         width=width, file=io.StringIO(), force_terminal=True, color_system="256", _environ={}
@@ -63,12 +65,12 @@ def painted(seen: Seen, width: int = 80, height: int | None = 24) -> str:
     return captured.get()
 
 
-def line_with(text: str, seen: Seen = SEEN, width: int = 80) -> str:
+def line_with(text: str, seen: ScreenData = SEEN, width: int = 80) -> str:
     found = [line for line in lines_of(seen, width) if text in line]
     assert len(found) == 1, (text, found)
     return found[0]
 
 
-def of(**changes: object) -> Seen:
+def of(**changes: object) -> ScreenData:
     """Return the usual screen with another state."""
     return replace(SEEN, state=replace(STATE, **changes))

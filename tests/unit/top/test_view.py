@@ -13,7 +13,7 @@ from rich.cells import cell_len
 from acsard.core.messages.schema import Figure, RobotState, SourceState, Spread, Time
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
-from acsard.top.seen import MODES, Seen
+from acsard.top.screen_data import MODES, ScreenData
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
 ENOUGH = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"
@@ -67,7 +67,7 @@ def test_a_long_reason_goes_on_below_and_moves_nothing() -> None:
 
 
 def test_before_the_first_state_it_says_what_it_waits_for() -> None:
-    assert lines_of(Seen("acsar", "tcp/x:1", None))[1] == "waiting for the first state"
+    assert lines_of(ScreenData("acsar", "tcp/x:1", None))[1] == "waiting for the first state"
 
 
 @pytest.mark.parametrize("state", [STATE, None])
@@ -128,7 +128,7 @@ def test_a_larger_one_has_air_between_its_parts() -> None:
 
 def test_a_hostile_text_changes_nothing_but_its_own_place() -> None:
     source = SourceState(ENOUGH, 1, 0.0, ENOUGH)
-    hostile = Seen(
+    hostile = ScreenData(
         ENOUGH,
         ENOUGH,
         replace(
@@ -188,7 +188,7 @@ def test_any_state_fits_any_terminal_and_is_harmless_there(
     width: int,
     height: int,
 ) -> None:
-    seen = Seen(robot_id, endpoint, state, before, age, INFO, 0, "q leaves")
+    seen = ScreenData(robot_id, endpoint, state, before, age, INFO, 0, "q leaves")
     told = lines_of(seen, width, height)
     assert len(told) <= height
     assert max(map(cell_len, told)) <= width

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from acsard.client import Client
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import ServiceReply
+from acsard.web.callers import MAINTAINER, RefusedError
 from acsard.web.calls import (
     ELSEWHERE_AT_ONCE,
     STOPS_AT_ONCE,
@@ -20,7 +21,6 @@ from acsard.web.calls import (
     Ending,
     Stops,
 )
-from acsard.web.who import MAINTAINER, RefusedError
 from tests.unit.web.test_fleet import quiet, robots
 
 PATIENCE_S = 20.0

@@ -17,7 +17,7 @@ from acsard.daemon.bus.address import Address
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
 from acsard.web.robots import About, Robots
-from acsard.web.told import Row
+from acsard.web.socket_messages import Row
 from tests.unit.web.test_metrics import STATE
 
 PATIENCE_S = 20.0

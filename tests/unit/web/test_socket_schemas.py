@@ -13,39 +13,39 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
-from acsard.web import lines, told
-from acsard.web.minute import Minute
+from acsard.web import job_lines, socket_messages
+from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, LINES, SENT, VALUE
+from acsard.web.socket_sender import Following
 from acsard.web.streams import KEYS as FOLLOWED
-from acsard.web.to_browser import Following
 from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
-GREETING = told.Greeting(
-    "acsar", "1", "operator", "phone/1f", told.Limits(1.0, 4.0), True, 10.0
+GREETING = socket_messages.Greeting(
+    "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0
 )  # fmt: skip
 
 SAID: tuple[Struct, ...] = (
-    told.Hello(GREETING),
-    told.Way([(0.0, 1.5)], []),
-    told.LastMinute(Minute().plotted(0)),
-    told.Answer(7, True, "stopped"),
-    told.Rows([told.Row("acsar", None, "", None, "", None, "")], ""),
-    told.Pong(12.5, 1e12),
-    told.Refused("cmd", "why"),
-    told.Gone("why"),
+    socket_messages.Hello(GREETING),
+    socket_messages.Way([(0.0, 1.5)], []),
+    socket_messages.LastMinute(Minute().plotted(0)),
+    socket_messages.Answer(7, True, "stopped"),
+    socket_messages.Rows([socket_messages.Row("acsar", None, "", None, "", None, "")], ""),
+    socket_messages.Pong(12.5, 1e12),
+    socket_messages.Refused("cmd", "why"),
+    socket_messages.Gone("why"),
 )
 
 GUIDED: tuple[Struct, ...] = (
-    told.Running("check", "here", True),
-    told.Ended(0, "success", ""),
-    lines.Subject("port sim", True),
-    lines.Told("so"),
-    lines.Doing("so"),
-    lines.Progress(0.5),
-    lines.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    lines.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
-    lines.Result("all"),
+    socket_messages.Running("check", "here", True),
+    socket_messages.Ended(0, "success", ""),
+    job_lines.Subject("port sim", True),
+    job_lines.JobProgress("so"),
+    job_lines.Doing("so"),
+    job_lines.Progress(0.5),
+    job_lines.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
+    job_lines.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    job_lines.Result("all"),
 )
 
 
@@ -82,7 +82,7 @@ def test_there_is_an_example_of_each() -> None:
 
 @pytest.mark.parametrize("role", get_args(Role))
 def test_each_role_may_be_greeted_and_no_other(role: Role) -> None:
-    hello = as_told(told.Hello(msgspec.structs.replace(GREETING, role=role)))
+    hello = as_told(socket_messages.Hello(msgspec.structs.replace(GREETING, role=role)))
     assert taken(hello)
     assert not taken({"hello": hello["hello"] | {"role": "king"}})
 

@@ -17,7 +17,7 @@ from acsard.core.config.settings import FeedbackConfig, WheelMap
 from acsard.core.link.codec import Codec, FrameError, Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.lines import LineReader
-from acsard.core.link.snapping import Snapping
+from acsard.core.link.quantization import Snapping
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import STILL, Instant, WheelSpeeds
 

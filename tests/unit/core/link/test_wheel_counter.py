@@ -8,7 +8,7 @@ import random
 import pytest
 
 from acsard.core.link import wheel_counter
-from acsard.core.link.lattice import STEEP, Search
+from acsard.core.link.quantization_step import STEEP, Search
 from acsard.core.link.wheel_counter import LEARNED_FROM, MOST_TOLD, OWED_FOR, WheelCounter
 
 PERIOD = 0.01

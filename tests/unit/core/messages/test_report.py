@@ -43,8 +43,8 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.topics import PUBLISHED
+from acsard.core.motion.command_events import missed
 from acsard.core.motion.gyro import WORDS
-from acsard.core.motion.told import missed
 from acsard.core.values import (
     Estimate,
     Event,

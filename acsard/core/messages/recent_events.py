@@ -1,0 +1,69 @@
+"""The last events for the topic `events`.
+
+An event that repeats is one row with a count. A machine that misses a period every second would
+otherwise push a fault out of the twenty rows within 20 s. An event that brings news keeps a row of
+its own. The log has a line for each event.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from msgspec import Struct
+
+from acsard.core.messages.schema import Events, Happening, Time
+from acsard.core.motion.event_throttle import together
+from acsard.core.values import NS_PER_S, Event, Instant
+
+LAST = 20
+"""Number of rows: more events than usually happen between two looks of a slow reader."""
+
+PAUSE_NS = 60 * NS_PER_S
+"""Pause without a repetition after which the next event of the same name gets a new row."""
+
+
+class _Row(Struct, frozen=True):
+    at: Instant
+    event: Event
+
+
+class RecentEvents:
+    """The last rows, oldest first. A row whose event repeats moves to the end."""
+
+    def __init__(self) -> None:
+        self._rows: deque[_Row] = deque(maxlen=LAST)
+        self._total = 0
+
+    def add(self, events: Iterable[Event], now: Instant) -> None:
+        """Add events that have just been reported."""
+        for event in events:
+            self._total += 1
+            same = None if event.news else self._same(event, now)
+            if same is not None:
+                self._rows.remove(same)
+                event = together(same.event, event)
+            self._rows.append(_Row(now, event))
+
+    def told(self) -> Events | None:
+        """Return the message with all rows, or None before the first event."""
+        if not self._rows:
+            return None
+        return Events(_time(self._rows[-1]), self._total, [_happening(row) for row in self._rows])
+
+    def _same(self, event: Event, now: Instant) -> _Row | None:
+        """Return the row that this event repeats, or None."""
+        since_ns = now.mono_ns - PAUSE_NS
+        for row in self._rows:
+            if row.event.name == event.name and not row.event.news and row.at.mono_ns >= since_ns:
+                return row
+        return None
+
+
+def _time(row: _Row) -> Time:
+    return Time.from_ns(row.at.wall_ns)
+
+
+def _happening(row: _Row) -> Happening:
+    one = row.event
+    return Happening(_time(row), one.name, one.level, one.text, one.by, one.count)

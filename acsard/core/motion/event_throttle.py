@@ -1,0 +1,101 @@
+"""Throttles events into log lines: repeated events become one line per second with their number.
+
+A few lines of one name may come at once, and then one per second. The events in between are counted
+and reported with the next line. So neither a client that floods the bus nor a wire that flaps can
+flood the log.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from typing import get_args
+
+from acsard.core.values import NS_PER_S, Event, EventName, Level
+
+BURST = 5
+"""Lines of one name that may come at once: as fast as people press buttons."""
+
+MOST = 8
+"""Kinds and names that one line distinguishes. A stranger may send under any number of them."""
+
+LEVELS: tuple[Level, ...] = get_args(Level)
+
+
+class _Held:
+    """Events of one name that wait for their line."""
+
+    def __init__(self) -> None:
+        self.count, self.news, self._level = 0, False, 0
+        self._kinds: Counter[str] = Counter()
+        self._by: Counter[str] = Counter()
+
+    def add(self, event: Event) -> None:
+        self.last = event
+        self.count += event.count
+        self.news = self.news or event.news
+        self._level = max(self._level, LEVELS.index(event.level))
+        _count(self._kinds, event.kind, event.count)
+        _count(self._by, event.by, event.count)
+
+    def line(self) -> Event:
+        """Return all of them as one event, with the worst level and the text of the last."""
+        last, what = self.last, _numbered(self._kinds)
+        if self.count > last.count and last.text:
+            what = f"{what or f'{self.count} times'}; the last"
+        text = ": ".join(part for part in (what, last.text) if part)
+        level, by = LEVELS[self._level], ", ".join(self._by)
+        return Event(last.name, text, level, by, count=self.count, news=self.news)
+
+
+class EventThrottle:
+    """The waiting events, and when each name may have its next line."""
+
+    def __init__(self) -> None:
+        self._held: dict[EventName, _Held] = {}
+        self._free_ns: dict[EventName, int] = {}
+        """Time at which the lines of a name so far are paid for, at a second each."""
+
+    def lines(self, events: list[Event], now_ns: int) -> tuple[Event, ...]:
+        """Take events; return the lines to write now, from these and from those that waited."""
+        if not (events or self._held):
+            return ()
+        for event in events:
+            self._held.setdefault(event.name, _Held()).add(event)
+        told = [name for name, held in self._held.items() if self._may(name, held.news, now_ns)]
+        return tuple([self._held.pop(name).line() for name in told])
+
+    def _may(self, name: EventName, news: bool, now_ns: int) -> bool:
+        """Return whether a line of this name may be written now, and if so charge it."""
+        free_ns = self._free_ns.get(name, now_ns)
+        if free_ns > now_ns + (BURST - 1 if news else 0) * NS_PER_S:
+            return False
+        self._free_ns[name] = max(free_ns, now_ns) + NS_PER_S
+        return True
+
+
+NUMBERED = re.compile(r"\A\d+ (?:x [^:;]*|times)(?:; the last)?: ")
+"""The start of a line that combines several events."""
+
+
+def together(before: Event, line: Event) -> Event:
+    """Return two lines of one name as one, with the total number and the text of the last."""
+    count, last = before.count + line.count, NUMBERED.sub("", line.text, count=1)
+    level = max(before.level, line.level, key=LEVELS.index)
+    names = dict.fromkeys(filter(None, [*before.by.split(", "), *line.by.split(", ")]))
+    by = [name for name in names if name != "others"]
+    more = ["others"] if len(by) > MOST or "others" in names else []
+    text = f"{count} times; the last: {last}"
+    return Event(line.name, text, level, ", ".join(by[:MOST] + more), count=count, news=False)
+
+
+def _count(counts: Counter[str], what: str, times: int) -> None:
+    if what:
+        counts[what if what in counts or len(counts) < MOST else "others"] += times
+
+
+def _numbered(counts: Counter[str]) -> str:
+    """Return a text like `12 x stale, 1 x not_finite`; a single event has no number."""
+    if counts.total() == 1:
+        return next(iter(counts))
+    return ", ".join(f"{times} x {what}" for what, times in counts.most_common())

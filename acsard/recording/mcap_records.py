@@ -1,0 +1,120 @@
+"""Yields the records of an MCAP file one after the other, and skips damaged places.
+
+If a chunk is damaged, or a record's length leads nowhere, the reader takes the chunk's first
+messages as far as they are whole, and searches for the next complete chunk.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metadata
+
+from acsard.recording.chunks import Content, Message, content, places
+from acsard.recording.end_record import DAMAGE
+
+MAGIC = b"\x89MCAP0\r\n"
+"""Magic bytes at the start of every MCAP file."""
+
+HEAD = struct.Struct("<BQ")
+"""Head of a record: its opcode and the number of bytes after the head."""
+
+READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.DATA_END: DataEnd.read,
+    Opcode.FOOTER: Footer.read,
+    Opcode.HEADER: Header.read,
+    Opcode.METADATA: Metadata.read,
+}
+"""Readers of the records that are used here, besides chunks. All other records are skipped."""
+
+OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
+
+
+class Found(NamedTuple):
+    """A record that is used, or a damaged place."""
+
+    record: McapRecord | None
+    """The record; None for a chunk and for damage."""
+    chunk: Content | None
+    """The chunk, as far as it is whole, or None."""
+    end: int
+    """Offset of the record's end in the file, bytes. After damage, reading goes on there."""
+    damaged: bool = False
+    """True for damage before other records. The end of a file that was cut is not damage."""
+
+    @property
+    def messages(self) -> list[Message]:
+        """Messages of the chunk; empty for other records."""
+        return self.chunk.messages if self.chunk else []
+
+
+def walk(data: bytes) -> Iterator[Found]:
+    """Yield the records up to the footer, or to the end of the data."""
+    at, stream, later = len(MAGIC), io.BytesIO(data), _Later(data)
+    if not data.startswith(MAGIC):
+        return
+    while at + HEAD.size <= len(data):
+        opcode, length = HEAD.unpack_from(data, at)
+        claimed = at + HEAD.size + length
+        chunk = content(data, at)
+        found = _read(stream, at, opcode, claimed, len(data)) if chunk is None else None
+        if chunk is not None and chunk.complete:
+            found = Found(None, chunk, chunk.end)
+        elif found is None and opcode in OTHERS and claimed <= len(data):
+            at = claimed
+            continue
+        if found is None:
+            after = later.chunk(at + 1)
+            cut = after is None and (not opcode or claimed > len(data))
+            found = Found(None, chunk, len(data) if cut else after or claimed, not cut)
+        yield found
+        if isinstance(found.record, Footer):
+            return
+        at = found.end
+
+
+def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
+    """Return the record that begins at `at`; None if it is not one of `READ`, or is cut off."""
+    read = READ.get(opcode)
+    if read is None:
+        return None
+    stream.seek(at + HEAD.size)
+    try:
+        record = read(ReadDataStream(stream))
+    except DAMAGE:
+        return None
+    end = stream.tell()
+    return Found(record, None, end) if end < size or end == claimed else None
+
+
+class _Later:
+    """Search for the next complete chunk. No place is searched twice."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._searched = 0
+        """Offset up to which no complete chunk begins, apart from those that were passed."""
+        self._found: int | None = None
+
+    def chunk(self, begin: int) -> int | None:
+        """Return the offset of the next complete chunk from `begin` on, or None.
+
+        `begin` never decreases.
+        """
+        if self._found is not None and self._found >= begin:
+            return self._found
+        self._found = None
+        for at in places(self._data, max(begin, self._searched)):
+            self._searched = at + 1
+            chunk = content(self._data, at)
+            if chunk is not None and chunk.complete and chunk.messages:
+                self._found = at
+                return at
+        self._searched = len(self._data)
+        return None

@@ -1,0 +1,137 @@
+"""The parts of a narrow screen: the same figures as on a wide one, but below each other.
+
+This module is pure. Continued lines are indented. The figures since the start come last, because a
+screen with few lines cuts them off.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from textwrap import wrap
+
+from rich.cells import cell_len
+from rich.text import Text
+
+from acsard.core.formatting import rough, signed
+from acsard.core.messages.schema import RobotState
+from acsard.daemon.latencies import NAMES
+from acsard.top.screen_data import ScreenData
+from acsard.top.text import clean, count, rule
+from acsard.top.wide_screen import (
+    certificate,
+    drives,
+    hidden,
+    missed,
+    overrun,
+    rates,
+    refused,
+    speeds,
+    spread,
+    title,
+    waits,
+    wheel,
+)
+
+BELOW = 80
+"""Width in cells from which the wide layout is used."""
+
+BAR = 4
+
+
+def motion(state: RobotState, width: int) -> list[Text]:
+    """Return pose and twist, then the wheels in their positions on the robot."""
+    told = [
+        f"x {signed(state.x, 3, 8)} m",
+        f"y {signed(state.y, 3, 8)} m",
+        f"yaw {signed(math.degrees(state.yaw), 1, 6)}°",
+        f"forward {signed(state.linear, 3, 7)} m/s",
+        f"turn {signed(state.angular, 3, 7)} rad/s",
+    ]
+    lines = [rule(width, [(0, "pose and twist")]), *flow([Text(one) for one in told], width, 0)]
+    lines.append(Text("wheels rad/s", "cyan"))
+    (right, left, rear_left, rear_right), scale = speeds(state)
+    for axle, one, other in (("front", left, right), ("rear", rear_left, rear_right)):
+        line = Text(f"  {axle:<6}", "dim").append_text(wheel(one, scale, BAR)).append(" ")
+        lines.append(line.append_text(wheel(other, scale, BAR)))
+    return lines
+
+
+def sources(state: RobotState, room: int, width: int) -> list[Text]:
+    """Return priority and age of each source, with its reason below, in about `room` lines."""
+    lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "heard")])]
+    left = list(state.sources)
+    while left:
+        one = left[0]
+        mark = "▶ " if drives(one, state) else "  "
+        name = Text(clean(one.name))
+        name.truncate(13, overflow="ellipsis", pad=True)
+        said = [Text(f"{mark}{name.plain} {count(one.priority):>8}  {rough(one.age)}")]
+        said += folded(waits(one, state), width, 4)
+        if len(lines) > 1 and len(lines) + len(said) > room:
+            break
+        lines += [*said]
+        left.pop(0)
+    if left:
+        lines.append(Text(hidden(left), "dim"))
+    return lines if state.sources else [*lines, Text("  none", "dim")]
+
+
+def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
+    """Return the lines about the serial link, the commands and the refusals."""
+    before = seen.before or state
+    lines = [rule(width, [(0, title(seen, state))])]
+    if state.certificate:
+        lines += flow([certificate(state)], width, 2)
+    counted = rates(seen, state, before)
+    told = [Text(f"{what} {counted(name)}") for what, name in LINES]
+    superseded = state.counters.get("lines_superseded", 0)
+    told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
+    if met := state.counters.get("commands_first_contact", 0):
+        told.append(Text(f"first contact {count(met)}"))
+    lines += flow([one for one in told if one], width, 0)
+    if state.gyro != "off":
+        lines += folded(f"gyro {clean(state.gyro)}", width, 2)
+    if state.track:
+        lines += folded(f"track {clean(state.track)}", width, 2)
+    kinds = refused(state, before)
+    for kind, parts in kinds:
+        lines += flow([Text(f"rejected {kind}"), *parts], width, 2)
+    if not kinds:
+        lines.append(Text("rejected nothing"))
+    return [*lines, *folded(f"last one {clean(state.refused) or '-'}", width, 2)]
+
+
+LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "commands"))
+
+
+def timing(state: RobotState, width: int) -> list[Text]:
+    """Return the daemon's timing figures."""
+    heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
+    lines = [rule(width, [(0, "timing")])]
+    for since, last in (("last minute", True), ("since start", False)):
+        lines.append(Text(f"{since:<16}{heads}", "dim"))
+        for name in NAMES:
+            one = state.figures.get(name)
+            figures = None if one is None else one.last_minute if last else one.since_start
+            lines.append(Text(f"{name:<16}").append_text(spread(figures)))
+    return lines
+
+
+def flow(parts: Sequence[Text], width: int, inset: int) -> list[Text]:
+    """Put as many parts in a line as fit."""
+    lines: list[Text] = []
+    for part in parts:
+        if lines and lines[-1].cell_len + 2 + part.cell_len <= width:
+            lines[-1].append("  ").append_text(part)
+        else:
+            lines.append(Text(" " * (inset if lines else 0)).append_text(part))
+    return lines
+
+
+def folded(text: str, width: int, inset: int) -> list[Text]:
+    """Wrap a sentence between words. The first line is indented unless it starts with a label."""
+    first = "" if text.startswith(("gyro ", "track ", "last one ")) else " " * inset
+    wide = max((cell_len(one) for one in text), default=1)  # a character may be two cells wide
+    room, rest = max(inset + 1, width // max(1, wide)), " " * inset
+    return [Text(one) for one in wrap(text, room, initial_indent=first, subsequent_indent=rest)]

@@ -1,0 +1,259 @@
+"""The parts of a wide screen below the mode: each is a list of lines that starts with a rule.
+
+This module is pure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from rich.text import Text
+
+from acsard.core.formatting import rough, signed
+from acsard.core.messages.schema import Info, RobotState, SourceState, Spread
+from acsard.core.motion.gyro import WORDS
+from acsard.core.values import NS_PER_S
+from acsard.daemon.latencies import NAMES
+from acsard.top.screen_data import ScreenData
+from acsard.top.text import bar, clean, count, rate, row, rule
+
+WIDEST = 116
+"""Maximum width in cells; longer lines are harder to read."""
+
+SHORT_WORDS, LONG_WORDS = 21, 56
+"""Width of the explanation of each figure; the long form is used from `WIDEST` on."""
+
+MOST_REASONS, MOST_PORT = 16, 34
+
+LATE_S = 0.2
+"""Difference in s between stamps and local clock that network delay explains; more means that the
+robot's clock was set."""
+
+LINKS = {"up": "green", "booting": "yellow"}
+
+FIGURES = {
+    "period_lateness": ("period due → step", "from a period due (the first missed) to its step"),
+    "step_time": ("work of one step", "from the start of a step to the end of its work"),
+    "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
+    "command_to_wire": ("arrival → first line", "from arrival in its turn to the first such line"),
+    "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
+    "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
+}
+"""Short and long words for each `latencies.Name`. An arrow leads from one moment to another."""
+
+
+def motion(state: RobotState, width: int) -> list[Text]:
+    """Return pose and twist on the left, and the wheels in their places on the right."""
+    (right, left, rear_left, rear_right), scale = speeds(state)
+    cells = 6 + max(0, width - 80) // 2
+    at = ((0, "pose and twist"), (40, "wheels rad/s"), (56, "left"), (68 + cells, "right"))
+    place = f"x {signed(state.x, 3, 8)} m  y {signed(state.y, 3, 8)} m  "
+    place += f"yaw {signed(math.degrees(state.yaw), 1, 6)}°"
+    twist = f"forward {signed(state.linear, 3, 7)} m/s  turn {signed(state.angular, 3, 7)} rad/s"
+    rows = ((place, "front", left, right), (twist, "rear", rear_left, rear_right))
+    lines = [rule(width, at)]
+    for told, axle, one, other in rows:
+        line = Text(told.ljust(40))
+        line.append(axle.ljust(6), "dim")
+        line.append_text(wheel(one, scale, cells)).append("  ")
+        lines.append(line.append_text(wheel(other, scale, cells)))
+    return lines
+
+
+def speeds(state: RobotState) -> tuple[tuple[float, ...], float]:
+    """Return the four wheel speeds (NaN if unknown) and the speed of a full bar, rad/s."""
+    wheels = (*state.wheels[:4], *[math.nan] * (4 - len(state.wheels)))
+    top = max((abs(speed) for speed in wheels if math.isfinite(speed)), default=0.0)
+    return wheels, next((s for s in (20.0, 40.0, 80.0) if top <= s), 100.0)
+
+
+def wheel(speed: float, scale: float, cells: int) -> Text:
+    """Return direction, speed and bar in `10 + cells` cells."""
+    if speed == 0.0 or not math.isfinite(speed):
+        sign, style = "·", "dim"
+    else:
+        sign, style = ("▲", "green") if speed > 0 else ("▼", "magenta")
+    number = "-".rjust(7) if math.isnan(speed) else signed(speed, 2, 7)
+    return Text.assemble(
+        (sign, style), number, "  ", (bar(speed, scale, cells).ljust(cells), style)
+    )
+
+
+def sources(state: RobotState, room: int, width: int) -> list[Text]:
+    """Return a line for each command source, in at most `room` lines."""
+    room_name = 13 + max(0, width - 80) // 2
+    start = room_name + 3
+    at = ((0, "sources"), (start, "priority"), (start + 10, "heard"), (start + 17, "waits for"))
+    lines = [rule(width, at)]
+    shown = state.sources[: room if len(state.sources) <= room else room - 1]
+    lines += [_source(source, state, room_name) for source in shown]
+    if len(shown) < len(state.sources):
+        lines.append(Text(hidden(state.sources[len(shown) :]), "dim"))
+    return lines if state.sources else [*lines, Text("  none", "dim")]
+
+
+def hidden(left: Sequence[SourceState]) -> str:
+    """Return a line that names the sources that do not fit."""
+    names = ", ".join(clean(source.name) for source in left[:MOST_REASONS])
+    return f"  and {count(len(left))} more: {names}"
+
+
+def drives(source: SourceState, state: RobotState) -> bool:
+    """Return whether the robot follows this source."""
+    return source.name == state.source and state.mode == "driving" and not source.waits_for
+
+
+def waits(source: SourceState, state: RobotState) -> str:
+    """Return the reason why a source does not drive, in words."""
+    if source.waits_for:
+        return clean(source.waits_for)
+    if drives(source, state):
+        return "nothing: it drives"
+    return f"nothing, but the robot is {clean(state.mode)}"
+
+
+def _source(source: SourceState, state: RobotState, room: int) -> Text:
+    drive = drives(source, state)
+    live = drive or source.waits_for != "a command"
+    mark, style = ("▶ ", "bold green") if drive else ("  ", "" if live else "dim")
+    name = Text(clean(source.name))
+    name.truncate(room, overflow="ellipsis", pad=True)
+    figures = f"{count(source.priority):>8}  {rough(source.age):<7}"
+    return Text(f"{mark}{name.plain} {figures}{waits(source, state)}", style)
+
+
+def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
+    """Return the lines about the serial link, the commands and the refusals."""
+    before = seen.before or state
+    head = title(seen, state)
+    titles: list[tuple[int, str | Text]] = [(0, head)]
+    if state.certificate:
+        told = certificate(state)
+        titles.append((max(head.cell_len + 2, width - told.cell_len - 4), told))
+    counted = rates(seen, state, before)
+    superseded = state.counters.get("lines_superseded", 0)
+    lines = [
+        rule(width, titles),
+        row("lines", f"in {counted('lines'):<21} out {counted('lines_sent'):<21}").append(
+            f" superseded {count(superseded)}"
+        ),
+        row("commands", f"   {counted('commands'):<21} ").append_text(missed(state, before)),
+    ]
+    if met := state.counters.get("commands_first_contact", 0):
+        lines[-1].append(f"  first contact {count(met)}", "dim")
+    if lost := overrun(state):
+        lines[-1].append("  ").append_text(lost)
+    if state.gyro != "off":
+        lines.append(_gyro(state.gyro))
+    if state.track:
+        lines.append(row("track", clean(state.track)))
+    lines += _refusals(state, before)
+    return lines
+
+
+def title(seen: ScreenData, state: RobotState) -> Text:
+    """Return the state of the link and its port."""
+    told = Text.assemble("link ", (clean(state.link), f"bold {LINKS.get(state.link, 'red')}"))
+    if seen.info is not None:
+        sim = seen.info.simulated
+        told.append(" on ", "dim").append("the built-in SIMULATOR" if sim else _port(seen.info))
+    return told
+
+
+def certificate(state: RobotState) -> Text:
+    """Return the remaining validity of the certificate."""
+    style = "" if state.certificate.startswith("valid for") else "bold red"
+    return Text(f"certificate {clean(state.certificate)}", style)
+
+
+def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
+    """Return a function that formats the rate and the total of a counter."""
+    # Stamps are exact, but if the robot's clock was set, the local clock decides.
+    seconds = (state.stamp.to_ns() - before.stamp.to_ns()) / NS_PER_S
+    if abs(seconds - seen.passed) > LATE_S:
+        seconds = seen.passed
+
+    def counted(name: str) -> str:
+        now, then = state.counters.get(name, 0), before.counters.get(name, 0)
+        return f"{rate(now, then, seconds)} of {count(now)}"
+
+    return counted
+
+
+def overrun(state: RobotState) -> Text:
+    """Return the number of samples that the bus dropped; empty if there were none."""
+    lost = state.counters.get("bus_overrun", 0)
+    return Text(f"bus overrun {count(lost)}" if lost else "", "yellow")
+
+
+def _gyro(does: str) -> Text:
+    """Return the effect of the gyro on the heading."""
+    good = does in ("used", "waiting for rest")
+    told = next((f"{name}: {words}" for name, words in WORDS.items() if name == does), clean(does))
+    return row("gyro", told, "" if good else "yellow")
+
+
+def _port(info: Info) -> str:
+    """Return the serial port; of a long path only the last part."""
+    port = clean(info.port)
+    return port if len(port) <= MOST_PORT else port.rpartition("/")[2][:MOST_PORT]
+
+
+def missed(state: RobotState, before: RobotState) -> Text:
+    """Return the number of missed periods, in yellow while it grows."""
+    missed = state.counters.get("missed_periods", 0)
+    grows = missed > before.counters.get("missed_periods", 0)
+    return Text(f"missed periods {count(missed)}", "yellow" if grows else "")
+
+
+def _refusals(state: RobotState, before: RobotState) -> list[Text]:
+    """Return the rejections by reason, and the last refusal in words."""
+    kinds = [
+        Text(f"{kind} ").append_text(Text(", ").join(parts))
+        for kind, parts in refused(state, before)
+    ]
+    joined = Text(" · ").join(kinds) if kinds else Text("nothing", "dim")
+    last = row("last one", clean(state.refused)) if state.refused else row("last one", "-", "dim")
+    return [row("rejected", "").append_text(joined), last]
+
+
+def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]]]:
+    """Return the rejections by kind and reason, with growing ones in yellow."""
+    kinds = []
+    for kind, prefix in (("lines", "line_"), ("commands", "command_"), ("gyro", "imu_")):
+        found = [(n, c) for n, c in state.counters.items() if n.startswith(prefix) and c]
+        found.sort(key=lambda one: -one[1])
+        parts = []
+        for name, number in found[:MOST_REASONS]:
+            grows = number > before.counters.get(name, 0)
+            told = f"{clean(name.removeprefix(prefix)).replace('_', ' ')} {count(number)}"
+            parts.append(Text(told, "yellow" if grows else ""))
+        if parts:
+            kinds.append((kind, parts))
+    return kinds
+
+
+def timing(state: RobotState, width: int) -> list[Text]:
+    """Return the daemon's timing figures."""
+    long = width >= WIDEST
+    room = LONG_WORDS if long else SHORT_WORDS
+    start = 16 + room
+    at = ((0, "timing"), (start + 2, "last minute"), (start + 23, "since start"))
+    heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
+    lines = [rule(width, at), Text(f"{'':{start}}{heads}{heads}", "dim")]
+    for name in NAMES:
+        line = Text(f"{name:<16}").append(FIGURES[name][long].ljust(room), "dim")
+        one = state.figures.get(name)
+        for figures in (one.last_minute, one.since_start) if one else (None, None):
+            line.append_text(spread(figures))
+        lines.append(line)
+    return lines
+
+
+def spread(found: Spread | None) -> Text:
+    """Return median, 99th percentile and maximum of a figure, in 21 cells."""
+    if found is None or found.count <= 0:
+        return Text("-".rjust(7) * 3, "dim")
+    p50, p99, most = (rough(1e-6 * us, 1e-6).rjust(7) for us in (found.p50, found.p99, found.max))
+    return Text.assemble(p50, (p99, "bold"), (most, "dim"))

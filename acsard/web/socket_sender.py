@@ -1,0 +1,153 @@
+"""Sends messages on one WebSocket: the newest value of each key when it is due, and answers at
+once.
+
+While the client has not read earlier data, values are skipped; they are never queued.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+
+import aiohttp
+import msgspec
+from aiohttp import web
+
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.web.callers import Reason
+from acsard.web.counts import Counts
+from acsard.web.socket_messages import Refused
+from acsard.web.streams import Stream
+
+UNREAD_BYTES = 32768
+"""Limit on unread bytes; above it the client receives no new values until it has read some."""
+
+UNREAD_FRAMES = 200
+"""Maximum number of waiting answers; beyond it the oldest are dropped."""
+
+CLOSES_S = 1.0
+"""Time limit for the client's answer to a close; the connection is cut after that."""
+
+TELL_NS = NS_PER_S
+"""Minimum interval between two reported refusals with the same reason. All refusals are counted."""
+
+
+class Following:
+    """A subscribed key with its period and next due time."""
+
+    def __init__(self, robot: str, name: str, own: str, period: float) -> None:
+        """Prepare the constant part of the key's messages.
+
+        `own` is the id of the page's own robot; messages of that robot carry no id.
+        """
+        self.robot, self.name, self.period = robot, name, period
+        told = {"key": name} if robot == own else {"key": name, "robot": robot}
+        self.head = msgspec.json.encode(told)[:-1] + b',"value":'
+        self.stream: Stream | None = None
+        self.sent = 0
+        self.due = 0.0
+
+
+class Outgoing:
+    """The outgoing side of one WebSocket."""
+
+    def __init__(
+        self, socket: web.WebSocketResponse, request: web.Request, counts: Counts, origin: str
+    ) -> None:
+        """Store the connection; `origin` identifies the client in the log."""
+        self._socket, self._transport, self._counts = socket, request.transport, counts
+        self._origin = origin
+        self.following: dict[tuple[str, str], Following] = {}
+        """Subscribed keys by (robot, key)."""
+        self._out: deque[bytes] = deque(maxlen=UNREAD_FRAMES)
+        self._news = asyncio.Event()
+        self._told: dict[str, int] = {}
+        self._closing = False
+
+    def say(self, message: object) -> None:
+        """Queue a message; it is sent as soon as the client reads."""
+        self._out.append(msgspec.json.encode(message))
+        self._news.set()
+
+    def wake(self) -> None:
+        """Wake `pump`, because there is a new message or subscription."""
+        self._news.set()
+
+    def refuse(self, what: str, reason: Reason, text: str) -> None:
+        """Count a refusal, and report it to the client at most once a second for each reason."""
+        self._counts.refuse(reason, self._origin)
+        now_ns = clock.mono_ns()
+        if now_ns - self._told.get(reason, -TELL_NS) >= TELL_NS:
+            self._told[reason] = now_ns
+            self.say(Refused(what, text))
+
+    async def pump(self, look_around: Callable[[float], float]) -> None:
+        """Send until cancelled or until the connection closes.
+
+        `look_around(now)` is called in each round and returns the time of its next call.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            while True:
+                self._news.clear()
+                await self._send_what_waits()
+                now = loop.time()
+                due = [await self._send_due(one, now) for one in list(self.following.values())]
+                due.append(look_around(now))
+                timer = loop.call_at(min(due), self._news.set)
+                try:
+                    await self._news.wait()
+                finally:
+                    timer.cancel()
+        except ConnectionError:
+            pass  # closing; `Viewer.run` notices
+
+    async def close(self, why: str) -> None:
+        """Tell the client to end the connection; `why` is at most 120 characters.
+
+        The client gets `CLOSES_S` to answer. If the connection were cut at once, many programs
+        would report a lost network instead of the reason.
+        """
+        if self._closing:
+            return
+        self._closing = True
+        if self._transport is not None:
+            asyncio.get_running_loop().call_later(CLOSES_S, self._transport.abort)
+        said = aiohttp.WSCloseCode.POLICY_VIOLATION.to_bytes(2, "big") + why.encode()
+        with suppress(ConnectionError):
+            await self._socket.send_frame(said, aiohttp.WSMsgType.CLOSE)
+
+    async def _send(self, text: bytes) -> None:
+        if not self._closing:  # no data may follow a close frame
+            await self._socket.send_frame(text, aiohttp.WSMsgType.TEXT)
+
+    async def _send_what_waits(self) -> None:
+        while self._out:
+            await self._send(self._out.popleft())
+
+    async def _send_due(self, one: Following, now: float) -> float:
+        """Send the value if it is due and new.
+
+        Return its next due time by the event loop's clock.
+        """
+        stream = one.stream
+        if stream is None:
+            return now + one.period  # `Keys._join` wakes the task when the stream exists
+        if one.due > now:
+            return one.due
+        # All keys share one time grid, so they wake the task together.
+        one.due = (now // one.period + 1) * one.period
+        if stream.number != one.sent:
+            if self._unread() > UNREAD_BYTES:
+                self._counts.add("frames_left_out")
+            else:
+                one.sent, value, age = stream.value()
+                frame = b'%b%b,"age":%.1f}' % (one.head, value, age)
+                await self._send(frame)
+        return one.due
+
+    def _unread(self) -> int:
+        return 0 if self._transport is None else self._transport.get_write_buffer_size()

@@ -1,0 +1,301 @@
+"""The MCU's clock is found from the times of reads.
+
+It counts neither too many nor too few slots, and it is given up in time.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acsard.core.link.free_running_times import Slots
+
+MS = 1_000_000
+PERIOD = 0.01
+
+
+class Bench:
+    """Lines at a fixed period, and the slots that the clock counts for them.
+
+    Each line is read at once or late.
+    """
+
+    def __init__(self, period: float = PERIOD, known: tuple[float, ...] = (PERIOD,)) -> None:
+        self.slots = Slots(known)
+        self.period_ns = period * 1e9
+        self.made = 0
+        self.counted = 0.0
+        self.waiting = 0
+        self.least = 0
+
+    def time_ns(self) -> int:
+        return int(5e12 + self.made * self.period_ns)
+
+    def line(self, late_ms: float = 0.0, lost: bool = False, held: bool = False) -> None:
+        """Make the MCU's next line: it is lost, or held back, or read with all lines held back."""
+        self.made += 1
+        self.waiting += not lost
+        if held or not self.waiting:
+            return
+        had = self.slots.period is not None
+        lost_slots = self.slots.read(self.time_ns() + int(late_ms * MS), self.waiting, True)
+        if had:
+            self.counted += self.waiting + lost_slots
+            self.least = min(self.least, lost_slots)
+        self.waiting = 0
+
+    def found(self) -> Bench:
+        """Send lines until the clock is known."""
+        while self.slots.period is None:
+            self.line()
+            assert self.made < 200
+        self.made, self.counted = self._start(), 0.0
+        return self
+
+    def _start(self) -> int:
+        self.began = self.made
+        return self.made
+
+    @property
+    def error(self) -> float:
+        """Return the number of slots counted beyond those that existed."""
+        return self.counted - (self.made - self.began)
+
+
+def test_no_clock_is_known_before_half_a_second() -> None:
+    bench = Bench()
+    for _ in range(45):
+        bench.line()
+        assert bench.slots.period is None
+    bench.found()
+
+
+@pytest.mark.parametrize(
+    ("real", "period"),
+    [
+        (0.0100001, 0.01),  # the configured period
+        (0.01004, 0.01),  # a ceramic resonator matches the configured period as well
+        (0.020003, 0.02),  # whole milliseconds
+        (0.0333333, 0.0333333),  # the measured period
+    ],
+)
+def test_the_period_is_the_one_that_the_firmware_means(real: float, period: float) -> None:
+    bench = Bench(real)
+    for _ in range(400):
+        bench.line()
+    assert bench.slots.period == pytest.approx(period, rel=1e-6)
+
+
+def test_lines_with_a_time_are_no_lost_ones() -> None:
+    bench = Bench().found()
+    for _ in range(1000):
+        bench.line(0.2)
+    assert (bench.error, bench.least) == (0, 0)
+
+
+@settings(max_examples=60)
+@given(
+    stalls=st.lists(st.tuples(st.integers(1, 110), st.floats(0.0, 9.0)), max_size=20),
+    seed=st.integers(0, 1000),
+    drift=st.floats(-2e-4, 2e-4),
+)
+def test_a_lossless_link_counts_each_line_once_whatever_stalls(
+    stalls: list[tuple[int, float]], seed: int, drift: float
+) -> None:
+    chance = random.Random(seed)
+    bench = Bench(PERIOD * (1 + drift)).found()
+    for held, late_ms in stalls:
+        for _ in range(held):
+            bench.line(held=True)
+        bench.line(late_ms)
+        for _ in range(chance.randint(20, 90)):
+            bench.line(chance.uniform(0.0, 1.0) + chance.expovariate(3.0) * 0.3)
+    assert bench.error == 0
+
+
+@given(seed=st.integers(0, 1000), held=st.integers(3, 100))
+def test_a_batched_link_without_loss_counts_each_line_once(seed: int, held: int) -> None:
+    chance = random.Random(seed)
+    slots, waiting, made, counted, stall = Slots((PERIOD,)), 0, 0, 0, 0
+    batch_ns = 16 * MS
+    for read in range(1, 2000):
+        due = read * batch_ns + int(chance.expovariate(1.0) * 0.3 * MS)
+        now_made = (read * batch_ns) // (10 * MS)
+        waiting += now_made - made
+        made = now_made
+        stall = held // 2 if read % 300 == 299 else max(0, stall - 1)
+        if stall or not waiting:
+            continue
+        had = slots.period is not None
+        lost = slots.read(10**12 + due, waiting, True)
+        if had:
+            counted += lost
+        waiting = 0
+    assert slots.period == PERIOD
+    assert counted == 0
+
+
+def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
+    """Return the times in ns and line counts of reads through an adapter at 115200 baud.
+
+    The adapter passes 62 bytes on at once, and fewer bytes every 16 ms. Lines of `size` bytes come
+    every 10 ms.
+    """
+    fed = [(round((k * 10 + phase) * MS + (i + 1) * MS / 11.52), i == size - 1)
+           for k in range(1, lines + 1) for i in range(size)]  # fmt: skip
+    reads: list[tuple[int, int]] = []
+    waiting, whole, due = 0, 0, 0
+    for at, ends in fed:
+        if waiting and at >= due:
+            reads.append((due, whole))
+            waiting = whole = 0
+        due = due if waiting else -(-at // (16 * MS)) * 16 * MS
+        waiting, whole = waiting + 1, whole + ends
+        if waiting == 62:
+            reads.append((at, whole))
+            waiting = whole = 0
+    return [(10**12 + at, whole) for at, whole in reads if whole]
+
+
+@pytest.mark.variations(2)
+@pytest.mark.parametrize("size", [30, 33, 34, 36])
+@given(phase=st.floats(0.0, 16.0))
+def test_lines_that_fill_an_adapter_s_packets_have_the_period_they_are_made_at(
+    size: int, phase: float
+) -> None:
+    slots, counted = Slots((PERIOD,)), 0
+    for at, lines in packets(size, 1000, phase):
+        had = slots.period is not None
+        counted += had * slots.read(at, lines, True)
+        if not had and slots.period is not None:
+            assert slots.period == PERIOD
+    assert (slots.period, counted) == (PERIOD, 0)
+
+
+OUT_OF_TURN = [
+    0.0, 0.49, 1.1, 0.68, 1.31, 0.87, 0.53, 1.11, 0.69, 1.29, 0.91, 0.48, 1.09, 0.68, 1.29, 0.97,
+    0.51, 1.08, 0.75, 1.32, 1.0, 0.49, 1.09, 0.68, 1.31, 0.91, 1.49, 1.09, 0.68, 1.28, 0.88, 0.52,
+]  # fmt: skip
+"""Observed lateness of reads during half a second of batches, in slots.
+
+The first line was early, like the first answer after a port opens, because the host's lines follow
+each other only after it.
+"""
+
+
+def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
+    slots, slot, before = Slots((PERIOD,)), 0, 0.0
+    for late in [*OUT_OF_TURN, *OUT_OF_TURN[5:]]:
+        lines = round(1.6 - late + before)  # the lines of 16 ms
+        slot, before = slot + lines, late
+        slots.read(10**12 + int((slot + late) * 10 * MS), lines, True)
+        if slots.period is not None:
+            break
+    assert slots.period == PERIOD
+    assert slots.usual == 10 * MS
+
+
+@pytest.mark.parametrize("lost", [1, 2, 7, 50])
+def test_missing_lines_are_counted_with_the_next_one(lost: int) -> None:
+    bench = Bench().found()
+    for _ in range(100):
+        bench.line(0.3)
+    for _ in range(lost):
+        bench.line(lost=True)
+    assert bench.error == -lost
+    bench.line(0.3)
+    assert bench.error == 0
+
+
+@given(seed=st.integers(0, 1000))
+def test_a_fifth_of_the_lines_lost_is_counted_to_the_last(seed: int) -> None:
+    chance = random.Random(seed)
+    bench = Bench().found()
+    for _ in range(2000):
+        bench.line(chance.uniform(0.0, 1.0), lost=chance.random() < 0.2)
+    bench.line(lost=False)
+    bench.line()
+    assert bench.error == 0
+
+
+def test_a_slot_counted_for_a_late_lone_line_is_taken_back_with_the_next() -> None:
+    bench = Bench().found()
+    for _ in range(100):
+        bench.line(0.2)
+    bench.line(9.0)
+    bench.line(0.2)
+    bench.line(0.2)
+    assert bench.error == 0
+
+
+def test_what_a_backlog_is_short_of_is_counted_with_it() -> None:
+    bench = Bench().found()
+    for _ in range(100):
+        bench.line(0.2)
+    for number in range(20):
+        bench.line(held=True, lost=number % 5 == 0)
+    bench.line(5.0)
+    assert bench.error == 0
+
+
+def forgets(bench: Bench, lines: Iterable[Callable[[], None]]) -> bool:
+    """Return whether the clock is given up during these lines."""
+    for line in lines:
+        line()
+        if bench.slots.period is None:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("period", [0.005, 0.0093, 0.0108, 0.02, 0.05])
+def test_another_period_is_found_out_and_found(period: float) -> None:
+    bench = Bench().found()
+    began = bench.time_ns()
+    bench.made, bench.period_ns = 0, period * 1e9
+    slots, periods = bench.slots, []
+    for number in range(1, 1500):
+        slots.read(began + int(number * bench.period_ns), 1, True)
+        periods.append(slots.period)
+    assert None in periods
+    assert periods[-1] == pytest.approx(period, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_lines_without_a_period_have_no_clock(seed: int) -> None:
+    chance = random.Random(seed)
+    slots, at, known = Slots((PERIOD,)), 10**12, 0
+    for _ in range(3000):
+        at += int(chance.uniform(4.0, 30.0) * MS)
+        slots.read(at, 1, True)
+        known += slots.period is not None
+    assert known < 300
+
+
+def test_a_line_is_as_old_as_its_slot_not_as_its_read() -> None:
+    bench = Bench().found()
+    chance = random.Random(1)
+    errors, raw = [], []
+    for number in range(5000):
+        late_ms = chance.uniform(0.0, 1.0) + chance.expovariate(1 / 0.3)
+        bench.line(late_ms)
+        if number > 500:
+            errors.append((bench.slots.time_ns(0) - bench.time_ns()) / MS)
+            raw.append(late_ms)
+    assert deviation(errors) < deviation(raw) / 6
+
+
+def deviation(values: list[float]) -> float:
+    middle = math.fsum(values) / len(values)
+    return math.sqrt(math.fsum((value - middle) ** 2 for value in values) / len(values))
+
+
+def test_a_clock_that_is_forgotten_is_looked_for_anew() -> None:
+    bench = Bench().found()
+    bench.slots.forget()
+    assert bench.slots.period is None
+    bench.found()

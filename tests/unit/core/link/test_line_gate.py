@@ -1,0 +1,149 @@
+"""Tests of the send stage, which never queues a line."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.link.check import ASK_NOTHING, ASK_SAMPLE, seal
+from acsard.core.link.line_gate import Gate
+
+MS = 1_000_000
+PERIOD_NS = 10 * MS
+STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+COMMA_STOP = b"ap00.00,bp00.00,cp00.00,dp00.00,\r\n"
+GO = b"ap10.00,bp10.00,cp10.00,dp10.00\r\n"
+
+
+class Wire:
+    """A send stage and a kernel that accepts part of each line."""
+
+    def __init__(self, baud_rate: int = 115200, stop: bytes = STOP, period_ms: int = 10) -> None:
+        self.gate = Gate(baud_rate, stop, period_ms * MS)
+        self._stop = stop
+        self.out = b""
+
+    def offer(
+        self,
+        line: bytes,
+        at_ms: float,
+        made_ms: float | None = None,
+        kernel: int = 0,
+        takes: int = 99,
+    ) -> str:
+        now_ns, made_ns = int(at_ms * MS), int((at_ms if made_ms is None else made_ms) * MS)
+        data = self.gate.prepare(line, made_ns, now_ns, kernel)
+        if data is None:
+            return "superseded"
+        taken = min(takes, len(data))
+        self.out += data[:taken]
+        return self.gate.took(line, data, taken, now_ns)
+
+    def started(self) -> Wire:
+        assert self.offer(self._stop, 0) == "sent"
+        self.out = b""
+        return self
+
+
+def test_the_first_line_of_an_opening_is_a_stop_behind_an_end_of_line() -> None:
+    wire = Wire()
+    assert wire.offer(GO, 0) == "superseded"
+    assert wire.out == b"\r\n" + STOP
+    assert wire.offer(GO, 10) == "sent"
+    assert wire.out == b"\r\n" + STOP + GO
+
+
+def test_a_first_line_that_did_not_go_whole_leaves_the_next_one_the_first() -> None:
+    wire = Wire()
+    assert wire.offer(GO, 0, takes=20) == "superseded"
+    assert wire.offer(GO, 10) == "superseded"
+    assert wire.out.endswith(b"\r\n" + STOP)
+
+
+def test_a_line_waits_until_the_one_before_has_left_the_wire() -> None:
+    wire = Wire(9600)
+    wire.offer(STOP, 5)  # 35 bytes at 9600 baud take 36.458 ms
+    assert wire.offer(GO, 5 + 36.458) == "superseded"
+    assert wire.offer(GO, 5 + 36.459) == "sent"
+
+
+def test_no_line_goes_while_the_kernel_holds_a_byte() -> None:
+    wire = Wire().started()
+    assert wire.offer(GO, 1000, kernel=1) == "superseded"
+    assert wire.offer(STOP, 1000, kernel=1) == "superseded"
+    assert wire.offer(GO, 1000) == "sent"
+
+
+@pytest.mark.parametrize("period_ms", [4, 10, 100])
+def test_what_was_made_more_than_a_period_ago_does_not_go(period_ms: int) -> None:
+    wire = Wire(period_ms=period_ms).started()
+    assert wire.offer(GO, 100 + period_ms + 0.001, made_ms=100) == "superseded"
+    assert wire.offer(GO, 300 + period_ms, made_ms=300) == "sent"
+
+
+@pytest.mark.parametrize("letters", [None, b"", ASK_NOTHING, ASK_SAMPLE])
+@pytest.mark.parametrize("stop", [STOP, COMMA_STOP])
+def test_a_stop_is_never_too_old_in_whatever_form(stop: bytes, letters: bytes | None) -> None:
+    line = stop if letters is None else seal(stop, 7, letters)
+    wire = Wire(stop=stop).started()
+    assert wire.offer(line, 1000, made_ms=100) == "sent"
+    assert wire.out == line
+
+
+@pytest.mark.parametrize(
+    "line", [GO, seal(GO, 7), b"ap00.00,bp00.00,cp00.00,dp00.01\r\n", seal(GO, 7, ASK_SAMPLE)]
+)
+def test_what_turns_a_wheel_is_no_stop(line: bytes) -> None:
+    assert Wire().started().offer(line, 1000, made_ms=100) == "superseded"
+
+
+def test_the_stop_that_opens_goes_however_old_the_line_is_that_was_wished() -> None:
+    wire = Wire()
+    assert wire.offer(GO, 1000, made_ms=100) == "superseded"
+    assert wire.out == b"\r\n" + STOP
+
+
+def test_the_first_stop_of_an_opening_is_the_plain_one_which_every_board_obeys() -> None:
+    wire = Wire()
+    assert wire.offer(seal(STOP, 7), 0) == "superseded"
+    assert wire.out == b"\r\n" + STOP
+
+
+@pytest.mark.parametrize(("takes", "prefix"), [(33, b""), (32, b"\r\n"), (0, b"")])
+def test_only_after_a_torn_line_the_next_one_begins_with_an_end_of_line(
+    takes: int, prefix: bytes
+) -> None:
+    wire = Wire().started()
+    assert wire.offer(GO, 10, takes=takes) == ("sent" if takes == 33 else "superseded")
+    wire.out = b""
+    assert wire.offer(GO, 20) == "sent"
+    assert wire.out == prefix + GO
+
+
+def test_only_the_bytes_that_were_taken_occupy_the_wire_and_count_as_sent() -> None:
+    wire = Wire(9600).started()
+    wire.offer(GO, 100, takes=12)  # 12 bytes at 9600 baud take 12.5 ms
+    assert wire.gate.sent_ns == 100 * MS
+    assert wire.offer(GO, 112.4) == "superseded"
+    assert wire.offer(GO, 112.5, takes=0) == "superseded"
+    assert wire.gate.sent_ns == 100 * MS
+    assert wire.offer(GO, 112.5) == "sent"
+
+
+@given(
+    baud=st.sampled_from([9600, 19200, 38400, 57600, 115200]),
+    sends=st.lists(st.tuples(st.integers(0, 50 * MS), st.integers(0, 35)), min_size=1),
+)
+def test_the_gate_never_lets_bytes_queue_on_the_wire(
+    baud: int, sends: list[tuple[int, int]]
+) -> None:
+    gate, now_ns, busy_until_ns = Gate(baud, STOP, PERIOD_NS), 0, 0
+    for pause_ns, takes in sends:
+        now_ns += pause_ns
+        data = gate.prepare(GO, now_ns, now_ns, 0)
+        if data is not None:
+            assert now_ns >= busy_until_ns
+            taken = min(takes, len(data))
+            gate.took(GO, data, taken, now_ns)
+            busy_until_ns = now_ns + taken * 10 * 1_000_000_000 // baud

@@ -1,0 +1,76 @@
+"""A message on one line says the same as its JSON, without the parts meant for programs."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+
+from acsard.core.messages.one_line import SHORT, place, short, speeds
+from acsard.core.messages.schema import (
+    Header,
+    Odometry,
+    Pose,
+    PoseStamped,
+    PoseWithCovariance,
+    Quaternion,
+    Time,
+    Twist,
+    TwistStamped,
+    TwistWithCovariance,
+    Vector3,
+)
+
+HEADER = Header(Time(), "odom")
+
+
+def pose(x: float, y: float, yaw: float) -> Pose:
+    return Pose(Vector3(x, y), Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
+
+
+def odometry(x: float, y: float, yaw: float, linear: float, angular: float) -> Odometry:
+    covariance = [0.25] * 36
+    twist = Twist(Vector3(linear), Vector3(z=angular))
+    return Odometry(
+        HEADER,
+        "base_link",
+        PoseWithCovariance(pose(x, y, yaw), covariance),
+        TwistWithCovariance(twist, covariance),
+    )
+
+
+def figures(line: str) -> list[float]:
+    return [float(text) for text in re.findall(r"[+-]\d+(?:\.\d+)?(?:e[+-]\d+)?", line)]
+
+
+def test_odometry_is_where_it_is_and_how_fast_each_with_its_unit() -> None:
+    line = short(odometry(1.25, -0.5, math.radians(90.0), 0.5, -0.2))
+    told = "x +1.250 m y -0.500 m yaw +90.0° forward +0.50 m/s turn -0.20 rad/s"
+    assert " ".join(line.split()) == told
+
+
+@pytest.mark.parametrize("yaw", [-3.1, -0.4, 0.0, 1.0, 3.1, 3.2, 6.0])
+def test_the_heading_is_within_half_a_turn(yaw: float) -> None:
+    told = figures(short(PoseStamped(HEADER, pose(0.0, 0.0, yaw))))[2]
+    assert -180.0 <= told <= 180.0
+    assert math.remainder(told - math.degrees(yaw), 360.0) == pytest.approx(0.0, abs=0.051)
+
+
+def test_a_stamped_twist_is_its_two_speeds() -> None:
+    line = short(TwistStamped(HEADER, Twist(Vector3(0.333), Vector3(z=1.0))))
+    assert figures(line) == [0.33, 1.0]
+
+
+def test_lines_of_a_robot_that_drives_stand_below_each_other() -> None:
+    far = [odometry(x, 0.0, 0.0, v, 0.0) for x, v in ((0.0, 0.5), (999.9, -0.5), (-99.0, 0.0))]
+    assert len({len(short(one)) for one in far}) == 1
+
+
+@pytest.mark.parametrize("value", [1e300, -1e12, math.inf, math.nan])
+def test_no_figure_breaks_the_line(value: float) -> None:
+    assert len("".join(place(value, value, 0.0) + speeds(value, value))) < 80
+
+
+def test_each_type_that_has_one_is_a_line() -> None:
+    assert {kind.__name__ for kind in SHORT} >= {"Odometry", "RobotState", "PoseStamped"}

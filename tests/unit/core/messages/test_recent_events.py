@@ -1,0 +1,74 @@
+"""A repeated event stays in one row, and a new event gets its own row."""
+
+from __future__ import annotations
+
+from acsard.core.messages.recent_events import LAST, RecentEvents
+from acsard.core.messages.schema import Events, Time
+from acsard.core.motion.command_events import missed
+from acsard.core.values import NS_PER_S, Event, Instant
+
+FAULT = Event("fault", "a wheel is dead; srv/clear releases it", "error")
+
+
+def at(seconds: float) -> Instant:
+    return Instant(round(seconds * NS_PER_S), round((1_000 + seconds) * NS_PER_S))
+
+
+def told(happened: RecentEvents) -> Events:
+    said = happened.told()
+    assert said is not None
+    return said
+
+
+def names(happened: RecentEvents) -> list[str]:
+    return [one.name for one in told(happened).events]
+
+
+def test_nothing_is_nothing() -> None:
+    assert RecentEvents().told() is None
+
+
+def test_a_fault_is_still_there_after_an_hour_of_missed_periods() -> None:
+    happened = RecentEvents()
+    happened.add([FAULT], at(0))
+    for second in range(1, 3600):
+        happened.add([missed(3)], at(second))
+    fault, others = told(happened).events
+    assert (fault.name, fault.stamp) == ("fault", Time.from_ns(at(0).wall_ns))
+    assert (others.name, others.count) == ("missed_periods", 3 * 3599)
+    assert others.text == f"{3 * 3599} times; the last: 3 in a row"
+    assert others.stamp == told(happened).stamp == Time.from_ns(at(3599).wall_ns)
+    assert told(happened).total == 3600
+
+
+def test_after_a_minute_s_rest_it_is_a_row_of_its_own() -> None:
+    happened = RecentEvents()
+    for second in (0, 60, 121):
+        happened.add([missed(1)], at(second))
+    assert [one.count for one in told(happened).events] == [2, 1]
+
+
+def test_what_goes_on_is_behind_what_was_news_meanwhile() -> None:
+    happened = RecentEvents()
+    happened.add([missed(1)], at(0))
+    happened.add([FAULT], at(1))
+    assert names(happened) == ["missed_periods", "fault"]
+    happened.add([missed(1)], at(2))
+    assert names(happened) == ["fault", "missed_periods"]
+
+
+def test_news_is_never_put_together() -> None:
+    happened = RecentEvents()
+    stop, clear = Event("stop", "stopped", by="ann"), Event("clear", "cleared", by="ann")
+    for second in range(3):
+        happened.add([stop, clear], at(second))
+    happened.add([Event("stop", "stopped", by="joe", news=False)], at(3))
+    assert names(happened) == ["stop", "clear"] * 3 + ["stop"]
+
+
+def test_more_than_are_kept_push_the_oldest_out() -> None:
+    happened = RecentEvents()
+    for second in range(LAST + 5):
+        happened.add([Event("commander", f"{second}")], at(second))
+    assert [one.text for one in told(happened).events] == [str(n) for n in range(5, LAST + 5)]
+    assert told(happened).total == LAST + 5

@@ -1,0 +1,127 @@
+"""Tests of gap filling: a line gives the wheel angles since the last accepted line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gap_filling import MAX_LOST_S, NOWHERE, Rolled, Rolling
+from acsard.core.values import Instant, WheelSpeeds
+
+AT = Instant(0, 0)
+FOUR = WheelSpeeds(4.0, 4.0, 4.0, 4.0)
+TWO = WheelSpeeds(2.0, 2.0, 2.0, 2.0)
+
+
+def all_four(angle: float) -> Any:
+    return (pytest.approx(angle),) * 4
+
+
+def near(*values: float) -> Any:
+    return pytest.approx(values)
+
+
+def total(rolled: Rolled) -> float:
+    """Return the angle of the first wheel, rad."""
+    return rolled.turned[0] + sum(piece[0] for piece in rolled.pieces)
+
+
+def test_a_line_is_its_speed_times_its_time() -> None:
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.01), TWO)
+    assert rolled.pieces == (all_four(0.04),)
+    assert rolled.seen == all_four(0.04)
+    assert (rolled.seconds, rolled.known, rolled.unknown) == (0.01, 0.01, 0.0)
+
+
+def test_who_stands_rolls_nowhere() -> None:
+    rolled = Rolling().take(Feedback(AT, WheelSpeeds(), 0.01), WheelSpeeds())
+    assert rolled.pieces == ()
+    assert rolled.turned == NOWHERE
+
+
+def test_what_no_line_reported_lies_between_two_speeds() -> None:
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.03, bridged=0.02), TWO)
+    assert rolled.pieces == (all_four(0.06), all_four(0.04))
+    assert rolled.seen == all_four(0.1)
+    assert (rolled.seconds, rolled.bridged) == near(0.03, 0.02)
+
+
+def test_a_silence_goes_on_as_before_it_no_longer_than_until_wheels_are_told_to_stand() -> None:
+    rolling = Rolling(quiet=0.1)
+    stood = rolling.take(Feedback(AT, WheelSpeeds(), 0.6, bridged=0.5), FOUR)
+    assert total(stood) == pytest.approx(0.4)
+    short = rolling.take(Feedback(AT, WheelSpeeds(), 0.2, bridged=0.1), FOUR)
+    assert total(short) == pytest.approx(0.2), "as long as nobody told them"
+
+
+def test_counts_go_before_the_speed() -> None:
+    counted = (0.05, 0.05, 0.05, 0.05)
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.01, counted=counted), TWO)
+    assert rolled.pieces == (counted,)
+    assert rolled.seen == all_four(0.04)  # a corrected count is not a motion of this line
+    turned = (0.06, 0.06, 0.06, 0.06)
+    rolled = Rolling().take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    assert (rolled.turned, rolled.pieces, rolled.seen) == (turned, (), turned)
+
+
+def test_counts_of_a_line_passed_over_behind_a_silence_are_told_once() -> None:
+    """The line has no duration of its own, because the silence before it covers that time."""
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, FOUR, 0.0, gap=0.5, turned=turned))
+    first = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    second = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), FOUR)
+    assert (first.turned, second.turned) == (all_four(0.12), turned)
+
+
+@pytest.mark.parametrize("lines", [1, 4])
+def test_a_moment_of_lines_passed_over_went_on_at_the_next_ones_speed(lines: int) -> None:
+    rolling = Rolling()
+    for _ in range(lines):
+        rolling.skip(Feedback(AT, TWO, 0.01))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
+    assert total(rolled) == pytest.approx(0.04 * (lines + 1))
+    assert (rolled.known, rolled.unknown) == near(0.01 * (lines + 1), 0.0)
+    assert total(rolling.take(Feedback(AT, FOUR, 0.01), FOUR)) == pytest.approx(0.04)
+
+
+def test_of_more_nobody_knows() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, MAX_LOST_S))
+    rolling.skip(Feedback(AT, TWO, 0.01))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01), TWO)
+    assert total(rolled) == pytest.approx(0.04)
+    assert (rolled.known, rolled.unknown) == near(0.0, MAX_LOST_S + 0.01)
+
+
+def test_of_counts_passed_over_none_is_lost_nor_their_time() -> None:
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, TWO, 0.01, turned=turned))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO)
+    assert rolled.turned == all_four(0.12)
+    assert rolled.seen == turned
+    assert (rolled.seconds, rolled.known) == near(0.01, 0.02)
+
+
+def test_gaps_before_lines_passed_over_stay_gaps() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, 0.0, gap=0.5))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.0, gap=0.3), TWO)
+    assert (rolled.known, rolled.unknown) == near(0.0, 0.8)
+
+
+def test_of_a_slow_link_one_line_passed_over_is_bridged_too() -> None:
+    rolling = Rolling()
+    rolling.skip(Feedback(AT, TWO, 0.1))
+    rolled = rolling.take(Feedback(AT, FOUR, 0.1), TWO)
+    assert total(rolled) == pytest.approx(0.8)
+    assert (rolled.known, rolled.unknown) == near(0.2, 0.0)
+
+
+def test_counts_passed_over_behind_a_silence_are_added_once() -> None:
+    rolling, turned = Rolling(), (0.06, 0.06, 0.06, 0.06)
+    rolling.skip(Feedback(AT, TWO, 0.0, gap=0.15, turned=turned))
+    first, second = (rolling.take(Feedback(AT, FOUR, 0.01, turned=turned), TWO) for _ in range(2))
+    assert first.turned == all_four(0.12)
+    assert second.turned == turned

@@ -1,0 +1,104 @@
+"""Tests of the signs that a wheel's encoder is faulty, and of the signs against it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Suspect, has_lied
+
+DT = 0.01
+FINE = math.tau / 3200
+NOTHING = Known(0.0, 0.0, False, None)
+
+
+def told(speed: float, slow: float | None = None) -> Known:
+    return Known((speed if slow is None else slow) * DT, speed * DT, True, None)
+
+
+def felt(speed: float) -> Known:
+    return Known(0.0, 0.0, False, speed * DT)
+
+
+def lies(
+    own: float, other: float, known: Known, lines: int = 4, same: bool = False
+) -> tuple[bool, Lie | None]:
+    """Return whether the wheel is found faulty after these lines, and its kind of fault.
+
+    Speeds are in rad/s.
+    """
+    suspect = Suspect()
+    for _ in range(lines):
+        if suspect.looks(own * DT, other * DT, same, DT, FINE):
+            suspect.compare(own * DT, other * DT, DT, known)
+    return suspect.lie is not None and suspect.lies(FINE), suspect.lie
+
+
+@pytest.mark.parametrize("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
+@pytest.mark.parametrize(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
+def test_a_sign_that_command_or_gyro_deny_is_a_lie(own: float, lie: Lie, known: Known) -> None:
+    assert lies(own, 10.0, known) == (True, lie)
+
+
+@pytest.mark.parametrize("own", [0.0, -10.0])
+def test_two_lines_are_none(own: float) -> None:
+    assert not lies(own, 20.0, told(20.0), lines=2)[0]
+
+
+@pytest.mark.parametrize("own", [0.0, -10.0])
+def test_without_command_and_gyro_nothing_is_known(own: float) -> None:
+    assert not lies(own, 10.0, NOTHING, lines=1000)[0]
+
+
+def test_who_does_as_told_does_not_lie() -> None:
+    assert not lies(0.0, 10.0, told(0.4), lines=100)[0]
+    assert not lies(10.0, -10.0, told(10.0), lines=100)[0]
+
+
+def test_a_gyro_is_believed_before_the_command() -> None:
+    spins = Known(10.0 * DT, 10.0 * DT, True, 0.0)
+    assert lies(0.0, 10.0, Known(10.0 * DT, 10.0 * DT, True, None))[0]
+    assert not lies(0.0, 10.0, spins, lines=100)[0]
+
+
+def test_half_the_speed_is_no_sign_of_a_lie() -> None:
+    assert lies(5.0, 10.0, told(10.0), lines=100) == (False, None)
+
+
+def test_a_wheel_that_says_the_same_while_its_command_and_the_other_change_is_stuck() -> None:
+    suspect, speed = Suspect(), 10.0
+    lines = 0
+    while lines < 20:
+        lines += 1
+        speed -= 0.3
+        command = Known((speed + 2.0) * DT, (speed - 1.0) * DT, True, None)
+        assert suspect.looks(10.0 * DT, speed * DT, True, DT, FINE)
+        suspect.compare(10.0 * DT, speed * DT, DT, command)
+        if suspect.lies(FINE):
+            break
+    assert suspect.lie == "stuck"
+    assert 3 <= lines < 15
+
+
+def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
+    assert not lies(3.0, 0.0, NOTHING, lines=25, same=True)[0]
+    assert lies(3.0, 0.0, NOTHING, lines=35, same=True) == (True, "stuck")
+
+
+@pytest.mark.parametrize(
+    ("lie", "own", "other", "lied"),
+    [
+        ("dead", 0.0, 5.0, True), ("dead", 5.0, 5.0, False),
+        ("reversed", -5.0, 5.0, True), ("reversed", 5.0, 5.0, False),
+        ("stuck", 7.0, 5.0, True), ("stuck", 7.01, 5.0, False),
+    ],
+)  # fmt: skip
+def test_a_line_before_belongs_to_the_lie_if_it_has_its_sign(
+    lie: Lie, own: float, other: float, lied: bool
+) -> None:
+    assert has_lied(lie, own, other, 7.0) is lied
+
+
+def test_every_lie_has_its_words() -> None:
+    assert set(WORDS) == set(Lie.__args__)  # type: ignore[attr-defined]

@@ -1,0 +1,38 @@
+"""Tests of bytes that are received at the wrong baud rate."""
+
+from __future__ import annotations
+
+from itertools import permutations
+from typing import get_args
+
+import pytest
+
+from acsard.core.config.settings import Baud, WheelMap
+from acsard.core.link.codec import Codec
+from acsard.core.simulator.baud_mismatch import garbled
+
+LINE = Codec(WheelMap()).stop
+
+
+def test_at_the_right_rate_nothing_happens() -> None:
+    assert garbled(LINE, 9600, 9600) == LINE
+    assert garbled(b"", 9600, 115200) == b""
+
+
+@pytest.mark.parametrize(("sent", "heard"), list(permutations(get_args(Baud), 2)))
+def test_at_a_wrong_rate_no_line_survives(sent: int, heard: int) -> None:
+    got = garbled(LINE * 5, sent, heard)
+    assert LINE[:-2] not in got
+    assert b"ap0" not in got
+
+
+def test_a_byte_at_half_the_rate_is_what_the_bits_say() -> None:
+    # At 9600 baud 0x00 is nine low bits and a high one. At 19200 these are 18 low samples without a
+    # stop bit in time.
+    assert garbled(b"\x00", 9600, 19200) == b"\x00"
+    # At 9600 baud 0xff is one low bit. At 19200 it is a start bit, then a 0 and ones.
+    assert garbled(b"\xff", 9600, 19200) == b"\xfe"
+
+
+def test_a_rate_that_is_nearly_right_is_right() -> None:
+    assert garbled(LINE, 115200, 117000) == LINE

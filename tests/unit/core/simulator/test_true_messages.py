@@ -1,0 +1,41 @@
+"""Tests of the simulated robot's true state as it is published on the bus."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from acsard.core.config.settings import OdometryConfig
+from acsard.core.incoming.commands import Arrival
+from acsard.core.incoming.imu import reading
+from acsard.core.messages.encodings import FORMATS, Format, encode
+from acsard.core.messages.schema import Time, Vector3
+from acsard.core.simulator.simulated_robot import Sight
+from acsard.core.simulator.true_messages import true_pose, turn_rate
+from acsard.core.values import Pose
+
+SIGHT = Sight(7, Pose(1.5, -2.0, math.pi / 2), 0.25)
+WALL_NS = 1_700_000_003_250_000_001
+
+
+def test_the_true_pose_is_the_one_that_was_seen_with_the_time_of_the_look() -> None:
+    told = true_pose(SIGHT, WALL_NS)
+    assert told.header.stamp == Time(1_700_000_003, 250_000_001)
+    assert told.pose.position == Vector3(1.5, -2.0, 0.0)
+    turn = told.pose.orientation
+    assert (turn.x, turn.y, turn.z, turn.w) == pytest.approx((0.0, 0.0, 0.5**0.5, 0.5**0.5))
+
+
+def test_the_truth_is_in_no_frame_of_odometry() -> None:
+    frames = OdometryConfig()
+    assert true_pose(SIGHT, WALL_NS).header.frame_id not in (frames.odom_frame, frames.base_frame)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_what_its_gyro_says_is_read_as_any_gyros(form: Format) -> None:
+    said = turn_rate(SIGHT, "base_link", 0.02, WALL_NS)
+    got = reading(Arrival("imu", True, encode(said, form), "", 7, None, ""))
+    assert (got.at_ns, got.stamp_ns, got.rate) == (7, WALL_NS, 0.25)
+    assert got.variance == pytest.approx(0.0004)
+    assert said.orientation_covariance[0] == said.linear_acceleration_covariance[0] == -1.0

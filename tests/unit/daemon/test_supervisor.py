@@ -1,0 +1,81 @@
+"""A TLS gateway that cannot be started is reported and retried while the robot drives on."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from acsard.core.values import Event
+from acsard.daemon.supervisor import DOOR, ROUTER, Kind, keep_door
+
+
+async def told(kind: Kind = DOOR) -> Event:
+    """Return the first event of the supervisor."""
+    said: asyncio.Queue[Event] = asyncio.Queue()
+    keeper = asyncio.create_task(keep_door(["door"], said.put_nowait, kind))
+    first = asyncio.create_task(said.get())
+    await asyncio.wait({keeper, first}, return_when=asyncio.FIRST_COMPLETED, timeout=10.0)
+    assert not keeper.done(), keeper
+    keeper.cancel()
+    return await first
+
+
+def test_without_a_program_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    event = asyncio.run(told())
+    assert (event.name, event.level) == ("door_ended", "warning")
+    assert "could not be started" in event.text
+
+
+def test_without_room_for_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", full)
+    assert "can't start new thread" in asyncio.run(told()).text
+
+
+def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
+    """Replace the `acsard` program by this text."""
+    file = where / "program"
+    file.write_text(f"#!{sys.executable} -S\n{text}\n")
+    file.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(file))
+
+
+def test_one_that_falls_silent_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("acsard.daemon.supervisor.SILENT_NS", 0)
+    pid = tmp_path / "pid"
+    stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
+    program(monkeypatch, tmp_path, stops + "os.kill(os.getpid(), 19)")
+    assert "stopped, or hung" in asyncio.run(told()).text
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid.read_text()), signal.SIGCONT)
+
+
+@pytest.mark.parametrize("code", [2, 78])
+def test_a_router_that_cannot_be_one_is_not_tried_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int
+) -> None:
+    program(monkeypatch, tmp_path, f"raise SystemExit({code})")
+    said: list[Event] = []
+    assert asyncio.run(keep_door(["router"], said.append, ROUTER)) == code
+    assert said == []
+
+
+@pytest.mark.parametrize(("kind", "code"), [(DOOR, 78), (ROUTER, 75), (ROUTER, 1)])
+def test_one_that_may_be_opened_later_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
+) -> None:
+    program(monkeypatch, tmp_path, f"raise SystemExit({code})")
+    event = asyncio.run(told(kind))
+    assert (event.name, event.text.partition(";")[0]) == (
+        kind.ended,
+        f"{kind.name} ended with {code}",
+    )

@@ -1,0 +1,52 @@
+"""A recording stores rounded estimates, and a checksum of the exact ones."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.values import Estimate, Pose
+from acsard.recording.recorded_steps import (
+    Unfinished,
+    UnfinishedError,
+    checksum,
+    microposes,
+    unfinished,
+)
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+def estimates() -> list[Estimate]:
+    tape = Tape()
+    World(recorder=tape).drive(0.5, 0.2, seconds=0.5)
+    return [estimate for taken in tape.taken for estimate in taken.outputs.estimates]
+
+
+def test_poses_are_told_in_millionths() -> None:
+    (first, *_) = estimates()
+    turned = replace(first, pose=Pose(1.0000004, -2.0000006, 3.1415926))
+    assert microposes([turned]) == ((1_000_000, -2_000_001, 3_141_593),)
+
+
+def test_a_checksum_goes_on_and_sees_every_bit() -> None:
+    every = estimates()
+    assert checksum(every[5:], checksum(every[:5], 0)) == checksum(every, 0)
+    last = every[-1]
+    nudged = replace(last, pose=replace(last.pose, x=last.pose.x + 1e-16 + last.pose.x * 2e-16))
+    assert checksum([*every[:-1], nudged], 0) != checksum(every, 0)
+    turned = replace(last, positions=(0.0, *last.positions[1:]))
+    assert checksum([*every[:-1], turned], 0) != checksum(every, 0)
+
+
+def test_what_came_into_a_step_that_did_not_end_comes_back_whole() -> None:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, 0.2, seconds=0.5)
+    world.call("stop")
+    for number, taken in enumerate(tape.taken):
+        step = Unfinished(number, taken.inputs)
+        assert unfinished(step.encode()) == step
+    for data in (b"", b"none", Unfinished(1, taken.inputs).encode()[:-1]):
+        with pytest.raises(UnfinishedError, match="not a step"):
+            unfinished(data)

@@ -1,0 +1,98 @@
+"""Tests of a recording's timeline in sentences."""
+
+from __future__ import annotations
+
+from acsard.core.config.settings import Config, McuConfig
+from acsard.recording.rows import decode, encode
+from acsard.recording.timeline import TimelineEntry, TimelineWriter, summary
+from acsard.recording.timeline import told as once
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+BOARD = Config(mcu=McuConfig(port="/dev/ttyACM0"))
+
+
+def story(tape: Tape, without: range = range(0)) -> list[TimelineEntry]:
+    teller = TimelineWriter()
+    steps = [s for s in decode(encode(0, tape.taken)) if s.number not in without]
+    return [one for step in steps for one in teller.step(step)]
+
+
+def driven() -> Tape:
+    tape = Tape()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    world.call("stop")
+    world.run(0.5)
+    world.loop.leaving = True
+    world.run(0.1)
+    return tape
+
+
+def test_it_begins_and_ends_with_the_daemon_and_tells_each_drive() -> None:
+    tape = driven()
+    told = story(tape)
+    assert (told[0].name, told[-1].name) == ("start", "end")
+    (drive,) = [one for one in told if one.name == "drive"]
+    assert drive.by == "app"
+    assert drive.text == "drove 0.85 m in 2.0 s"
+    assert "stop" in [one.name for one in told]
+    assert [one.seconds for one in told] == sorted(one.seconds for one in told)
+
+
+def test_a_silence_of_a_computer_that_did_not_run_is_not_told_as_the_boards() -> None:
+    tape = Tape()
+    world = World(BOARD, recorder=tape)
+    world.drive(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.05)
+        world.stall(0.2)
+        world.run(0.02)
+    world.hold(0.5, seconds=1.0)
+    with world.mcu.mute():
+        world.run(0.2)
+    told = [one for one in story(tape) if one.name in ("link_stale", "link_late")]
+    late, stale = told
+    assert (late.name, stale.name) == ("link_late", "link_stale")
+    assert late.text.startswith("this computer did not run for 0.2")
+    assert summary(told) == "1 computer stall, 1 board silence"
+
+
+def test_what_is_heard_in_a_silence_is_no_other_silence() -> None:
+    tape = Tape()
+    world = World(BOARD, recorder=tape)
+    world.run(1.0)
+    with world.mcu.mute():
+        world.run(5.0)
+    world.run(1.0)
+    told = story(tape)
+    assert [one.name for one in told if one.name in ("link_stale", "link_heard")] == [
+        "link_stale", "link_heard"
+    ]  # fmt: skip
+    said = [one for _, outputs, _ in tape.taken for one in outputs.events]
+    assert summary([once(one, 1) for one in said]) == "1 board silence"
+
+
+def test_steps_that_are_missing_are_said() -> None:
+    gaps = [one.text for one in story(driven(), range(100, 160)) if one.name == "gap"]
+    assert gaps == ["60 steps are missing before this one"]
+
+
+def test_a_list_says_who_stopped_it_and_how_often_what_happened() -> None:
+    events = [
+        TimelineEntry(1.0, "stop", "stopped", by="joe"),
+        TimelineEntry(2.0, "stop", "stopped", by="joe"),
+        TimelineEntry(2.5, "mode", "driving"),
+        TimelineEntry(3.0, "fault", "a wheel", "error"),
+        TimelineEntry(4.0, "command_refused", "old", count=7),
+        TimelineEntry(5.0, "link_stale", "silent", "warning", count=2),
+        TimelineEntry(6.0, "link_down", "gone", "warning", count=2),
+        TimelineEntry(7.0, "mcu_restarted", "has started", "warning", count=2),
+    ]
+    assert summary(events) == (
+        "2 stops, 1 fault, 7 refused commands, 2 board silences, 2 lost ports, 2 board restarts "
+        "(stopped by joe)"
+    )
+    assert summary([]) == ""
+    assert summary([], starts=True) == "start"
+    assert summary([TimelineEntry(1.0, "fault", "a wheel")], starts=True) == "start, 1 fault"

@@ -1,0 +1,157 @@
+"""Tests of the place of a client and of the page that asks.
+
+A client is on the machine, or uses one of the robot's names.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.web.callers import (
+    MAINTAINER,
+    MOST_COOKIES,
+    Asked,
+    RefusedError,
+    Who,
+    cookie_name,
+    host_name,
+    is_loopback,
+    place,
+    require_own_origin,
+    tokens_in,
+    unmapped,
+)
+
+NAMES = frozenset({"robot.local", "192.168.1.7"})
+
+
+@pytest.mark.parametrize(
+    ("peer", "host"),
+    [
+        ("127.0.0.1", "localhost:8080"),
+        ("127.0.0.1", "127.0.0.1:8080"),
+        ("127.8.8.8", "LOCALHOST"),
+        ("::1", "[::1]:8080"),
+        ("::ffff:127.0.0.1", "127.0.0.1"),
+    ],
+)
+def test_who_is_at_the_machine_is_here(peer: str, host: str) -> None:
+    assert place(Asked(peer, False, host), NAMES) == "here"
+    assert place(Asked(peer, True, host), NAMES) == "here"
+
+
+@pytest.mark.parametrize(
+    ("asked", "reason"),
+    [
+        # a name of an attacker that resolves to 127.0.0.1
+        (Asked("127.0.0.1", False, "evil.example:8080"), "host"),
+        (Asked("127.0.0.1", False, ""), "host"),
+        (Asked("127.0.0.1", False, "localhost.evil.example"), "host"),
+        (Asked("127.0.0.1", False, "robot.local"), "host"),
+        (Asked("192.168.1.50", False, "robot.local"), "plain"),
+        (Asked("192.168.1.50", False, "localhost"), "plain"),
+        (Asked("192.168.1.50", True, "localhost"), "host"),
+        (Asked("192.168.1.50", True, "127.0.0.1"), "host"),
+        (Asked("192.168.1.50", True, "evil.example"), "host"),
+        (Asked("", True, ""), "host"),
+    ],
+)
+def test_any_other_name_is_refused(asked: Asked, reason: str) -> None:
+    with pytest.raises(RefusedError) as found:
+        place(asked, NAMES)
+    assert found.value.reason == reason
+
+
+@pytest.mark.parametrize("secure", [False, True])
+@pytest.mark.parametrize("host", ["localhost:8080", "robot.local"])
+def test_who_comes_through_a_proxy_is_nobody_we_know(secure: bool, host: str) -> None:
+    with pytest.raises(RefusedError, match="proxy") as found:
+        place(Asked("127.0.0.1", secure, host, proxied=True), NAMES)
+    assert found.value.reason == "proxy"
+
+
+@pytest.mark.parametrize("host", ["robot.local:8443", "Robot.Local", "192.168.1.7:8443"])
+def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
+    assert place(Asked("192.168.1.50", True, host), NAMES) == "away"
+    # A client on the machine that uses the public name needs a token like others.
+    assert place(Asked("127.0.0.1", True, host), NAMES) == "away"
+
+
+@pytest.mark.parametrize(
+    ("secure", "host", "origin", "site"),
+    [
+        (False, "localhost:8080", "http://localhost:8080", None),
+        (False, "localhost:8080", "http://localhost:8080", "same-origin"),
+        (True, "robot.local", "https://Robot.local", None),
+        (False, "localhost:8080", None, None),  # a program without a browser
+        (False, "localhost:8080", None, "none"),  # typed into the address bar
+    ],
+)
+def test_our_own_page_and_programs_may(
+    secure: bool, host: str, origin: str | None, site: str | None
+) -> None:
+    require_own_origin(Asked("127.0.0.1", secure, host, origin, site))
+
+
+@pytest.mark.parametrize(
+    ("origin", "site"),
+    [
+        ("http://evil.example", None),
+        ("https://localhost:8080", None),
+        ("http://localhost:8081", None),
+        ("http://localhost", None),
+        ("null", None),
+        ("", None),
+        (None, "cross-site"),
+        (None, "same-site"),
+    ],
+)
+def test_another_page_may_not(origin: str | None, site: str | None) -> None:
+    with pytest.raises(RefusedError) as found:
+        require_own_origin(Asked("127.0.0.1", False, "localhost:8080", origin, site))
+    assert found.value.reason == "origin"
+
+
+def test_a_role_may_what_those_below_it_may() -> None:
+    viewer, operator = Who("viewer", "tv"), Who("operator", "phone")
+    assert [viewer.may("viewer"), viewer.may("operator")] == [True, False]
+    assert [operator.may("operator"), operator.may("maintainer")] == [True, False]
+    assert MAINTAINER.may("maintainer")
+    operator.require("operator", "clear")
+    with pytest.raises(RefusedError, match="clear is for operators; you are viewer") as found:
+        viewer.require("operator", "clear")
+    assert found.value.reason == "role"
+
+
+def test_names_are_told_from_ports_and_loopback_from_names() -> None:
+    assert [host_name(h) for h in ("A:1", "[::1]:2", "1.2.3.4", "[fe80::1")] == [
+        "a", "::1", "1.2.3.4", "fe80::1",
+    ]  # fmt: skip
+    assert [is_loopback(a) for a in ("127.1.2.3", "::1", "localhost", "10.0.0.1", "")] == [
+        True, True, False, False, False,
+    ]  # fmt: skip
+
+
+def test_an_ipv4_address_is_itself_by_a_socket_for_both() -> None:
+    told = ("::ffff:192.168.1.7", "192.168.1.7", "::1", "fe80::ffff:1", "")
+    assert [unmapped(one) for one in told] == ["192.168.1.7", "192.168.1.7", "::1", *told[3:]]
+
+
+def test_a_page_looks_at_its_own_cookie_first_and_at_no_other_robot_s() -> None:
+    """A browser sends the cookies of all ports of a host."""
+    shown = {
+        cookie_name("robot1", 8444): "elsewhere",
+        cookie_name("robot2", 8443): "another robot's",
+        cookie_name("robot1-8443", 8443): "another robot's",
+        cookie_name("robot1", 8443): "own",
+        "session": "no token",
+    }
+    assert tokens_in(shown, "robot1", 8443) == ["own", "elsewhere"]
+    assert tokens_in(shown, "robot3", 8443) == []
+    assert tokens_in({}, "robot1", 8443) == []
+
+
+def test_of_cookies_without_end_a_few_are_looked_at_and_the_page_s_own_is_one() -> None:
+    shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
+    told = tokens_in(shown, "robot1", 8443)
+    assert (len(told), told[0]) == (MOST_COOKIES, "8443")

@@ -1,0 +1,106 @@
+"""The page may start only a few commands, and each option has only a few values."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.calibration.guided.needs import NEEDS, SIMULATED
+from acsard.calibration.guided.ways import KINDS
+from acsard.cli import calibrate, mcu
+from acsard.web.frames import Begin, FrameError
+from acsard.web.jobs import KEY, Reach, words
+
+REACH = Reach("/etc/acsard/acsard.toml", "tls/robot:7447", "robot2", "/etc/acsard/tls")
+PORTS = ("/dev/acsar", "sim")
+
+
+def parsed(given: list[str]) -> argparse.Namespace:
+    """Return the arguments as the command line parses them."""
+    parser = argparse.ArgumentParser()
+    verbs = parser.add_subparsers()
+    calibrate.add(verbs)
+    mcu.add(verbs)
+    return parser.parse_args(given)
+
+
+def test_a_check_has_the_port_and_the_file_and_asks() -> None:
+    args = parsed(words(Begin("check", "/dev/acsar"), REACH, PORTS))
+    assert (args.port, args.config) == ("/dev/acsar", REACH.config)
+    assert args.json_lines
+    assert [args.yes, args.write, args.wheels_are_lifted] == [False] * 3
+
+
+@pytest.mark.parametrize("way", ["", *NEEDS])
+def test_a_calibration_goes_to_the_robot_of_the_page_and_asks(way: str) -> None:
+    positions = "sim/pose" if way == "positions" else ""
+    args = parsed(words(Begin("calibrate", "", way, positions), REACH, ()))
+    assert (args.connect, args.id, args.tls) == (REACH.endpoint, REACH.robot_id, REACH.tls)
+    assert (args.way or "", args.positions or "") == (way, positions)
+    assert args.json_lines
+    assert [args.yes, args.write, args.log] == [False, False, None]
+
+
+def test_what_is_not_known_is_not_given() -> None:
+    given = words(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
+    assert not any(word.startswith(("--config", "--tls", "--way", "--positions")) for word in given)
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [
+        Begin("check", ""),
+        Begin("check", "/etc/passwd"),
+        Begin("check", "--yes"),
+        Begin("check", "sim", "tape"),
+        Begin("check", "sim", "", "sim/pose"),
+        Begin("calibrate", "sim"),
+        Begin("calibrate", "", "guess"),
+        Begin("calibrate", "", "tape --write"),
+        Begin("calibrate", "", "tape", "sim/pose"),
+        Begin("calibrate", "", "positions"),
+        Begin("calibrate", "", "positions", "--yes"),
+        Begin("calibrate", "", "positions", "slam/**"),
+        Begin("calibrate", "", "positions", "slam\npose"),
+        Begin("calibrate", "", "positions", "x" * 81),
+    ],
+)
+def test_what_is_not_offered_is_refused_in_words(wish: Begin) -> None:
+    with pytest.raises(FrameError) as caught:
+        words(wish, REACH, PORTS)
+    assert caught.value.about == "begin"
+    assert str(caught.value)
+
+
+@given(st.sampled_from(["check", "calibrate"]), st.text(), st.text(), st.text())
+def test_no_text_becomes_an_option_of_its_own(
+    what: str, port: str, way: str, positions: str
+) -> None:
+    try:
+        given = words(Begin(what, port, way, positions), REACH, PORTS)  # type: ignore[arg-type]
+    except FrameError:
+        return
+    names = {word.partition("=")[0] for word in given}
+    assert names <= {
+        "mcu", "check", "calibrate", "--json-lines", "--config", "--port", "--connect", "--id",
+        "--tls", "--way", "--positions",
+    }  # fmt: skip
+
+
+def test_the_ways_are_those_there_are() -> None:
+    assert {name: kind.needs for name, kind in KINDS.items()} == NEEDS
+
+
+def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:
+    way, why = SIMULATED
+    assert way in NEEDS
+    assert [one for one in NEEDS if one not in why] == []
+
+
+@pytest.mark.parametrize("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
+def test_what_is_no_key_is_no_positions(key: str) -> None:
+    assert not KEY.match(key)
+    assert KEY.match("sim/pose")

@@ -1,0 +1,91 @@
+"""A page that is opened gets the last minute: thinned, bounded and without invented values."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.messages.schema import Figure, RobotState, Spread, Time, Twist, Vector3
+from acsard.core.values import NS_PER_S
+from acsard.web.last_minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
+
+SPREAD = Spread(10, 5.0, 20.0, 80.0)
+
+STATE = RobotState(
+    Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
+    [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {},
+    figures={"period_lateness": Figure(SPREAD, SPREAD)},
+)  # fmt: skip
+
+WISHED = Twist(Vector3(0.3, 0.0, 0.0), Vector3(0.0, 0.0, -0.6))
+
+
+def lived(seconds: float, look_ns: int = NS_PER_S // 10) -> Minute:
+    """Return the minute after each state was offered as it arrived."""
+    minute = Minute()
+    for at_ns in range(0, int(seconds * NS_PER_S) + 1, look_ns):
+        if minute.due(at_ns):
+            minute.add(at_ns, replace(STATE, linear=at_ns / NS_PER_S), WISHED)
+    return minute
+
+
+def columns(plotted: Plotted) -> list[list[float | None]]:
+    told = msgspec.to_builtins(plotted)
+    wheels = told.pop("wheels")
+    return [*told.values(), *wheels]
+
+
+def test_a_row_has_what_each_line_of_the_plots_shows() -> None:
+    minute = Minute()
+    minute.add(NS_PER_S, STATE, WISHED)
+    told = minute.plotted(3 * NS_PER_S)
+    assert told.age == [2000]
+    assert (told.linear, told.angular) == ([0.25], [-0.5])
+    assert (told.wished_linear, told.wished_angular) == ([0.3], [-0.6])
+    assert told.wheels == [[1.0], [2.0], [3.0], [4.0]]
+    assert (told.late_p99, told.late_max) == ([0.02], [0.08])
+
+
+def test_it_is_the_last_minute_and_no_more_however_long_it_goes_on() -> None:
+    told = lived(150.0).plotted(150 * NS_PER_S)
+    assert 0.98 * LASTS_NS / STEP_NS < len(told.age) <= LASTS_NS // STEP_NS + 1
+    assert max(told.age) <= LASTS_NS // 1_000_000
+    assert told.age == sorted(told.age, reverse=True)
+    assert told.linear[-1] == 150.0
+    assert {len(column) for column in columns(told)} == {len(told.age)}
+
+
+@pytest.mark.parametrize("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
+def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns: int) -> None:
+    told = lived(100.0, look_ns).plotted(100 * NS_PER_S)
+    assert len(told.age) <= ROWS
+    assert max(told.age) > 0.98 * LASTS_NS / 1_000_000
+
+
+def test_what_nobody_heard_or_measured_is_none() -> None:
+    minute = Minute()
+    unknown = replace(STATE, linear=None, angular=None, wheels=[], figures={})
+    minute.add(0, unknown, None)
+    told = minute.plotted(1)
+    assert told.age == [0]
+    assert {value for column in columns(told)[1:] for value in column} == {None}
+
+
+def test_before_anything_was_heard_there_is_nothing() -> None:
+    assert {len(column) for column in columns(Minute().plotted(NS_PER_S))} == {0}
+
+
+def test_when_nothing_is_heard_any_more_the_minute_passes() -> None:
+    minute = lived(10.0)
+    assert 0 < len(minute.plotted(65 * NS_PER_S).age) < len(minute.plotted(10 * NS_PER_S).age)
+    assert minute.plotted(71 * NS_PER_S).age == []
+
+
+def test_a_whole_minute_is_small() -> None:
+    """Values have at most three decimals, so that a phone loads them fast."""
+    minute = Minute()
+    for n in range(1000):
+        if minute.due(n * STEP_NS):
+            minute.add(n * STEP_NS, replace(STATE, linear=n / 7, angular=-n / 7), WISHED)
+    assert len(msgspec.json.encode(minute.plotted(1000 * STEP_NS))) < 32768

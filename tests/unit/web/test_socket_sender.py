@@ -1,0 +1,26 @@
+"""A key is due as often as requested, whatever else is sent meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+
+from aiohttp import web
+from aiohttp.test_utils import make_mocked_request
+
+from acsard.web.counts import Counts
+from acsard.web.socket_sender import Following, Outgoing
+from acsard.web.streams import Stream
+
+
+def test_a_key_that_is_due_soon_does_not_wait_longer_for_what_goes_out_before() -> None:
+    async def story() -> None:
+        out = Outgoing(web.WebSocketResponse(), make_mocked_request("GET", "/ws"), Counts(), "")
+        one = Following("acsar", "state", "acsar", 0.1)
+        one.stream = Stream()
+        due = await out._send_due(one, 100.03)
+        assert abs(due - 100.1) < 1e-6
+        woken = [await out._send_due(one, now) for now in (100.04, 100.07, 100.099)]
+        assert woken == [due] * 3
+        assert await out._send_due(one, due) > due
+
+    asyncio.run(story())
