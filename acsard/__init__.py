@@ -13,7 +13,7 @@ a network end in another process, the gateway.
 `Robot.step` does, in this order: fold the feedback into odometry, choose one command, gate it by
 mode, limit it, invert the kinematics, report. No other function decides anything.
 
-The packages follow, each with the packages that it may import below it. `pyproject.toml` states
+Where to look: each package may import only those below it. `pyproject.toml` states
 this order as contracts, and `lint-imports` checks them.
 
     cli/             one file per verb: its options, one call into another package, its output
