@@ -26,8 +26,9 @@ checks for 0.25 s that the commands are not late. More zeros let it decide soone
 jitter of a busy machine.
 """
 
-OPENED_S = 2.0
-"""Time after which zeros must count, s. It also gives another driver time to leave."""
+OPENED_S = 4.0
+"""Time after which zeros must count, s. The delay of a sender that is new to the daemon is checked
+for up to 2 s, if its source has so long a timeout. It also gives another driver time to leave."""
 
 ZEROS = 3
 """Number of zeros at the end, in case the network loses one."""
@@ -51,8 +52,12 @@ STALE_NS = NS_PER_S // 10
 DRIVES_NS = NS_PER_S // 2
 """Time after the last wish for a speed for which a sender counts as driving."""
 
-LONGEST_NS = 10 * NS_PER_S
-"""Longest possible timeout of a source. The robot follows no speed that is older."""
+LONGEST_S = 10.0
+"""Longest possible timeout of a source, s. The robot follows no speed that is older."""
+
+LATE_NS = NS_PER_S // 10
+"""Time by which the robot may follow a speed for longer than its source's timeout, because the
+command took this long to arrive."""
 
 NEVER = ("inactive", "stopped", "fault", "leaving")
 """Modes in which no command counts."""
@@ -131,12 +136,16 @@ class Commander:
         self._moved_ns = now_ns if moves else None
         return wish
 
-    def end(self, now_ns: int) -> Wish | None:
-        """Release the robot; return a zero if it may still follow a speed of this sender."""
+    def end(self, now_ns: int, timeout_s: float = LONGEST_S) -> Wish | None:
+        """Release the robot; return a zero if it may still follow a speed of this sender.
+
+        `timeout_s` is the timeout of the sender's source. A zero later than that would only stop
+        the next driver.
+        """
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
         self._lead = False
-        if moved_ns is None or now_ns - moved_ns > LONGEST_NS:
+        if moved_ns is None or now_ns - moved_ns > timeout_s * NS_PER_S + LATE_NS:
             return None
         return self._zero(now_ns)
 

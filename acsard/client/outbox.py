@@ -11,7 +11,7 @@ from concurrent.futures import Future
 from threading import Condition, Thread
 from typing import Never
 
-from acsard.client.commander import Commander, Wish
+from acsard.client.commander import LONGEST_S, Commander, Wish
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
 
@@ -42,10 +42,14 @@ class Outbox:
             self._news.notify_all()
         return silence
 
-    def release(self, commander: Commander) -> None:
-        """Forget a sender; send a zero first if the robot may still follow it."""
+    def release(self, commander: Commander, timeout_s: float = LONGEST_S) -> None:
+        """Forget a sender; send a zero first if the robot may still follow it.
+
+        `timeout_s` is the timeout of the sender's source.
+        """
         with self._news:
-            put, zero = self._senders.pop(commander, None), commander.end(clock.mono_ns())
+            put = self._senders.pop(commander, None)
+            zero = commander.end(clock.mono_ns(), timeout_s)
             if put is not None and zero is not None:
                 self._zeros.append((put, zero))
             self._news.notify_all()

@@ -48,11 +48,6 @@ class Watch(Follower):
         Raises `ZError` after the session was closed.
         """
         news = []
-        # Replies come first, because a published state is newer.
-        while self._answers:
-            state = self._read(self._answers.popleft())
-            if state is not None and self.answered(state, now):
-                news.append(state)
         for _ in range(QUEUED):  # bounded, so that a flood cannot hold the caller
             sample = self._states.try_recv()
             if sample is None:
@@ -60,6 +55,11 @@ class Watch(Follower):
             state = self._read(sample)
             if state is not None:
                 self.published(state, now)
+                news.append(state)
+        # Replies come last: `answered` compares stamps, and `published` does not.
+        while self._answers:
+            state = self._read(self._answers.popleft())
+            if state is not None and self.answered(state, now):
                 news.append(state)
         if self.asks(now):
             self._robot.ask(STATE, self._answers.append)

@@ -17,6 +17,7 @@ import foxglove
 import zenoh
 
 from acsard.client import Client
+from acsard.client.commander import LONGEST_S
 from acsard.client.watch import Watch
 from acsard.core.messages.topics import full_key
 from acsard.core.ros.names import full_name
@@ -65,6 +66,7 @@ class Bridge:
         self._settings = Settings(robot, self._notices, facts.tables)
         topic = full_name(ros.namespace, "cmd_vel")
         self._drives = Drives(self._viewer, topic, self._notices, facts.forbidden)
+        self._drives.timeout_s = self._timeout_s(facts)
         context = foxglove.Context()
         self._relay = Relay(robot, context, self._wake.set)
         self._relay.offer(facts)
@@ -82,8 +84,11 @@ class Bridge:
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
-        """Run rounds until `end` is called."""
+        """Run rounds until `end` is called; raise the error that ended the sending thread."""
+        dead = self._drives.outbox.dead
         while not self._ended.is_set():
+            if dead.done():
+                dead.result()
             self._wake.wait(ROUND_S)
             time.sleep(GATHER_S)
             self._wake.clear()
@@ -148,7 +153,13 @@ class Bridge:
     def _learn(self, facts: Facts) -> None:
         self._relay.offer(facts)
         self._drives.forbidden = facts.forbidden
+        self._drives.timeout_s = self._timeout_s(facts)
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
+
+    def _timeout_s(self, facts: Facts) -> float:
+        """Return the timeout of the source as which viewers drive, s."""
+        sources = facts.config.commands.sources
+        return next((one.timeout for one in sources if one.name == self._robot.source), LONGEST_S)
 
     def _follow(self, driving: bool) -> None:
         """Follow the robot's state while a viewer drives."""

@@ -13,7 +13,7 @@ from threading import Lock
 import zenoh
 
 from acsard.client import Client
-from acsard.client.commander import Commander, Wish
+from acsard.client.commander import LONGEST_S, Commander, Wish
 from acsard.client.outbox import Outbox
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.values import NS_PER_S
@@ -71,6 +71,8 @@ class Drives:
         self._viewers: dict[int, Viewer] = {}
         self._lock = Lock()
         self.outbox = Outbox()
+        self.timeout_s = LONGEST_S
+        """Timeout of the source as which viewers drive, s."""
 
     # Called by the server's threads.
 
@@ -110,7 +112,12 @@ class Drives:
             self._notices.say("warning", "drive", f"{self.topic}: refused: {error}")
             return
         robot = viewer.robot
-        silence_ns = self.outbox.take(viewer.commander, lambda due: self._send(robot, due), wished)
+        with self._lock:
+            if self._viewers.get(client) is not viewer:
+                return  # it has left, and its last zero is on its way
+            silence_ns = self.outbox.take(
+                viewer.commander, lambda due: self._send(robot, due), wished
+            )
         if viewer.is_slow(silence_ns):
             self._notices.say("warning", "drive", TOO_SLOW)
 
@@ -122,7 +129,7 @@ class Drives:
                 return
             encoding, _ = viewer.channels.pop(channel, ("", ""))
             if encoding:
-                self.outbox.release(viewer.commander)
+                self.outbox.release(viewer.commander, self.timeout_s)
             if not viewer.channels:
                 del self._viewers[client]
 
@@ -139,7 +146,7 @@ class Drives:
         """Send one zero for each viewer that drives, then stop the sending thread."""
         with self._lock:
             for viewer in self._viewers.values():
-                self.outbox.release(viewer.commander)
+                self.outbox.release(viewer.commander, self.timeout_s)
             self._viewers.clear()
         self.outbox.end(END_S)
 

@@ -13,6 +13,7 @@ import zenoh
 from msgspec import Struct
 
 from acsard.client import Client
+from acsard.client.commander import LONGEST_S
 from acsard.client.follower import Follower, restarted
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
@@ -24,6 +25,7 @@ from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
 from acsard.host.threads import in_thread
+from acsard.web.commands import SOURCE
 from acsard.web.counts import Counts
 from acsard.web.last_minute import Minute, Plotted
 from acsard.web.streams import UNREADY, Stream, Streams
@@ -63,6 +65,8 @@ class About(Struct, frozen=True):
     state_hz: float
     recordings: str
     """Directory of the black box, "" if nothing is recorded."""
+    timeout_s: float = LONGEST_S
+    """Timeout of the source as which the page drives, s."""
 
 
 def _path() -> Track:
@@ -148,11 +152,12 @@ class Robots:
         while True:
             now_ns = clock.mono_ns()
             now = now_ns / NS_PER_S
+            if states.number != seen:
+                seen, asked = states.number, states.asked
+                self._take(states.raw() or ("", b""), states.at_ns, now_ns, asked=asked)
+            # Replies come last: `answered` compares stamps, and `published` does not.
             while self._answers:
                 self._take(encoded(self._answers.popleft()), now_ns, now_ns, asked=True)
-            if states.number != seen:
-                seen = states.number
-                self._take(states.raw() or ("", b""), states.at_ns, now_ns, asked=False)
             if follower.asks(now) and (asking is None or asking.done()):
                 asking = asyncio.create_task(self._ask_state())
             quiet = follower.silent(now)
@@ -239,6 +244,11 @@ class Robots:
                 float(config["limits"]["angular_speed"]),
                 float(config["rates"]["state"]),
                 str(config["record"]["directory"]),
+                next(
+                    float(source["timeout"])
+                    for source in config["commands"]["sources"]
+                    if source["name"] == SOURCE
+                ),
             )
         except (MendableError, DecodeError, msgspec.MsgspecError, KeyError, TypeError, ValueError):
             return False

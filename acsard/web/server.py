@@ -17,6 +17,7 @@ from aiohttp import web
 from msgspec import Struct
 
 from acsard.client import Client
+from acsard.client.commander import LONGEST_S
 from acsard.core.config.settings import Config
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
@@ -202,6 +203,7 @@ def _about(wanted: Wanted) -> About:
         config.limits.angular_speed,
         config.rates.state,
         config.record.directory,
+        next((one.timeout for one in config.commands.sources if one.name == SOURCE), LONGEST_S),
     )
 
 

@@ -195,7 +195,7 @@ class Viewer:
 
         This is the last command that is sent for this viewer.
         """
-        self._hand.outbox.release(self._commander)
+        self._hand.outbox.release(self._commander, self._robots.about.timeout_s)
 
     def _call(self, frame: Call) -> None:
         if frame.call == "stop":

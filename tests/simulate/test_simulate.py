@@ -257,7 +257,7 @@ def test_a_paired_run_finds_no_difference_to_the_same_code_and_names_the_first_o
     assert pair.sides[1].package.is_relative_to(tmp_path)
     assert pair.differs(one)[0] == ""
     pair.close()
-    words = other / "acsard" / "core" / "motion" / "words.py"
+    words = other / "acsard" / "core" / "motion" / "arbiter_text.py"
     text = words.read_text(encoding="utf-8")
     words.write_text(text.replace("waiting for a command", "no command"), encoding="utf-8")
     pair = Pair(OURS, other)

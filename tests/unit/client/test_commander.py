@@ -7,7 +7,7 @@ import pytest
 from acsard.client.commander import (
     DRIVES_NS,
     GATHER_NS,
-    LONGEST_NS,
+    LONGEST_S,
     SILENCE_NS,
     STALE_NS,
     Commander,
@@ -128,7 +128,13 @@ def test_a_sender_that_does_not_drive_leaves_nothing(panel: Panel) -> None:
     panel.press(REST)
     assert panel.commander.end(panel.now) is None
     panel.press(AHEAD, times=2)
-    assert panel.commander.end(panel.now + LONGEST_NS + NS_PER_S) is None
+    assert panel.commander.end(panel.now + int((LONGEST_S + 1.0) * NS_PER_S)) is None
+
+
+def test_a_sender_that_leaves_after_its_timeout_stops_no_other_driver(panel: Panel) -> None:
+    for late, zero in ((0.0, Wish(REST)), (0.2, Wish(REST)), (0.4, None)):
+        panel.press(AHEAD, times=2)
+        assert panel.commander.end(panel.now + int(late * NS_PER_S), 0.25) == zero
 
 
 def test_a_sender_drives_while_it_asks_for_a_speed(panel: Panel) -> None:

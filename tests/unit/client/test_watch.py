@@ -71,8 +71,19 @@ def test_an_answer_counts_less_than_a_state_that_was_published_later() -> None:
     robot.answer = sample_of(at(2))
     watch.look(ASK_S + 0.1)
     robot.queue.append(sample_of(at(3)))
-    assert watch.look(ASK_S + 0.2) == [at(2), at(3)]
+    assert watch.look(ASK_S + 0.2) == [at(3)]
     assert watch.state == at(3)
+
+
+def test_a_state_that_was_published_before_the_answer_comes_first() -> None:
+    robot = Robot()
+    watch = Watch(robot, 0.0)
+    robot.queue.append(sample_of(at(1)))
+    watch.look(0.0)
+    robot.answer = sample_of(at(3))
+    watch.look(ASK_S + 0.1)
+    robot.queue.append(sample_of(at(2)))
+    assert watch.look(ASK_S + 0.2) == [at(2), at(3)]
 
 
 def test_messages_that_cannot_be_read_are_counted_until_one_can() -> None:

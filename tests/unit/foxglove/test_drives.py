@@ -18,8 +18,10 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Message, Time, Twist, TwistStamped, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
+from acsard.foxglove import drives
 from acsard.foxglove.drives import Drives, Viewer
 from acsard.foxglove.notices import Notices
+from acsard.foxglove.twists import wish
 from acsard.host import clock
 from tests.system.harness import until
 
@@ -95,6 +97,24 @@ def viewers() -> Iterator[Viewers]:
     for session in viewers.sessions.values():
         session.free.set()
     viewers.drives.end()
+
+
+def test_a_viewer_that_leaves_while_its_message_is_decoded_sends_nothing_more(
+    viewers: Viewers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewers.publish(1, AHEAD)
+    viewers.heard(1, 2)
+
+    def leaves(encoding: str, data: bytes) -> Wish:
+        viewers.drives.withdrawn(1, 1)
+        viewers.drives.withdrawn(1, 2)
+        return wish(encoding, data)
+
+    monkeypatch.setattr(drives, "wish", leaves)
+    viewers.publish(1, AHEAD)
+    viewers.drives.outbox.flush(HOLD_S)
+    assert viewers.heard(1, 3)[-1].twist == REST
+    assert not viewers.drives.driving()
 
 
 def test_a_stamp_is_passed_on_and_the_zeros_around_go_by_the_same_clock(viewers: Viewers) -> None:
