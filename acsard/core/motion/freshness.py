@@ -59,9 +59,16 @@ GAP_NS = 2 * NS_PER_S
 sender paused for this time by its own stamps. Numbers tell a pause from commands that were lost."""
 
 STANDS_NS = 10_000
-"""Two stamps that are no further apart show a clock that was set back by the time between the
-arrivals. Zenoh's own clock never goes back: it advances by a fraction of a microsecond for each
-message until the wall clock has caught up."""
+"""Two stamps that are no further apart, of commands that did not arrive together, show a clock that
+was set back by the time between the arrivals. Zenoh's own clock never goes back: it advances by a
+fraction of a microsecond for each message until the wall clock has caught up."""
+
+APART_NS = NS_PER_S // 500
+"""Commands that arrive within this time of each other may have been sent together."""
+
+TOGETHER_NS = NS_PER_S // 2000
+"""Commands that arrive within this time of each other come out of one queue, the oldest first. A
+check waits for the last of them. No sender may send more than 1000 commands a second."""
 
 FORGIVE_NS, FORGIVE_RATE = NS_PER_S, 60
 """How much later a foreign clock may become without an adjustment that shows: 1 s, and 1 s more for
@@ -90,7 +97,7 @@ class _Proof:
     def __init__(self, delay: int, at_ns: int, needed_ns: int, share: int, again: bool) -> None:
         self.least = self._first = self._half = delay
         self._length_ns, self._share, self._again = needed_ns // 2, share, again
-        self._begun_ns = at_ns
+        self._begun_ns = self._last_ns = at_ns
         self._halves: list[tuple[int, int]] = []
         """When each of the last halves began, and its minimum."""
 
@@ -102,7 +109,7 @@ class _Proof:
         if not -EARLY_NS <= delay - self._first <= WAVER_NS:
             return "failed"
         proven = False
-        if at_ns - self._begun_ns >= self._length_ns:
+        if at_ns - self._begun_ns >= self._length_ns and at_ns - self._last_ns > TOGETHER_NS:
             self._halves.append((self._begun_ns, self._half))
             self._begun_ns += self._length_ns
             if at_ns - self._begun_ns >= self._length_ns:
@@ -110,6 +117,7 @@ class _Proof:
             self._half = delay
             proven = self._constant(at_ns)
         self._half, self.least = min(self._half, delay), min(self.least, delay)
+        self._last_ns = at_ns
         return "proven" if proven and delay - self.least <= timeout_ns else "open"
 
     def _constant(self, at_ns: int) -> bool:
@@ -203,7 +211,7 @@ class _Clock:
             return
         if departed > GAP_NS:
             self._paused = True
-        elif departed <= STANDS_NS:
+        elif departed <= STANDS_NS and silence > APART_NS:
             self._before = self._delay if self._before is None else self._before
             self._shown += silence - departed
 
@@ -268,6 +276,7 @@ class _Clock:
 
     def _believe(self, proof: _Proof, verdict: Verdict) -> Verdict:
         self.state, self._least, self._proof = "known", proof.least, None
+        self._early = 0
         self._forget_adjustments()
         return verdict
 

@@ -409,3 +409,38 @@ def test_the_numbers_of_1024_senders_without_stamps_are_remembered(
     for number in range(others):
         numbered(freshness, 1, 1, f"stranger {number}")
     assert numbered(freshness, 2, 5) == verdict
+
+
+# what a proof must not believe
+
+
+def test_bursts_of_a_backlog_never_count_although_one_ends_a_half() -> None:
+    """The oldest command of a burst has the delay of the burst before."""
+    freshness, start = Freshness(), 15 * NS_PER_S
+    backlog, number, last, accepted = 5 * NS_PER_S, 0, 0, []
+    for burst in range(34):
+        at_ns = start + burst * 240 * MS
+        while number <= burst * 24 * 1.2 and 10 * NS_PER_S + number * 10 * MS <= at_ns:
+            at_ns = last = max(at_ns, last + 400_000)
+            sent_ns = 10 * NS_PER_S + number * 10 * MS
+            command = Command("high", GO, at_ns, sent_ns, "a", sequence=number, steady=True)
+            if freshness.judge(command, TIMEOUT) == "fresh":
+                accepted.append(at_ns - sent_ns)
+            number += 1
+    assert [delay for delay in accepted if delay > backlog // 2] == []
+
+
+def test_commands_that_come_in_pairs_show_no_clock_that_was_set_back() -> None:
+    sender = Sender()
+    for pair in range(60 * 50):
+        delay = min(3 * NS_PER_S, pair * 10 * MS)
+        rise = min(10 * MS, 3 * NS_PER_S - max(0, pair - 1) * 10 * MS) if pair < 301 else 0
+        verdicts = sender.each([(18_100_000 + rise, delay), (1_900_000, delay + 1_900_000)])
+        assert "set" not in verdicts, f"after {pair / 50} s"
+
+
+def test_a_new_proof_forgets_how_early_the_commands_before_it_were() -> None:
+    sender, period = Sender(known=False, steady=True), 20 * MS
+    falls = [100] * 16 + [54] + [44] * 14 + [36] * 14 + [28] * 14 + [20] * 14
+    verdicts = sender.each([(period, delay * MS) for delay in falls])
+    assert verdicts.count("first") == 2
