@@ -147,11 +147,16 @@ class Content(NamedTuple):
     """True if the chunk is read to its end."""
 
     def head(self, data: bytes) -> bytes:
-        """Return the head of a chunk that consists of this content and `LAST_BLOCK`."""
+        """Return the head of a chunk that consists of this content.
+
+        If the content is not complete, `LAST_BLOCK` belongs behind it.
+        """
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)
         out = b"".join([out for _, out, _ in blocks])
-        length = self.end - self.begin - _HEAD.size + len(LAST_BLOCK)
+        length = self.end - self.begin - _HEAD.size
+        if not self.complete:
+            length += len(LAST_BLOCK)
         return _head(min(times), max(times), len(out), zlib.crc32(out), length)
 
 

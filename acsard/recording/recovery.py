@@ -90,25 +90,20 @@ def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 def _in_place(recording: Recording, part: Path, cut: str) -> bool:
     """Write the end behind the last whole second, over the torn part.
 
-    A chunk that was cut gets its true head. Returns False if the disk has no room; then the file is
-    as it was. No second is given up to gain room: some disks give none back, and then all would be
-    lost.
+    A chunk that was cut, or whose head is not the true one, gets its true head. If a power cut
+    interrupted an earlier recovery behind the end, only the heads are written. Returns False if the
+    disk has no room; then the file is as it was. No second is given up to gain room: some disks
+    give none back, and then all would be lost.
     """
     gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
         gist.message(topic, wall_ns, data)
         if topic == "events":
             gist.event(event_of(recording, data))
-    if recording.ended:
+    before = part.read_bytes()
+    puts, size = _mends(before, gist.closing(cut))
+    if not puts and size == len(before):
         return True
-    before, end = part.read_bytes(), _end(gist.closing(cut))
-    *_, chunk = (None, *[found.chunk for found in walk(before) if found.chunk and found.messages])
-    # Another process has changed the file since it was read.
-    if chunk is None:
-        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
-    puts = [(chunk.end, end)]
-    if not chunk.complete:
-        puts = [(chunk.end, LAST_BLOCK + end), (chunk.begin, chunk.head(before))]
     with part.open("r+b", buffering=0) as stream:
         try:
             for at, data in puts:
@@ -121,10 +116,33 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
             if error.errno not in FULL:
                 raise
             return False
-        at, data = puts[0]
-        stream.truncate(at + len(data))
+        stream.truncate(size)
         os.fsync(stream.fileno())
     return True
+
+
+def _mends(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
+    """Return the offset and the bytes of each write that finishes a file, and the file's new size.
+
+    The end comes before the heads, because the disk may have no room for it.
+    """
+    heads: list[tuple[int, bytes]] = []
+    chunk = None
+    for found in walk(before):
+        if isinstance(found.record, Footer) and before.startswith(MAGIC, found.end):
+            return heads, found.end + len(MAGIC)
+        if found.chunk and found.messages:
+            chunk = found.chunk
+            if chunk.complete and not before.startswith(head := chunk.head(before), chunk.begin):
+                heads.append((chunk.begin, head))
+    # Another process has changed the file since it was read.
+    if chunk is None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+    end = _end(last)
+    if not chunk.complete:
+        end = LAST_BLOCK + end
+        heads.append((chunk.begin, chunk.head(before)))
+    return [(chunk.end, end), *heads], chunk.end + len(end)
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:

@@ -45,6 +45,12 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
     return list(Recording(path).messages())
 
 
+def read_by_the_library(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        found = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        return [(channel.topic, one.log_time, one.data) for _, channel, one in found]
+
+
 @pytest.mark.parametrize("room", [False, True])
 def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
     data: bytes, room: bool, tmp_path: Path
@@ -162,6 +168,45 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
             whole.unlink()
         assert list(tmp_path.iterdir()) == []
     assert len(counts) > 5
+
+
+@pytest.mark.parametrize("tail", [b"", bytes(700), b"torn"])
+def test_a_kill_before_the_head_of_a_complete_chunk_leaves_a_file_that_any_reader_opens(
+    growing: bytes, tail: bytes, tmp_path: Path
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(growing + LAST_BLOCK + tail)
+    before = messages(part)
+    assert recover(part, whole, "crash", room=False) == ""
+    assert read_by_the_library(whole) == before == messages(whole)
+
+
+def test_a_power_cut_before_the_heads_of_several_chunks_leaves_a_file_that_any_reader_opens(
+    data: bytes, tmp_path: Path
+) -> None:
+    part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(data)
+    part.write_bytes(data)
+    before = messages(part)
+    for begin, _ in chunks(data):
+        bad[begin : begin + len(GROWING)] = GROWING
+    part.write_bytes(bad[: chunks(data)[-1][1]])
+    assert recover(part, whole, "crash", room=False) == ""
+    assert read_by_the_library(whole) == before == messages(whole)
+
+
+@pytest.mark.parametrize("tail", [b"", bytes(700)])
+def test_a_recovery_in_place_that_a_power_cut_interrupted_is_completed(
+    growing: bytes, tail: bytes, tmp_path: Path
+) -> None:
+    """The power failed when the end was on the disk and the chunk's head was not."""
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(growing)
+    recover(part, whole, "crash", room=False)
+    recovered, begin = whole.read_bytes(), growing.index(GROWING)
+    part.write_bytes(recovered[:begin] + GROWING + recovered[begin + len(GROWING) :] + tail)
+    whole.unlink()
+    assert recover(part, whole, "open", room=False) == ""
+    assert whole.read_bytes() == recovered
 
 
 def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
