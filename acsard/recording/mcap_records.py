@@ -11,12 +11,20 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import msgspec
+import zstandard
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metadata
 
 from acsard.recording.chunks import Content, Message, content, places
-from acsard.recording.end_record import DAMAGE
+
+DAMAGE = (
+    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
+    ValueError, OverflowError, EOFError, MemoryError,
+)  # fmt: skip
+"""Exceptions that the MCAP library raises for bytes that are not valid MCAP."""
 
 MAGIC = b"\x89MCAP0\r\n"
 """Magic bytes at the start of every MCAP file."""
