@@ -64,6 +64,12 @@ _BESIDE_DATA = _MESSAGE.size - 9
 
 _LONGEST_FRAME_HEAD = 18
 
+_BLOCK_BYTES = 1 << 17
+"""Largest size of a zstd block, compressed and uncompressed."""
+
+_BLOCK_EFFORT = 1 << 10
+"""Effort of unpacking a block of no bytes: it takes about as long as 1 KiB of a large one."""
+
 _REPEATED = 1
 """Kind of a zstd block that is one byte, repeated."""
 
@@ -145,6 +151,8 @@ class Content(NamedTuple):
     messages: list[Message]
     complete: bool
     """True if the chunk is read to its end."""
+    effort: int = 0
+    """Number of bytes that were unpacked to read it, with an allowance for each block."""
 
     def head(self, data: bytes) -> bytes:
         """Return the head of a chunk that consists of this content.
@@ -176,13 +184,14 @@ def content(data: bytes, begin: int) -> Content | None:
         return None
     messages: list[Message] = []
     whole = Content(begin, at, messages, False)
-    rest, size, wanted = bytearray(), 0, _MESSAGE.size
+    rest, size, effort, wanted = bytearray(), 0, 0, _MESSAGE.size
     # Messages of which the last one ends in a block to come.
     waiting: list[Message] = []
     try:
         for end, out, last in _blocks(data, at):
             rest += out
             size += len(out)
+            effort += len(out) + _BLOCK_EFFORT
             if size > MOST_BYTES:
                 break
             if rest and len(rest) < wanted:
@@ -198,8 +207,8 @@ def content(data: bytes, begin: int) -> Content | None:
                 whole = Content(begin, end, messages, last)
     except zstandard.ZstdError:
         # A damaged block, and with it all that was compressed after it.
-        pass
-    return whole
+        effort += _BLOCK_BYTES
+    return whole._replace(effort=effort)
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
@@ -217,7 +226,7 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
         last, kind, size = bool(block & 1), block >> 1 & 3, block >> 3
         end = begin + 3 + (1 if kind == _REPEATED else size)
         # The zeros behind a torn place of a disk are empty blocks without end.
-        if not block or end > len(data):
+        if not block or size > _BLOCK_BYTES or end > len(data):
             return
         yield end, stream.decompress(data[begin:end]), last
         begin = end
