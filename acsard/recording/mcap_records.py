@@ -29,9 +29,10 @@ DAMAGE = (
 MAGIC = b"\x89MCAP0\r\n"
 """Magic bytes at the start of every MCAP file."""
 
-MOST_EFFORT = 64
+MOST_EFFORT = 256
 """Number of bytes that may be unpacked without a complete chunk, for each byte of the file. The
-chunks of the recordings of the tests take 5 to 13, and a damaged chunk is read twice.
+chunks of the recordings of the tests take 5 to 13. A damaged chunk is read up to three times, and
+a damaged block in it counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
@@ -87,6 +88,11 @@ def walk(data: bytes) -> Iterator[Found]:
             continue
         if found is None:
             after = chunks.later(at + 1)
+            if claimed < (after or len(data)):
+                beside = chunks.read(claimed)
+                # The next chunk is damaged as well, and its beginning can be read.
+                if beside is not None and beside.messages:
+                    after = claimed
             cut = after is None and not chunks.spent and (not opcode or claimed > len(data))
             end = len(data) if cut or chunks.spent else after or claimed
             found = Found(None, chunk, end, not cut)

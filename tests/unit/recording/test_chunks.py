@@ -187,8 +187,10 @@ def test_many_chunks_that_share_their_end_take_a_time_in_proportion(data: bytes)
     assert not any(one.messages for one in found)
 
 
-def test_a_whole_chunk_behind_many_damaged_ones_is_read() -> None:
+def test_the_beginnings_of_damaged_chunks_and_a_whole_one_behind_them_are_read() -> None:
     bad = bytearray(COMPLETE)
     bad[ENDS[4] + 3 :] = b"\xff" * (len(bad) - ENDS[4] - 3)
-    *_, last = walk(MAGIC + bytes(bad) * 200 + COMPLETE)
+    *damaged, last = walk(MAGIC + bytes(bad) * 200 + COMPLETE)
     assert last.messages == ALL
+    assert [one.messages for one in damaged] == [ALL[:15]] * 200
+    assert all(one.damaged for one in damaged)
