@@ -16,7 +16,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Attachment, DataEnd, Footer, Metadata
 
 from acsard.host.errors import RecordingError
-from acsard.recording.chunks import LAST_BLOCK
+from acsard.recording.chunks import LAST_BLOCK, places
 from acsard.recording.end_record import END, EndRecord, fields
 from acsard.recording.file import Gist, Recording, event_of, rewrite
 from acsard.recording.mcap_records import MAGIC, walk
@@ -46,7 +46,7 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
             return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
-            if recording.damaged or seen.st_size > NOTHING_BYTES:
+            if recording.damaged or seen.st_size > NOTHING_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has nothing whole in it")
             part.unlink()
             return ""
@@ -69,7 +69,8 @@ def _begins(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    return any(found.messages for found in walk(part.read_bytes()))
+    """Return whether a chunk was begun in the file, even if none of it can be read."""
+    return any(True for _ in places(part.read_bytes(), 0))
 
 
 def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:

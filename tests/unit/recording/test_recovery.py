@@ -156,8 +156,9 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
         size = dice.randrange(begin, len(growing)) if number else len(growing)
         part.write_bytes(growing[:size] + tail)
         before = messages(part)
-        recover(part, whole, "crash", room)
+        said = recover(part, whole, "crash", room)
         counts.add(len(before))
+        assert bool(before) != ("nothing whole in it" in said)
         if before:
             recording, last = Recording(whole), closing(whole)
             assert list(recording.messages()) == before
@@ -165,9 +166,25 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
             assert (recording.whole, recording.cut, last.cut) == (True, "crash", "crash")
             with whole.open("rb") as stream:
                 assert len(list(make_reader(stream).iter_messages())) == len(before)
-            whole.unlink()
-        assert list(tmp_path.iterdir()) == []
+        assert list(tmp_path.iterdir()) == [whole]
+        whole.unlink()
     assert len(counts) > 5
+
+
+@pytest.mark.parametrize("room", [False, True])
+@pytest.mark.parametrize("at", ["file", "chunk"])
+def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
+    growing: bytes, at: str, room: bool, tmp_path: Path
+) -> None:
+    """The seconds behind the bad sector cannot be read by this version."""
+    part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(growing)
+    begin = growing.index(GROWING) + len(GROWING) if at == "chunk" else 0
+    bad[begin : begin + 512] = bytes(512)
+    assert len(bad) < NOTHING_BYTES
+    part.write_bytes(bad)
+    assert "stays so, as a.mcap" in recover(part, whole, "crash", room)
+    assert whole.read_bytes() == bad
+    assert not part.exists()
 
 
 @pytest.mark.parametrize("tail", [b"", bytes(700), b"torn"])
