@@ -15,6 +15,7 @@ from pathlib import Path
 from mcap.data_stream import RecordBuilder
 from mcap.records import Attachment, DataEnd, Footer, Metadata
 
+from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import LAST_BLOCK, places
 from acsard.recording.end_record import END, EndRecord, fields
@@ -50,7 +51,11 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
                 raise RecordingError(f"{part} has nothing whole in it")
             part.unlink()
             return ""
-        if not room or not _beside(recording, part, whole, cut):
+        if room and _beside(recording, part, whole, cut):
+            if recording.damaged:
+                lost = many(recording.damaged, "damaged place is", "damaged places are")
+                told = f"{lost} left out of {whole.name}"
+        else:
             if not _in_place(recording, part, cut):
                 told = f"{whole.name} was cut and has no end, for want of room; all else is in it"
             part.rename(whole)
