@@ -57,6 +57,9 @@ _ENDLESS = (1 << 63) - 1
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Head of a message's record: opcode, length, channel, sequence, and the time twice."""
 
+MOST_DATA = MOST_IN_MESSAGE - _MESSAGE.size
+"""Largest size of the data of a message that is read, in bytes."""
+
 _CHECKED = struct.Struct("<HQ")
 
 _BESIDE_DATA = _MESSAGE.size - 9
