@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from mcap.reader import make_reader
 from acsard.core.config.settings import Config
 from acsard.recording.chunks import GROWING, LAST_BLOCK
 from acsard.recording.end_record import closing
-from acsard.recording.file import Recording
+from acsard.recording.file import CHUNK_BYTES, About, Recording, Writing
 from acsard.recording.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import World
@@ -243,6 +244,25 @@ def test_a_recovery_in_place_that_a_power_cut_interrupted_is_completed(
     whole.unlink()
     assert recover(part, whole, "open", room=False) == ""
     assert whole.read_bytes() == recovered
+
+
+def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file(
+    tmp_path: Path,
+) -> None:
+    part, whole, count = tmp_path / "a.part", tmp_path / "a.mcap", 20
+    writing = Writing(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    for second in range(count):
+        writing.add("state", second, bytes(CHUNK_BYTES))
+        writing.end_chunk()
+    writing.flush()
+    writing.close()
+    tracemalloc.start()
+    try:
+        assert recover(part, whole, "crash", room=False) == ""
+        assert tracemalloc.get_traced_memory()[1] < count * CHUNK_BYTES / 2
+    finally:
+        tracemalloc.stop()
+    assert len(messages(whole)) == count
 
 
 def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
