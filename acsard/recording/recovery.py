@@ -13,13 +13,13 @@ from io import FileIO
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
-from mcap.records import Attachment, DataEnd, Footer, Metadata
+from mcap.records import Attachment, DataEnd, Footer, McapRecord, Metadata
 
 from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import LAST_BLOCK, places
 from acsard.recording.end_record import END, EndRecord, fields
-from acsard.recording.file import Gist, Recording, event_of, rewrite
+from acsard.recording.file import Gist, Index, Recording, event_of, rewrite
 from acsard.recording.mcap_records import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -133,21 +133,29 @@ def _mends(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int
     The end comes before the heads, because the disk may have no room for it.
     """
     heads: list[tuple[int, bytes]] = []
-    chunk = None
+    chunk, index = None, Index()
     for found in walk(before):
         if isinstance(found.record, Footer) and before.startswith(MAGIC, found.end):
             return heads, found.end + len(MAGIC)
+        # A record behind a chunk belongs to an earlier end, which the new one overwrites.
+        if found.record is not None and chunk is None:
+            length = len(_encoded(found.record))
+            index.record(found.record, found.end - length, length)
         if found.chunk and found.messages:
             chunk = found.chunk
+            index.chunk()
+            for message in chunk.messages:
+                index.message(message.channel, message.wall_ns)
             if chunk.complete and not before.startswith(head := chunk.head(before), chunk.begin):
                 heads.append((chunk.begin, head))
     # Another process has changed the file since it was read.
     if chunk is None:
         raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
-    end = _end(last)
+    before_end = b""
     if not chunk.complete:
-        end = LAST_BLOCK + end
+        before_end = LAST_BLOCK
         heads.append((chunk.begin, chunk.head(before)))
+    end = before_end + _end(last, index, chunk.end + len(before_end))
     return [(chunk.end, end), *heads], chunk.end + len(end)
 
 
@@ -159,10 +167,22 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
     os.fsync(stream.fileno())
 
 
-def _end(last: EndRecord) -> bytes:
-    """Return the smallest end of a valid MCAP file, without an index. Readers do not need one."""
+def _end(last: EndRecord, index: Index, at: int) -> bytes:
+    """Return the end of an MCAP file, to be written at that offset.
+
+    Its summary leaves out the copy of the schema and the channels, for want of room. Without the
+    statistics, some readers take the file for an empty one.
+    """
+    closing = Metadata(END, fields(last))
+    data = _encoded(closing)
+    index.record(closing, at, len(data))
+    data += _encoded(DataEnd(0))
+    summary_at = at + len(data)
+    return data + _encoded(*index.records(), Footer(summary_at, 0, 0)) + MAGIC
+
+
+def _encoded(*records: McapRecord) -> bytes:
     builder = RecordBuilder()
-    Metadata(END, fields(last)).write(builder)
-    DataEnd(0).write(builder)
-    Footer(0, 0, 0).write(builder)
-    return bytes(builder.end()) + MAGIC
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())

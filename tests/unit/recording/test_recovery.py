@@ -6,6 +6,7 @@ import errno
 import os
 import random
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
 from acsard.recording.chunks import GROWING, LAST_BLOCK
-from acsard.recording.end_record import closing
+from acsard.recording.end_record import END, closing
 from acsard.recording.file import CHUNK_BYTES, About, Recording, Writing
 from acsard.recording.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
@@ -244,6 +245,35 @@ def test_a_recovery_in_place_that_a_power_cut_interrupted_is_completed(
     whole.unlink()
     assert recover(part, whole, "open", room=False) == ""
     assert whole.read_bytes() == recovered
+
+
+@pytest.mark.parametrize("cut", ["growing", "between chunks", "in the end"])
+def test_a_recovery_in_place_writes_the_statistics_and_the_index_of_a_finished_file(
+    data: bytes, growing: bytes, cut: str, tmp_path: Path
+) -> None:
+    """Some MCAP readers show an empty file without them."""
+    part, whole, copy = tmp_path / "a.part", tmp_path / "a.mcap", tmp_path / "b.mcap"
+    behind = data.rindex(b"acsard end", 0, -400) + 300
+    cuts = {"growing": growing, "between chunks": data[: chunks(data)[-1][1]]}
+    part.write_bytes(cuts.get(cut, data[:behind]))
+    copy.write_bytes(part.read_bytes())
+    assert recover(part, whole, "crash", room=False) == ""
+    other = tmp_path / "c.mcap"
+    assert recover(copy, other, "crash", room=True) == ""
+    found = []
+    for path in (whole, other):
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            named = [record.name for record in reader.iter_metadata()]
+            attached = [record.name for record in reader.iter_attachments()]
+            # A copy unites short chunks.
+            found.append((replace(summary.statistics, chunk_count=0), named, attached))
+    assert found[0] == found[1]
+    assert found[0][0].message_count == len(messages(whole))
+    assert found[0][1:] == (["acsard", END], ["acsard.toml"])
 
 
 def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file(
