@@ -57,12 +57,21 @@ _ENDLESS = (1 << 63) - 1
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Head of a message's record: opcode, length, channel, sequence, and the time twice."""
 
+MOST_DATA = MOST_IN_MESSAGE - _MESSAGE.size
+"""Largest size of the data of a message that is read, in bytes."""
+
 _CHECKED = struct.Struct("<HQ")
 
 _BESIDE_DATA = _MESSAGE.size - 9
 """Number of bytes of a message's head that the record's length counts."""
 
 _LONGEST_FRAME_HEAD = 18
+
+_BLOCK_BYTES = 1 << 17
+"""Largest size of a zstd block, compressed and uncompressed."""
+
+_BLOCK_EFFORT = 1 << 10
+"""Effort of unpacking a block of no bytes: it takes about as long as 1 KiB of a large one."""
 
 _REPEATED = 1
 """Kind of a zstd block that is one byte, repeated."""
@@ -145,13 +154,20 @@ class Content(NamedTuple):
     messages: list[Message]
     complete: bool
     """True if the chunk is read to its end."""
+    effort: int = 0
+    """Number of bytes that were unpacked to read it, with an allowance for each block."""
 
     def head(self, data: bytes) -> bytes:
-        """Return the head of a chunk that consists of this content and `LAST_BLOCK`."""
+        """Return the head of a chunk that consists of this content.
+
+        If the content is not complete, `LAST_BLOCK` belongs behind it.
+        """
         times = [message.wall_ns for message in self.messages]
         blocks = _blocks(data[: self.end], self.begin + _HEAD.size)
         out = b"".join([out for _, out, _ in blocks])
-        length = self.end - self.begin - _HEAD.size + len(LAST_BLOCK)
+        length = self.end - self.begin - _HEAD.size
+        if not self.complete:
+            length += len(LAST_BLOCK)
         return _head(min(times), max(times), len(out), zlib.crc32(out), length)
 
 
@@ -171,13 +187,14 @@ def content(data: bytes, begin: int) -> Content | None:
         return None
     messages: list[Message] = []
     whole = Content(begin, at, messages, False)
-    rest, size, wanted = bytearray(), 0, _MESSAGE.size
+    rest, size, effort, wanted = bytearray(), 0, 0, _MESSAGE.size
     # Messages of which the last one ends in a block to come.
     waiting: list[Message] = []
     try:
         for end, out, last in _blocks(data, at):
             rest += out
             size += len(out)
+            effort += len(out) + _BLOCK_EFFORT
             if size > MOST_BYTES:
                 break
             if rest and len(rest) < wanted:
@@ -193,8 +210,8 @@ def content(data: bytes, begin: int) -> Content | None:
                 whole = Content(begin, end, messages, last)
     except zstandard.ZstdError:
         # A damaged block, and with it all that was compressed after it.
-        pass
-    return whole
+        effort += _BLOCK_BYTES
+    return whole._replace(effort=effort)
 
 
 def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
@@ -212,7 +229,7 @@ def _blocks(data: bytes, at: int) -> Iterator[tuple[int, bytes, bool]]:
         last, kind, size = bool(block & 1), block >> 1 & 3, block >> 3
         end = begin + 3 + (1 if kind == _REPEATED else size)
         # The zeros behind a torn place of a disk are empty blocks without end.
-        if not block or end > len(data):
+        if not block or size > _BLOCK_BYTES or end > len(data):
             return
         yield end, stream.decompress(data[begin:end]), last
         begin = end

@@ -19,6 +19,7 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
 from acsard.core.values import NS_PER_S, Event, Instant
+from acsard.recording.chunks import MOST_DATA
 from acsard.recording.directory import Ring, Run, leave
 from acsard.recording.file import About, Writing
 from acsard.recording.recorded_steps import Start, Taken, runs
@@ -145,16 +146,25 @@ class OnDisk:
             self._begin(ring, self._start, steps[0].inputs.now)
         assert self._writing is not None
         for at in range(0, len(steps), BATCH):
-            batch = steps[at : at + BATCH]
-            self._writing.add("steps", batch[0].inputs.now.wall_ns, encode(self._number, batch))
-            self._number += len(batch)
-            self._handed += len(batch)
-            self._last = batch[-1].inputs.now
-            for _, outputs, _ in batch:
-                for event in outputs.events:
-                    self._writing.event(told(event, outputs.now.wall_ns))
-                    if event.name in HAPPENED:
-                        self._happened(ring, outputs.now)
+            self._add(ring, self._writing, steps[at : at + BATCH])
+
+    def _add(self, ring: Ring, writing: Writing, batch: list[Taken]) -> None:
+        """Write steps as one message, or as several if one would be too large to be read."""
+        data = encode(self._number, batch)
+        if len(data) > MOST_DATA and len(batch) > 1:
+            half = len(batch) // 2
+            self._add(ring, writing, batch[:half])
+            self._add(ring, writing, batch[half:])
+            return
+        writing.add("steps", batch[0].inputs.now.wall_ns, data)
+        self._number += len(batch)
+        self._handed += len(batch)
+        self._last = batch[-1].inputs.now
+        for _, outputs, _ in batch:
+            for event in outputs.events:
+                writing.event(told(event, outputs.now.wall_ns))
+                if event.name in HAPPENED:
+                    self._happened(ring, outputs.now)
 
     def _begin(self, ring: Ring, start: Start, now: Instant) -> None:
         ring.trim(now)

@@ -2,26 +2,37 @@
 
 from __future__ import annotations
 
+import io
+import os
 import struct
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
-import zstandard
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Metadata
 from msgspec import Meta, Struct
 
 from acsard.core.formatting import printable
+from acsard.recording.mcap_records import DAMAGE, HEAD, MAGIC
 
 END = "acsard end"
 """Name of the MCAP metadata record that holds the `EndRecord`."""
 
-DAMAGE = (
-    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
-    ValueError, OverflowError, EOFError, MemoryError,
-)  # fmt: skip
-"""Exceptions that the MCAP library raises for bytes that are not valid MCAP."""
+TAIL_BYTES = 1 << 16
+"""Number of bytes at the end of a file in which its end record is searched for. The recordings
+of the tests have 1141 bytes from the record to the end of the file, and long names take some more.
+"""
+
+_NAMED = struct.pack("<I", len(END)) + END.encode()
+"""Name of the record with its length, as it follows the record's head."""
+
+_FOOTER = HEAD.pack(Opcode.FOOTER, 20)
+"""Head of the MCAP footer, which has 20 bytes."""
+
+_DATA_END = HEAD.pack(Opcode.DATA_END, 4)
+"""Head of the record that follows the end record."""
 
 Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """Time in ns since 1970 that fits in a signed 64-bit integer."""
@@ -71,13 +82,34 @@ def fields(last: EndRecord) -> dict[str, str]:
 
 
 def closing(path: Path) -> EndRecord | None:
-    """Read the closing of a file. Return None if it has no closing or cannot be read."""
+    """Read the closing of a file. Return None if it has no closing or cannot be read.
+
+    Only the last `TAIL_BYTES` are read. The index of the file is not followed, and no chunk is
+    unpacked, because a file from a stranger may claim gigabytes.
+    """
     try:
         with path.open("rb") as stream:
-            for metadata in make_reader(stream).iter_metadata():
-                if metadata.name == END:
-                    return msgspec.convert(metadata.metadata, EndRecord, strict=False)
+            if stream.read(len(MAGIC)) != MAGIC:
+                return None
+            stream.seek(max(len(MAGIC), stream.seek(0, os.SEEK_END) - TAIL_BYTES))
+            found = _last(stream.read(TAIL_BYTES))
+            return msgspec.convert(found, EndRecord, strict=False) if found else None
     except (OSError, *DAMAGE):
         # A caller that reads the whole file reports the damage.
-        pass
+        return None
+
+
+def _last(tail: bytes) -> dict[str, str] | None:
+    """Return the content of the last end record in the last bytes of a file that is finished."""
+    footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
+    if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
+        return None
+    at = tail.rfind(_NAMED, HEAD.size, footer_at)
+    while at >= 0:
+        begin = at - HEAD.size
+        opcode, length = HEAD.unpack_from(tail, begin)
+        if opcode == Opcode.METADATA and tail.startswith(_DATA_END, at + length):
+            record: Metadata = Metadata.read(ReadDataStream(io.BytesIO(tail[at : at + length])))
+            return record.metadata
+        at = tail.rfind(_NAMED, HEAD.size, at)
     return None

@@ -120,6 +120,53 @@ class Gist:
         return EndRecord(self._wall_ns, self._last_ns, said, cut, why)
 
 
+class Index:
+    """Statistics and index of a file, for the summary at its end."""
+
+    def __init__(self) -> None:
+        self._places: list[McapRecord] = []
+        self._totals = Statistics(
+            attachment_count=0,
+            channel_count=len(CHANNELS),
+            channel_message_counts=dict.fromkeys(NUMBERS.values(), 0),
+            chunk_count=0,
+            message_count=0,
+            message_start_time=0,
+            message_end_time=0,
+            metadata_count=0,
+            schema_count=1,
+        )
+
+    def message(self, channel: int, wall_ns: int) -> None:
+        """Take a message; `wall_ns` is its wall-clock time in ns since 1970, at least 0."""
+        totals = self._totals
+        first_ns = totals.message_start_time if totals.message_count else wall_ns
+        totals.message_start_time = min(first_ns, wall_ns)
+        totals.message_end_time = max(totals.message_end_time, wall_ns)
+        totals.message_count += 1
+        counts = totals.channel_message_counts
+        counts[channel] = counts.get(channel, 0) + 1
+
+    def chunk(self) -> None:
+        """Count a chunk."""
+        self._totals.chunk_count += 1
+
+    def record(self, record: McapRecord, at: int, length: int) -> None:
+        """Take a record of any kind, with its offset and its length in the file, bytes."""
+        if isinstance(record, Metadata):
+            self._totals.metadata_count += 1
+            self._places.append(MetadataIndex(at, length, record.name))
+        elif isinstance(record, Attachment):
+            self._totals.attachment_count += 1
+            times, size = (record.log_time, record.create_time), len(record.data)
+            kind = record.media_type
+            self._places.append(AttachmentIndex(at, length, *times, size, record.name, kind))
+
+    def records(self) -> list[McapRecord]:
+        """Return the records of the summary."""
+        return [self._totals, *self._places]
+
+
 class Writing:
     """A recording that is being written.
 
@@ -129,18 +176,7 @@ class Writing:
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
         self._gist = Gist(about)
-        self._indexes: list[McapRecord] = []
-        self._totals = Statistics(
-            attachment_count=1,
-            channel_count=len(CHANNELS),
-            channel_message_counts=dict.fromkeys(NUMBERS.values(), 0),
-            chunk_count=0,
-            message_count=0,
-            message_start_time=0,
-            message_end_time=0,
-            metadata_count=2,
-            schema_count=1,
-        )
+        self._index = Index()
         self._chunk: Growing | None = None
         self._chunk_at: int | None = None
         """Offset of the chunk's head in the file; None if nothing of it is written yet."""
@@ -158,27 +194,18 @@ class Writing:
         self._write(Header("acsard", f"acsard {about.version}"))
         meta = msgspec.to_builtins(about)
         del meta["config"]
-        self._add_metadata("acsard", {key: str(value) for key, value in meta.items()})
-        self._add_attachment("acsard.toml", about.wall_ns, about.config.encode())
+        self._write(Metadata("acsard", {key: str(value) for key, value in meta.items()}))
+        text, at_ns = about.config.encode(), about.wall_ns
+        self._write(Attachment(at_ns, at_ns, "acsard.toml", "text/plain", text))
         for record in _definitions():
             self._write(record)
         self.flush()
 
-    def _write(self, record: McapRecord) -> tuple[int, int]:
-        """Write a record, and return its offset and its length."""
+    def _write(self, record: McapRecord) -> None:
         builder = RecordBuilder()
         record.write(builder)
         at = self._file.tell()
-        return at, self._file.write(builder.end())
-
-    def _add_metadata(self, name: str, content: dict[str, str]) -> None:
-        at, length = self._write(Metadata(name, content))
-        self._indexes.append(MetadataIndex(at, length, name))
-
-    def _add_attachment(self, name: str, wall_ns: int, data: bytes) -> None:
-        kind = "text/plain"
-        at, length = self._write(Attachment(wall_ns, wall_ns, name, kind, data))
-        self._indexes.append(AttachmentIndex(at, length, wall_ns, wall_ns, len(data), name, kind))
+        self._index.record(record, at, self._file.write(builder.end()))
 
     @property
     def size(self) -> int:
@@ -196,12 +223,7 @@ class Writing:
             self.end_chunk()
         self._chunk = self._chunk or Growing()
         self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
-        totals = self._totals
-        first_ns = totals.message_start_time if totals.message_count else wall_ns
-        totals.message_start_time = min(first_ns, wall_ns)
-        totals.message_end_time = max(totals.message_end_time, wall_ns)
-        totals.message_count += 1
-        totals.channel_message_counts[NUMBERS[topic]] += 1
+        self._index.message(NUMBERS[topic], wall_ns)
 
     def event(self, told: TimelineEntry) -> None:
         """Add an event, and take it for the summary."""
@@ -241,15 +263,15 @@ class Writing:
         self._file.write(head)
         self._file.seek(end)
         self._chunk = self._chunk_at = None
-        self._totals.chunk_count += 1
+        self._index.chunk()
 
     def finish(self, cut: str = "", why: str = "") -> None:
         """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
         self.end_chunk()
-        self._add_metadata(END, fields(self._gist.closing(cut, why)))
+        self._write(Metadata(END, fields(self._gist.closing(cut, why))))
         self._write(DataEnd(0))
         summary_at = self._file.tell()
-        for record in (*_definitions(), self._totals, *self._indexes):
+        for record in (*_definitions(), *self._index.records()):
             self._write(record)
         # A checksum of 0 says that there is none.
         self._write(Footer(summary_at, 0, 0))

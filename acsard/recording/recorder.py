@@ -1,9 +1,9 @@
 """The black box of a running daemon: takes the inputs and outputs of each step, and never waits.
 
-The control loop puts references into a bounded queue. A thread encodes them, writes one chunk a
-second and syncs it to the disk. If the disk is slow or stuck, the queue fills, and further steps
-are lost and counted. The recording then goes on in a new file that begins with the robot's state,
-so that it can be replayed.
+The control loop puts references into a bounded queue. A thread encodes them, adds a block to
+the growing chunk each second and syncs it to the disk. If the disk is slow or stuck, the queue
+fills, and further steps are lost and counted. The recording then goes on in a new file that begins
+with the robot's state, so that it can be replayed.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ MOST = 4096
 """Largest number of steps in the queue. At 100 Hz a disk may stall for 10 s without a loss."""
 
 FLUSH_S = 0.98
-"""Pause between two chunks. With the time that one takes to write, there is one each second."""
+"""Pause between two syncs. With the time that one takes, there is one each second."""
 
 MOST_TEXT = 200
 """Largest number of characters of an exception's text."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Times that `close` waits for the last chunk, and for a marker in its place."""
+"""Times that `close` waits for the end of the file, and for a marker in its place."""
 
 
 class Recorder:
@@ -107,7 +107,7 @@ class Recorder:
         return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
 
     def close(self, error: BaseException | None = None) -> None:
-        """Write the last chunk and the end of the file, if the disk is quick enough.
+        """Write the last steps and the end of the file, if the disk is quick enough.
 
         `error` is the exception that ends the daemon. A `BaseException` that is not an `Exception`
         is an ordinary end.

@@ -13,12 +13,13 @@ from io import FileIO
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
-from mcap.records import Attachment, DataEnd, Footer, Metadata
+from mcap.records import Attachment, DataEnd, Footer, McapRecord, Metadata
 
+from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
-from acsard.recording.chunks import LAST_BLOCK
+from acsard.recording.chunks import LAST_BLOCK, places
 from acsard.recording.end_record import END, EndRecord, fields
-from acsard.recording.file import Gist, Recording, event_of, rewrite
+from acsard.recording.file import Gist, Index, Recording, event_of, rewrite
 from acsard.recording.mcap_records import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -46,11 +47,15 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
             return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
-            if recording.damaged or seen.st_size > NOTHING_BYTES:
+            if recording.damaged or seen.st_size > NOTHING_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has nothing whole in it")
             part.unlink()
             return ""
-        if not room or not _beside(recording, part, whole, cut):
+        if room and _beside(recording, part, whole, cut):
+            if recording.damaged:
+                lost = many(recording.damaged, "damaged place is", "damaged places are")
+                told = f"{lost} left out of {whole.name}"
+        else:
             if not _in_place(recording, part, cut):
                 told = f"{whole.name} was cut and has no end, for want of room; all else is in it"
             part.rename(whole)
@@ -69,7 +74,8 @@ def _begins(part: Path) -> bool:
 
 
 def _has_chunks(part: Path) -> bool:
-    return any(found.messages for found in walk(part.read_bytes()))
+    """Return whether a chunk was begun in the file, even if none of it can be read."""
+    return any(True for _ in places(part.read_bytes(), 0))
 
 
 def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
@@ -90,25 +96,20 @@ def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
 def _in_place(recording: Recording, part: Path, cut: str) -> bool:
     """Write the end behind the last whole second, over the torn part.
 
-    A chunk that was cut gets its true head. Returns False if the disk has no room; then the file is
-    as it was. No second is given up to gain room: some disks give none back, and then all would be
-    lost.
+    A chunk that was cut, or whose head is not the true one, gets its true head. If a power cut
+    interrupted an earlier recovery behind the end, only the heads are written. Returns False if the
+    disk has no room; then the file is as it was. No second is given up to gain room: some disks
+    give none back, and then all would be lost.
     """
     gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
         gist.message(topic, wall_ns, data)
         if topic == "events":
             gist.event(event_of(recording, data))
-    if recording.ended:
+    before = part.read_bytes()
+    puts, size = _mends(before, gist.closing(cut))
+    if not puts and size == len(before):
         return True
-    before, end = part.read_bytes(), _end(gist.closing(cut))
-    *_, chunk = (None, *[found.chunk for found in walk(before) if found.chunk and found.messages])
-    # Another process has changed the file since it was read.
-    if chunk is None:
-        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
-    puts = [(chunk.end, end)]
-    if not chunk.complete:
-        puts = [(chunk.end, LAST_BLOCK + end), (chunk.begin, chunk.head(before))]
     with part.open("r+b", buffering=0) as stream:
         try:
             for at, data in puts:
@@ -121,10 +122,41 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
             if error.errno not in FULL:
                 raise
             return False
-        at, data = puts[0]
-        stream.truncate(at + len(data))
+        stream.truncate(size)
         os.fsync(stream.fileno())
     return True
+
+
+def _mends(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
+    """Return the offset and the bytes of each write that finishes a file, and the file's new size.
+
+    The end comes before the heads, because the disk may have no room for it.
+    """
+    heads: list[tuple[int, bytes]] = []
+    chunk, index = None, Index()
+    for found in walk(before):
+        if isinstance(found.record, Footer) and before.startswith(MAGIC, found.end):
+            return heads, found.end + len(MAGIC)
+        # A record behind a chunk belongs to an earlier end, which the new one overwrites.
+        if found.record is not None and chunk is None:
+            length = len(_encoded(found.record))
+            index.record(found.record, found.end - length, length)
+        if found.chunk and found.messages:
+            chunk = found.chunk
+            index.chunk()
+            for message in chunk.messages:
+                index.message(message.channel, message.wall_ns)
+            if chunk.complete and not before.startswith(head := chunk.head(before), chunk.begin):
+                heads.append((chunk.begin, head))
+    # Another process has changed the file since it was read.
+    if chunk is None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+    before_end = b""
+    if not chunk.complete:
+        before_end = LAST_BLOCK
+        heads.append((chunk.begin, chunk.head(before)))
+    end = before_end + _end(last, index, chunk.end + len(before_end))
+    return [(chunk.end, end), *heads], chunk.end + len(end)
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
@@ -135,10 +167,22 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
     os.fsync(stream.fileno())
 
 
-def _end(last: EndRecord) -> bytes:
-    """Return the smallest end of a valid MCAP file, without an index. Readers do not need one."""
+def _end(last: EndRecord, index: Index, at: int) -> bytes:
+    """Return the end of an MCAP file, to be written at that offset.
+
+    Its summary leaves out the copy of the schema and the channels, for want of room. Without the
+    statistics, some readers take the file for an empty one.
+    """
+    closing = Metadata(END, fields(last))
+    data = _encoded(closing)
+    index.record(closing, at, len(data))
+    data += _encoded(DataEnd(0))
+    summary_at = at + len(data)
+    return data + _encoded(*index.records(), Footer(summary_at, 0, 0)) + MAGIC
+
+
+def _encoded(*records: McapRecord) -> bytes:
     builder = RecordBuilder()
-    Metadata(END, fields(last)).write(builder)
-    DataEnd(0).write(builder)
-    Footer(0, 0, 0).write(builder)
-    return bytes(builder.end()) + MAGIC
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())

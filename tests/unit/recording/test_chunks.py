@@ -145,3 +145,52 @@ def test_many_chunks_that_ask_for_megabytes_take_a_time_in_proportion() -> None:
     began = time.process_time()
     assert [found.messages for found in walk(data)] == [[]]
     assert time.process_time() - began < 3.0
+
+
+FRAME_HEAD = GROWS[len(GROWING) :][: zstandard.frame_header_size(GROWS[len(GROWING) :])]
+
+LONG = struct.pack("<BQ", 5, MOST_IN_MESSAGE - 100)
+"""Beginning of a message of 4 MB."""
+
+EACH = len(GROWING + FRAME_HEAD + LONG) + 3
+
+
+def with_a_shared_tail(count: int, tail: bytes, head: bytes = GROWING) -> bytes:
+    """Return chunks that each have all later ones, as one raw block, and the same tail behind."""
+    parts = []
+    for number in range(count):
+        size = len(LONG) + EACH * (count - number - 1)
+        parts.append(head + FRAME_HEAD + (size << 3).to_bytes(3, "little") + LONG)
+    return MAGIC + b"".join(parts) + tail
+
+
+REPEATED = (1 << 17 << 3 | 2).to_bytes(3, "little") + b"x"
+"""A block of 4 bytes that unpacks to 128 KiB."""
+
+NEXT = GROWING[:1] + struct.pack("<Q", EACH - 9) + GROWING[9:]
+"""Head of a chunk whose record ends at the next chunk."""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(with_a_shared_tail(1000, REPEATED * 62), id="bytes"),
+        pytest.param(with_a_shared_tail(1000, REPEATED * 62, NEXT), id="records"),
+        pytest.param(with_a_shared_tail(1000, b"\x0a\0\0x" * 4000), id="blocks"),
+    ],
+)
+def test_many_chunks_that_share_their_end_take_a_time_in_proportion(data: bytes) -> None:
+    began = time.process_time()
+    found = list(walk(data))
+    assert time.process_time() - began < 1.0
+    assert (found[-1].end, found[-1].damaged) == (len(data), True)
+    assert not any(one.messages for one in found)
+
+
+def test_the_beginnings_of_damaged_chunks_and_a_whole_one_behind_them_are_read() -> None:
+    bad = bytearray(COMPLETE)
+    bad[ENDS[4] + 3 :] = b"\xff" * (len(bad) - ENDS[4] - 3)
+    *damaged, last = walk(MAGIC + bytes(bad) * 200 + COMPLETE)
+    assert last.messages == ALL
+    assert [one.messages for one in damaged] == [ALL[:15]] * 200
+    assert all(one.damaged for one in damaged)

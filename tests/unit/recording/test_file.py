@@ -283,6 +283,28 @@ def test_where_two_chunks_beside_one_another_are_damaged_all_others_are_read(
     assert (recording.ended, recording.whole) == (True, False)
 
 
+def test_of_two_damaged_chunks_beside_one_another_both_beginnings_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "two.mcap"
+    writing = Writing(path, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    for _ in range(4):
+        for second in range(5):
+            writing.add("steps", second, random.Random(second).randbytes(500))
+            writing.flush()
+        writing.end_chunk()
+    writing.finish()
+    every = [wall_ns for _, wall_ns, _ in Recording(path).messages()]
+    bad = bytearray(path.read_bytes())
+    for begin, end in chunks(bad)[1:3]:
+        at = (begin + end) // 2
+        bad[at : end - 3] = b"\xff" * (end - 3 - at)
+    path.write_bytes(bad)
+    recording = Recording(path)
+    assert every == [0, 1, 2, 3, 4] * 4
+    read = [wall_ns for _, wall_ns, _ in recording.messages()]
+    assert read == [0, 1, 2, 3, 4, 0, 1, 0, 1, 0, 1, 2, 3, 4]
+    assert (recording.damaged, recording.ended) == (2, True)
+
+
 def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_path: Path) -> None:
     data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
     said: list[str] = []

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import random
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,8 +14,8 @@ from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
 from acsard.recording.chunks import GROWING, LAST_BLOCK
-from acsard.recording.end_record import closing
-from acsard.recording.file import Recording
+from acsard.recording.end_record import END, closing
+from acsard.recording.file import CHUNK_BYTES, About, Recording, Writing
 from acsard.recording.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import World
@@ -45,6 +47,12 @@ def messages(path: Path) -> list[tuple[str, int, bytes]]:
     return list(Recording(path).messages())
 
 
+def read_by_the_library(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        found = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        return [(channel.topic, one.log_time, one.data) for _, channel, one in found]
+
+
 @pytest.mark.parametrize("room", [False, True])
 def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
     data: bytes, room: bool, tmp_path: Path
@@ -55,8 +63,10 @@ def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
         tail = dice.choice([b"", bytes(700), dice.randbytes(64)])
         part.write_bytes(data[: dice.randrange(first + 1, len(data) - 8)] + tail)
         os.utime(part, (0, 1e9))
-        before = messages(part)
-        assert recover(part, whole, "crash", room) == ""
+        torn = Recording(part)
+        before = list(torn.messages())
+        # Random bytes behind the cut may look like the rest of a damaged record.
+        assert bool(recover(part, whole, "crash", room)) == (room and torn.damaged > 0)
         assert messages(whole) == before
         recording = Recording(whole)
         assert len(list(recording.messages())) == len(before) > 0
@@ -116,6 +126,23 @@ def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(
     assert (recording.ended, recording.damaged) == (True, 1)
 
 
+@pytest.mark.parametrize(
+    ("hit", "said"),
+    [
+        pytest.param([1], "1 damaged place is left out of a.mcap", id="one"),
+        pytest.param([1, 3], "2 damaged places are left out of a.mcap", id="two"),
+    ],
+)
+def test_damage_that_a_copy_leaves_out_is_reported(
+    data: bytes, hit: list[int], said: str, tmp_path: Path
+) -> None:
+    part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(data)
+    for begin, end in [chunks(data)[number] for number in hit]:
+        bad[begin + 80 : end] = b"\xff" * (end - begin - 80)
+    part.write_bytes(bad[: chunks(data)[-1][1]])
+    assert recover(part, whole, "crash", room=True) == said
+
+
 @pytest.mark.parametrize("room", [False, True])
 def test_a_damaged_head_costs_nothing_of_what_is_behind_it(
     data: bytes, room: bool, tmp_path: Path
@@ -150,8 +177,9 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
         size = dice.randrange(begin, len(growing)) if number else len(growing)
         part.write_bytes(growing[:size] + tail)
         before = messages(part)
-        recover(part, whole, "crash", room)
+        said = recover(part, whole, "crash", room)
         counts.add(len(before))
+        assert bool(before) != ("nothing whole in it" in said)
         if before:
             recording, last = Recording(whole), closing(whole)
             assert list(recording.messages()) == before
@@ -159,9 +187,112 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
             assert (recording.whole, recording.cut, last.cut) == (True, "crash", "crash")
             with whole.open("rb") as stream:
                 assert len(list(make_reader(stream).iter_messages())) == len(before)
-            whole.unlink()
-        assert list(tmp_path.iterdir()) == []
+        assert list(tmp_path.iterdir()) == [whole]
+        whole.unlink()
     assert len(counts) > 5
+
+
+@pytest.mark.parametrize("room", [False, True])
+@pytest.mark.parametrize("at", ["file", "chunk"])
+def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
+    growing: bytes, at: str, room: bool, tmp_path: Path
+) -> None:
+    """The seconds behind the bad sector cannot be read by this version."""
+    part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(growing)
+    begin = growing.index(GROWING) + len(GROWING) if at == "chunk" else 0
+    bad[begin : begin + 512] = bytes(512)
+    assert len(bad) < NOTHING_BYTES
+    part.write_bytes(bad)
+    assert "stays so, as a.mcap" in recover(part, whole, "crash", room)
+    assert whole.read_bytes() == bad
+    assert not part.exists()
+
+
+@pytest.mark.parametrize("tail", [b"", bytes(700), b"torn"])
+def test_a_kill_before_the_head_of_a_complete_chunk_leaves_a_file_that_any_reader_opens(
+    growing: bytes, tail: bytes, tmp_path: Path
+) -> None:
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(growing + LAST_BLOCK + tail)
+    before = messages(part)
+    assert recover(part, whole, "crash", room=False) == ""
+    assert read_by_the_library(whole) == before == messages(whole)
+
+
+def test_a_power_cut_before_the_heads_of_several_chunks_leaves_a_file_that_any_reader_opens(
+    data: bytes, tmp_path: Path
+) -> None:
+    part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(data)
+    part.write_bytes(data)
+    before = messages(part)
+    for begin, _ in chunks(data):
+        bad[begin : begin + len(GROWING)] = GROWING
+    part.write_bytes(bad[: chunks(data)[-1][1]])
+    assert recover(part, whole, "crash", room=False) == ""
+    assert read_by_the_library(whole) == before == messages(whole)
+
+
+@pytest.mark.parametrize("tail", [b"", bytes(700)])
+def test_a_recovery_in_place_that_a_power_cut_interrupted_is_completed(
+    growing: bytes, tail: bytes, tmp_path: Path
+) -> None:
+    """The power failed when the end was on the disk and the chunk's head was not."""
+    part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
+    part.write_bytes(growing)
+    recover(part, whole, "crash", room=False)
+    recovered, begin = whole.read_bytes(), growing.index(GROWING)
+    part.write_bytes(recovered[:begin] + GROWING + recovered[begin + len(GROWING) :] + tail)
+    whole.unlink()
+    assert recover(part, whole, "open", room=False) == ""
+    assert whole.read_bytes() == recovered
+
+
+@pytest.mark.parametrize("cut", ["growing", "between chunks", "in the end"])
+def test_a_recovery_in_place_writes_the_statistics_and_the_index_of_a_finished_file(
+    data: bytes, growing: bytes, cut: str, tmp_path: Path
+) -> None:
+    """Some MCAP readers show an empty file without them."""
+    part, whole, copy = tmp_path / "a.part", tmp_path / "a.mcap", tmp_path / "b.mcap"
+    behind = data.rindex(b"acsard end", 0, -400) + 300
+    cuts = {"growing": growing, "between chunks": data[: chunks(data)[-1][1]]}
+    part.write_bytes(cuts.get(cut, data[:behind]))
+    copy.write_bytes(part.read_bytes())
+    assert recover(part, whole, "crash", room=False) == ""
+    other = tmp_path / "c.mcap"
+    assert recover(copy, other, "crash", room=True) == ""
+    found = []
+    for path in (whole, other):
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            summary = reader.get_summary()
+            assert summary is not None
+            assert summary.statistics is not None
+            named = [record.name for record in reader.iter_metadata()]
+            attached = [record.name for record in reader.iter_attachments()]
+            # A copy unites short chunks.
+            found.append((replace(summary.statistics, chunk_count=0), named, attached))
+    assert found[0] == found[1]
+    assert found[0][0].message_count == len(messages(whole))
+    assert found[0][1:] == (["acsard", END], ["acsard.toml"])
+
+
+def test_a_recovery_in_place_holds_one_chunk_in_memory_and_not_the_unpacked_file(
+    tmp_path: Path,
+) -> None:
+    part, whole, count = tmp_path / "a.part", tmp_path / "a.mcap", 20
+    writing = Writing(part, About("acsar", "0.1.0", "3.11.0", 1, 2))
+    for second in range(count):
+        writing.add("state", second, bytes(CHUNK_BYTES))
+        writing.end_chunk()
+    writing.flush()
+    writing.close()
+    tracemalloc.start()
+    try:
+        assert recover(part, whole, "crash", room=False) == ""
+        assert tracemalloc.get_traced_memory()[1] < count * CHUNK_BYTES / 2
+    finally:
+        tracemalloc.stop()
+    assert len(messages(whole)) == count
 
 
 def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: Path) -> None:
