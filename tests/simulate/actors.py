@@ -348,6 +348,7 @@ class Run:
         if not self.product.plugged:
             self.product.plug(new)
             self._disarmed(self.true_ns)
+            self._linked = False
 
     def _suspend(self, lasts_ns: int) -> None:
         """The host sleeps: its monotonic clock stands, and its USB ports lose their power."""
@@ -389,7 +390,9 @@ class Run:
 
     # what the product shows
 
-    def _fed(self, at_ns: int) -> None:
+    def _fed(self, at_ns: int, data: bytes) -> None:
+        if b"ap" not in data and b"an" not in data:
+            return  # The board greets, or the line is noisy while it boots.
         true_ns = at_ns - START_NS + self.slept_ns
         gap_ns = true_ns - self._fed_ns
         if gap_ns > 9 * NS // 10:

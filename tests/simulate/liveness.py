@@ -23,6 +23,9 @@ MOST_HELD = 2000
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
 
+LOOKED_AT_NS = 3 * NS // 20
+"""A sender that was silent for longer has paused."""
+
 
 class Liveness:
     """Watches one run for what ought to happen."""
@@ -47,6 +50,9 @@ class Liveness:
         if name not in self._lawful:
             return
         wish = self.run.witness.wishes[-1][1]
+        before_ns, _ = self._latest.get(name, (0, ""))
+        if wish.arrived_ns - before_ns > LOOKED_AT_NS:
+            self._since.pop(name, None)
         if wish.armed_ns <= self._event_ns or not (wish.v or wish.w):
             self._since.pop(name, None)
         else:
@@ -78,7 +84,7 @@ class Liveness:
         for name, since_ns in self._since.items():
             heard_ns, identity = self._latest[name]
             quiet = now_ns - self._event_ns > SETTLES_NS
-            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < NS // 10:
+            if quiet and now_ns - since_ns > NS and now_ns - heard_ns < LOOKED_AT_NS:
                 run.counts["lawful looks"] += 1
                 if now_ns - run.moved_ns > NS // 2:
                     text = f"{identity} since {since_ns / NS:.3f} s; {run.witness.reason}"

@@ -149,7 +149,7 @@ class Product:
         self.alive = True
         self.fed_ns = START_NS
         """When bytes of the board last reached the daemon."""
-        self.fed: Callable[[int], None] = lambda at_ns: None
+        self.fed: Callable[[int, bytes], None] = lambda at_ns, data: None
         self.dropped = 0
         """Samples that the inbox had no room for, of this daemon."""
         self.echo = False
@@ -164,7 +164,7 @@ class Product:
         feed = world.port.feed
 
         def noticed(received: Received) -> None:
-            self.fed(received.at.mono_ns)
+            self.fed(received.at.mono_ns, received.data)
             self.fed_ns = received.at.mono_ns
             feed(received)
 
