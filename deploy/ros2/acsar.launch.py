@@ -64,9 +64,9 @@ def nodes(context: LaunchContext) -> list[Node]:
             remappings=TF,
             output="both",
         ),
-        # Takes the URDF from the topic robot_description, as it does since Jazzy. The hardware's
-        # node lives in this process, and what is remapped here is remapped for it too: never
-        # joint_states, from which it has the wheels.
+        # The controller manager takes the URDF from the topic robot_description, as it does since
+        # Jazzy. The hardware's node lives in the same process, so each remapping here applies to it
+        # too. Do not remap joint_states: the hardware reads the wheels from that topic.
         Node(
             package="controller_manager",
             executable="ros2_control_node",

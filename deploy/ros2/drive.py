@@ -18,7 +18,7 @@ from rclpy.utilities import remove_ros_args
 
 PERIOD_S = 0.05
 PATIENCE_S = 10.0
-"""How long to wait for somebody who listens; a bridge makes its route only now."""
+"""How long to wait for a subscriber. A bridge makes its route only when a publisher appears."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 ZEROS_S = 1.5
 """Behind a bridge all publishers look like one sender: a zero counts when no speed has followed it
@@ -26,7 +26,7 @@ for a second. Over rmw_zenoh a quarter of a second is enough."""
 
 
 def end(number: int, frame: object) -> NoReturn:
-    """Ended by a signal, after the zeros; another one takes none of them away."""
+    """End after a signal. The zeros are still sent, and further signals are ignored meanwhile."""
     for one in SIGNALS:
         signal.signal(one, signal.SIG_IGN)
     sys.exit(128 + number)
@@ -35,10 +35,10 @@ def end(number: int, frame: object) -> NoReturn:
 def main(argv: list[str]) -> None:
     given = [float(word) for word in remove_ros_args(argv)[1:]]
     linear, angular, seconds = given + [0.2, 0.0, 3.0][len(given) :]
-    # Its own handlers would end the context first, and no zero could be sent any more.
+    # rclpy's own handlers would end the context first, and no zero could be sent any more.
     rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     for number in SIGNALS:
-        # Whoever began it by nohup wants it to go on without its terminal.
+        # With nohup, SIGHUP is ignored already: the program goes on when its terminal closes.
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, end)
     try:

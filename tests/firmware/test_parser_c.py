@@ -113,7 +113,7 @@ class Parser:
         return got
 
     def stream(self, data: bytes) -> list[Command]:
-        """Return the commands in a stream that starts anew."""
+        """Return the commands in a stream, read by a parser that has just started."""
         self._reader.length = 0
         self._reader.discarding = False
         found = [self.parse(line) for line in self.lines(data)]

@@ -37,7 +37,7 @@ LET_GO_NS = 4 * NS_PER_S // 10
 """A zero counts so long after a speed, for commanders of 5 Hz and more."""
 
 SIGNED = Signature("somebody").pack()
-"""Who sends what `World.send` does."""
+"""The sender of what `World.send` sends."""
 
 
 class VirtualPort:

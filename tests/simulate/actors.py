@@ -27,7 +27,7 @@ from tests.simulate.roads import NS, Message, messages, read_reply, sample
 
 
 class Result(NamedTuple):
-    """What a run came to."""
+    """The result of a run."""
 
     seed: int
     finding: str

@@ -73,7 +73,7 @@ class Trace:
         self._second, self._hash = second, hashlib.sha256()
 
     def step(self, step: Step) -> None:
-        """Take what a step showed."""
+        """Take the results of a step."""
         step = rewritten(step)
         second = step["at"] // 10**9
         self._hash.update(json.dumps(step).encode())

@@ -23,7 +23,7 @@ class Fault(NamedTuple):
 
     name: str
     breaks: str
-    """What a person would notice."""
+    """The symptom that a person would notice."""
     edits: tuple[Edit, ...]
 
 

@@ -48,7 +48,7 @@ NONE: Sequence[Estimate] = ()
 
 
 class Seen(msgspec.Struct, frozen=True, gc=False):
-    """What one control step showed to the outside."""
+    """The results of one control step that others can see."""
 
     at_ns: int
     decided_ns: int
@@ -64,7 +64,7 @@ class Seen(msgspec.Struct, frozen=True, gc=False):
 
 
 def problems(config: dict[str, Any]) -> list[str]:
-    """Return what makes this configuration illegal, in words."""
+    """Return the problems of this configuration, in words; none if it is legal."""
     try:
         parse(b"", config)
     except ConfigError as error:
@@ -203,7 +203,7 @@ class Product:
 
     @property
     def wall_ns(self) -> int:
-        """What the robot's wall clock shows."""
+        """The time of the robot's wall clock."""
         return self._world.instant.wall_ns
 
     def run_until(self, at_ns: int) -> None:

@@ -36,7 +36,7 @@ class Message(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What the bus hands over, and whom the sender's identity makes it come from."""
+    """A sample as the bus hands it over, with the identity of its sender."""
 
     key: str
     payload: bytes

@@ -1,4 +1,4 @@
-"""Lines of the MCU protocol: what is read and how, what is refused and why, what is written."""
+"""Lines of the MCU protocol: how each is read or why it is refused, and which are written."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([endpoint]))
 
 with zenoh.open(config) as session:
-    # By a name: one that nothing refers to is undeclared at once.
+    # Keep the subscriber in a variable: Zenoh undeclares a subscriber that nothing refers to.
     odometry = session.declare_subscriber(f"acsard/{robot}/json/odom")
     for sample in odometry:
         odom = json.loads(sample.payload.to_bytes())

@@ -89,7 +89,7 @@ KEPT = [
     Latches(STOP, FAULT, OFF),
     Latches(lowered={"limits.linear_speed": 0.6, "limits.angular_speed": 2.0}),
 ]
-"""Latches that a robot starts with; most often there are none."""
+"""Latches that a robot starts with; usually none are set."""
 
 Wheels = tuple[float, float, float, float]
 

@@ -1,4 +1,4 @@
-"""The table of paths: what is open to strangers and what no rate limits is a short, fixed list."""
+"""The table of paths: only a short, fixed list is open to strangers or free of rate limits."""
 
 from __future__ import annotations
 

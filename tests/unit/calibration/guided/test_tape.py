@@ -23,7 +23,7 @@ def test_a_first_turn_that_was_ended_half_way_is_found_out() -> None:
 
 
 class Metric(Player):
-    """A person who records every question."""
+    """A person in the test, who answers each question and records it."""
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
