@@ -56,13 +56,13 @@ VERBS = (
 """The verbs in the order of the help text. Each one is the name of a module of this package."""
 
 _EPILOG = """\
-exit codes: 0 done, 1 failure, 2 usage, 66 no such port, 69 daemon unreachable, 75 port,
+exit codes: 0 done, 1 failure, 2 wrong usage, 66 no such port, 69 daemon unreachable, 75 port,
 bus address or robot id in use, 77 no permission, 78 bad configuration
 
-try:  acsard run                (the robot, on the built-in simulator)
-      acsard drive              (in a second terminal: the keyboard drives it)
-      acsard top                (in a third: all of it on one screen)
-      acsard echo odom --short  (where is it?)
+try:  acsard run                (start the robot on the built-in simulator)
+      acsard drive              (in a second terminal: drive it with the keyboard)
+      acsard top                (in a third terminal: show its full status on one screen)
+      acsard echo odom --short  (print its position)
 """
 
 
@@ -83,8 +83,9 @@ def parser(names: Sequence[str] = VERBS) -> argparse.ArgumentParser:
     """Return the parser of the `acsard` command with these verbs."""
     whole = _Parser(
         prog="acsard",
-        description="The hardware interface of a four-wheel differential-drive robot: serial "
-        "microcontroller below, Zenoh bus above. Without a verb: run.",
+        description="The hardware interface of a four-wheel differential-drive robot. It connects "
+        "the robot's microcontroller (serial port) to a Zenoh bus. Without a verb, acsard "
+        "runs the daemon.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

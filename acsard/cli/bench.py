@@ -7,25 +7,23 @@ import argparse
 from acsard.cli.common import Overrides, add_config, load
 
 _DESCRIPTION = """\
-Measure this machine: run a daemon of its own (beside one that already runs) on a
-simulated microcontroller with plain lines, follow and command it from another
-process, and print how long things take. Nothing is asserted; a busy machine gives worse figures.
+Measure how fast the daemon is on this machine. The tool starts a daemon of its own on a simulated
+microcontroller; a daemon that already runs is not disturbed. It commands and follows the new daemon
+from another process and prints the times. It does not judge them. A busy machine gives worse times.
 
-what is measured, and between which points (all on one clock):
-  command -> wire       the call of put() here, in another process, at random times ->
-                        the first byte of the line that says it can be read at the far
-                        end of the port. A wire's own time (2.9 ms a line at 115200
-                        baud) comes after that.
-  feedback -> odometry  the last byte of a feedback line handed to the far end of the
-                        port -> the odometry of that very line in a callback here.
-  processor, memory     of the daemon's process alone, by /proc.
-  start-up              before fork and exec -> the first byte of the first line.
-Every command and every feedback line says a speed of its own, so that each is found
-again by what it says. A real wire adds its own time, an FTDI adapter its timer.
+what is measured, and between which points (all by one clock):
+  command -> wire       from the call of put() in this process, at random times, until the first
+                        byte of the line with that command can be read at the far end of the
+                        port. The time on a real wire (2.9 ms a line at 115200 baud) comes on top.
+  feedback -> odometry  from the write of the last byte of a feedback line at the far end of the
+                        port until a callback in this process receives the odometry of that line.
+  processor, memory     of the daemon's process alone, read from /proc.
+  start-up              from before fork and exec until the first byte of the first line.
+Every command and every feedback line has a speed of its own, by which the tool finds it again.
+A real wire adds its own time, and an FTDI adapter adds its latency timer.
 
-With --port the real microcontroller is used: only zero speeds are sent, so nothing
-moves, and what happens on the wire cannot be seen and is left out. Stop the robot's
-daemon first.
+With --port the tool uses the real microcontroller. It sends only zero speeds, so nothing moves.
+It cannot see the wire then, so it omits the times on the wire. Stop the robot's daemon first.
 """
 
 LONGEST_S = 600.0
@@ -36,21 +34,27 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "bench",
-        help="measure how fast it is on this machine",
+        help="measure how fast the daemon is on this machine",
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_config(parser)
     parser.add_argument(
-        "--seconds", type=duration, default=20.0, metavar="N", help="how long (default: 20)"
+        "--seconds",
+        type=duration,
+        default=20.0,
+        metavar="N",
+        help="duration of the measurement in seconds (default: 20)",
     )
     parser.add_argument(
         "--port",
         metavar="DEVICE",
-        help="measure with the microcontroller on this serial port, at zero speed "
-        "(default: sim, a simulated one, whatever the configuration says)",
+        help="measure with the microcontroller on this serial port, at zero speed (default: "
+        "sim, a simulated one, even if the configuration names a port)",
     )
-    parser.add_argument("--rate", type=float, metavar="HZ", help="control rate, else as configured")
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ", help="control rate (default: as configured)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(main=main)
 

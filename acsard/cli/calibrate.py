@@ -23,16 +23,18 @@ if TYPE_CHECKING:
     from acsard.prompts.json_lines import JsonAttendant
 
 DESCRIPTION = """\
-Find the wheels' radii and the effective track, each with its standard deviation, and tell what they
-improve. Without --log the robot is driven, guided in words: a person at this terminal stands beside
-it on a free floor of 3 m x 3 m, starts each leg by Enter, stops it by any key, and reads off a tape
-what is asked for; at most 90 s of driving. With --log from a drive that was recorded: by the black
-box of a robot with a gyro, as it is, or a CSV file with a header: column t (s) and the wheel speeds
-in rad/s, "fr,fl,rl,rr" or "left,right"; and yaw_rate (rad/s, of a gyro), or x and y (m, of any
-source of positions) with or without yaw (rad), or both; run (any name) tells several drives apart.
-Columns may be in any order, cells empty where a sensor has nothing to say. Good logs begin with 3 s
-of standing, and have straight drives, turns to both sides, slow and fast, and curves, for 60 s or
-more. Exit 0 when something was found, 1 when not, with what to do instead.
+Measure the wheel radii and the effective track width, each with its standard deviation, and say how
+much they improve the odometry. Without --log the tool drives the robot and guides a person at this
+terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m, starts
+each leg with Enter, stops it with any key, and types the tape measurements that the tool asks for.
+The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box recording
+of a robot with a gyro, or a CSV file with a header. The CSV file has the column t (s) and the wheel
+speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
+y (m, from any source of positions) with or without yaw (rad), or both. The column run (any name)
+separates several drives. The columns may be in any order, and a cell is empty if its sensor has no
+value then. A good log begins with 3 s of standing still. It contains straight drives, turns to both
+sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the values.
+Otherwise it is 1, and a message says what to do instead.
 """
 
 DRIVEN = "the drive"
@@ -46,20 +48,25 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "calibrate",
-        help="wheel radii and effective track, by a guided drive or from a recorded one",
+        help="measure wheel radii and effective track width, by a guided drive or from a "
+        "recorded one",
         description=DESCRIPTION,
     )
     add_bus(parser)
     add_options(parser)
     parser.add_argument(
-        "--log", type=Path, metavar="FILE", help="a recorded drive, CSV or one of `acsard log`"
+        "--log",
+        type=Path,
+        metavar="FILE",
+        help="recorded drive: a CSV file or a recording of `acsard log`",
     )
     parser.add_argument(
         "--distance",
         type=_distance,
         metavar="[RUN=]METRES",
-        help="with --log: how far from its start a run ends, in a straight line by tape measure: "
-        "tells how large the wheels are; without RUN it is the straightest run",
+        help="with --log: the straight-line distance from the start to the end of a run, by "
+        "tape measure. It determines how large the wheels are. Without RUN it applies to "
+        "the straightest run",
     )
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print one JSON object")
@@ -67,8 +74,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--write",
         action="store_true",
-        help="also write what was found into the configuration file, comments kept (needs the "
-        "library tomlkit; without it, it tells what to type)",
+        help="also write the result into the configuration file and keep its comments (needs "
+        "the library tomlkit; if it is missing, a message gives the command that installs "
+        "it)",
     )
     parser.set_defaults(main=main)
 
@@ -78,7 +86,10 @@ def main(args: argparse.Namespace) -> int:
     if not args.json_lines or args.log:
         return _calibrate(args, None)
     if args.yes:
-        raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
+        raise UsageError(
+            "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
+            "asks them through a program. Leave one out"
+        )
     from acsard.prompts.json_lines import JsonAttendant
 
     with JsonAttendant() as lines:
@@ -123,7 +134,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
         trouble = differing(config, mine, where)
         written = written or lines.offer(args.config, keys(found), trouble)
     if written and not args.log:
-        print("restart the daemon: it takes them at its start", file=sys.stderr)
+        print("restart the daemon: it reads these values only when it starts", file=sys.stderr)
     return int(Exit.OK)
 
 
@@ -136,7 +147,7 @@ def _only_log(args: argparse.Namespace) -> Path:
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
             raise UsageError(
-                f"{option} is for a guided drive, --log for a recorded one: one of both"
+                f"{option} is for a guided drive and --log for a recorded one: leave one out"
             )
     log: Path = args.log
     return log
@@ -144,7 +155,9 @@ def _only_log(args: argparse.Namespace) -> Path:
 
 def _no_log(args: argparse.Namespace) -> argparse.Namespace:
     if args.distance:
-        raise UsageError("--distance goes with --log; a guided drive asks for what it needs")
+        raise UsageError(
+            "--distance goes with --log: a guided drive asks for the distances that it needs"
+        )
     return args
 
 
@@ -155,10 +168,12 @@ def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration
     from acsard.recording.mcap_records import MAGIC
 
     if log.is_dir():
-        raise LogError(f"it is a directory (a bag of ROS, perhaps): {AS_CSV}")
+        raise LogError(f"it is a directory (perhaps a ROS bag): {AS_CSV}")
     try:
         if log.stat().st_size > MOST_BYTES:
-            raise ExitError(Exit.FAILURE, f"{log} is over 1 GiB: cut it, ten minutes are plenty")
+            raise ExitError(
+                Exit.FAILURE, f"{log} is larger than 1 GiB: cut it; ten minutes are enough"
+            )
         data = log.read_bytes()
     except OSError as error:
         raise ExitError(

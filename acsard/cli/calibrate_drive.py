@@ -35,29 +35,30 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--way",
         choices=tuple(NEEDS),
-        help="what the drive is compared with; without it a gyro where the robot has one "
-        "([odometry] gyro), else a tape",
+        help="reference for the drive (default: a gyro if the robot has one ([odometry] gyro), "
+        "else a tape)",
     )
     parser.add_argument(
         "--positions",
         metavar="KEY",
-        help="with positions on this key (PoseStamped or Odometry, in JSON, msgpack or CDR): as "
-        "`acsard topics` lists it (sim/pose), or any full key",
+        help="for --way positions: the key of the positions (PoseStamped or Odometry in JSON, "
+        "msgpack or CDR), as `acsard topics` lists it (sim/pose), or any full key",
     )
     parser.add_argument(
         "--positions-at",
         metavar="ENDPOINT",
-        help="where that key is, when the daemon does not have it: a router, say",
+        help="where that key is published if the daemon does not have it, for example a router",
     )
     parser.add_argument(
         "--imu",
         metavar="KEY",
-        help="with the gyro on this key (imu without it): as listed, or a full key",
+        help="for --way gyro: the key of the gyro (default: imu), as `acsard topics` lists it, "
+        "or a full key",
     )
     parser.add_argument(
         "--yes",
         action="store_true",
-        help="start every leg without Enter; only with the built-in simulator",
+        help="start every leg without Enter (only with the built-in simulator)",
     )
 
 
@@ -98,27 +99,31 @@ def guided(
         try:
             return _played(kind, made, robot, attendant), config
         except KeyboardInterrupt:
-            raise GuideError("ended by the person. Nothing is written") from None
+            raise GuideError("the operator ended the drive. Nothing is written") from None
 
 
 def _usable(args: argparse.Namespace, odometry: str) -> None:
     if args.way == "positions" and not args.positions:
-        raise UsageError("--way positions needs the key they come on: --positions KEY")
+        raise UsageError("--way positions needs the key of the positions: --positions KEY")
     if args.positions and args.way not in (None, "positions"):
-        raise UsageError(f"--positions is for another way than --way {args.way}; leave one out")
+        raise UsageError(f"--positions does not go with --way {args.way}: leave one out")
     if args.positions in ("odom", odometry):
         raise UsageError(
-            "odom is what the wheels say already: positions have to come from elsewhere"
+            "odom is computed from the wheels themselves: the positions must come from "
+            "another source"
         )
     if args.imu and (args.positions or args.way not in (None, "gyro")):
         other = "--positions" if args.positions else f"--way {args.way}"
-        raise UsageError(f"--imu is for --way gyro, not for {other}; leave one out")
+        raise UsageError(f"--imu is for --way gyro, not for {other}: leave one out")
     if args.positions_at and not args.positions:
-        raise UsageError("--positions-at says where --positions KEY is; give that as well")
+        raise UsageError(
+            "--positions-at says where the key of --positions is: give --positions KEY as well"
+        )
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
         raise UsageError(
-            "calibrate drives the robot, and a person at the terminal starts and stops it: run it "
-            "in one. --yes without one is for the built-in simulator; --log takes a recorded drive"
+            "calibrate drives the robot, and a person at the terminal starts and stops "
+            "it: run it in a terminal. Without a terminal, use --yes (only with the "
+            "built-in simulator), or --log with a recorded drive"
         )
 
 
@@ -129,8 +134,8 @@ def _may(args: argparse.Namespace, *, simulated: bool) -> None:
     """
     if args.yes and not simulated:
         raise UsageError(
-            "--yes is for the built-in simulator: this robot is real, and somebody has to stand "
-            "beside it and start each leg. Leave --yes out"
+            "--yes is only for the built-in simulator: this robot is real, and a person "
+            "must stand near it and start each leg. Leave --yes out"
         )
 
 
@@ -161,8 +166,9 @@ def differing(config: Config, mine: Config, where: str) -> str:
     if same == (mine.drive.wheel_radius, mine.drive.wheel_separation):
         return ""
     return (
-        f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation = "
-        f"{same[1]:g}, and {where} says otherwise: give --config the file it runs with"
+        f"the daemon runs with drive.wheel_radius = {same[0]:g} and drive.wheel_separation "
+        f"= {same[1]:g}, but {where} has other values: give --config the file that the "
+        "daemon uses"
     )
 
 
@@ -172,8 +178,8 @@ def _way(args: argparse.Namespace, config: Config) -> str:
     gyro = args.way == "gyro" or args.imu
     if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
         raise UsageError(
-            "this robot's daemon hears no gyro: set odometry.gyro = true and restart it, or give "
-            "--way tape, wall or umbmark"
+            "this robot's daemon receives no gyro: set odometry.gyro = true and restart "
+            "the daemon, or use --way tape, wall or umbmark"
         )
     way: str = args.way or ("gyro" if gyro or config.odometry.gyro else "tape")
     return way
@@ -210,8 +216,8 @@ def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Cali
     from acsard.calibration.guided.legs import Leg
 
     attendant.say(
-        f"Calibration with {kind.needs}. {kind.told(made)} Stay beside the robot: any key stops it "
-        "at once."
+        f"Calibration with {kind.needs}. {kind.told(made)} Stay near the robot: any key "
+        "stops it at once."
     )
     way, number = kind.begin(made), 0
     step = next(way)

@@ -30,7 +30,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "call",
         help="call a service: " + ", ".join(CALLED),
-        description="Call a service and print its answer; exit 1 when it was refused.",
+        description="Call a service and print its answer. The exit code is 1 if the robot refuses.",
     )
     parser.add_argument(
         "service",
@@ -76,8 +76,9 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
     each = [one for one in ids if one != "*"] or ["robot1"]
     more = "" if "*" not in ids else "; `acsard fleet` lists the ids"
     return (
-        f"only stop goes to many robots at once: before {service} somebody has to look at each. "
-        f"One after the other: {', '.join(f'`{typed} {one}`' for one in each)}{more}"
+        f"only stop goes to many robots at once: before {service} a person must look at "
+        "each robot. Call them one after the other: "
+        f"{', '.join(f'`{typed} {one}`' for one in each)}{more}"
     )
 
 
@@ -109,7 +110,7 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
         replies = dict(zip(wanted, calls.map(stop, wanted), strict=True))
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):
-            told = f"NO ANSWER: go and look, or use its switch ({reply})"
+            told = f"NO ANSWER: go to the robot, or use its emergency switch ({reply})"
             reply = ServiceReply(False, told)
         line = encode(reply, "json").decode()
         print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))

@@ -13,8 +13,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "check",
         help="check the configuration and print the effective one",
-        description="Print the configuration in force, defaults filled in; or every problem at "
-        "once, each with its mend, and exit 78.",
+        description="Print the effective configuration with all defaults. If the configuration has "
+        "problems, print all of them, each with its fix, and exit with code 78.",
     )
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of TOML")

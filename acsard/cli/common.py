@@ -25,17 +25,18 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config",
         metavar="FILE",
-        help="configuration (else $ACSARD_CONFIG, ./acsard.toml, /etc/acsard/acsard.toml, "
-        "or the built-in defaults)",
+        help="configuration file (default: $ACSARD_CONFIG, ./acsard.toml, "
+        "/etc/acsard/acsard.toml, or the built-in defaults)",
     )
 
 
 JSON_LINES = (
-    "for a program that asks the person: what is told and asked is JSON on standard output, an "
-    "object a line, and answers come in the same on standard input (deploy/web/README.md)"
+    "for a program that asks the operator: this tool writes its messages and questions to "
+    "standard output as JSON, one object per line, and reads the answers from standard "
+    "input in the same form (deploy/web/README.md)"
 )
 
-MANY = "; several with commas, or '*' for all there are"
+MANY = "; several ids separated by commas, or '*' for all robots"
 
 
 def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
@@ -47,21 +48,22 @@ def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
     """
     add_config(parser)
     parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="where the daemon listens, e.g. tcp/127.0.0.1:7448"
+        "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
     )
     parser.add_argument(
         "--tls",
         metavar="DIRECTORY",
-        help="your certificate for a tls/ endpoint (else $ACSARD_TLS, or bus.tls)",
+        help="directory with your certificate, for a tls/ endpoint (default: $ACSARD_TLS, or "
+        "bus.tls)",
     )
-    parser.add_argument("--id", metavar="ID", help="the robot's id (robot.id)" + more)
+    parser.add_argument("--id", metavar="ID", help="the robot's id (default: robot.id)" + more)
 
 
 def count(text: str) -> int:
     """Return a whole number of at least 1: an argparse type."""
     number = int(text)
     if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is not 1 or more")
+        raise argparse.ArgumentTypeError(f"{text} is less than 1")
     return number
 
 
@@ -117,8 +119,8 @@ def require_one(args: argparse.Namespace) -> None:
 
     if named(args.id or ""):
         raise UsageError(
-            f"--id '{args.id}' names many robots and `acsard {args.verb}` is for one: "
-            "`acsard fleet` says who is there; echo, get and call stop go to many"
+            f"--id '{args.id}' names several robots, but `acsard {args.verb}` takes one: "
+            "`acsard fleet` lists the robots; only echo, get and call stop take several"
         )
 
 
@@ -140,11 +142,11 @@ def require_followed(key: str) -> None:
     if row is None:
         return
     instead = {
-        "query": f"answers when it is asked: acsard get {key}",
+        "query": f"answers a query: acsard get {key}",
         "service": f"is a service: acsard call {key.removeprefix('srv/')}",
     }.get(row.direction)
     if row.key == "alive":
-        instead = "is a token without messages: acsard fleet shows who is there"
+        instead = "is a token without messages: acsard fleet lists the robots that are present"
     if instead is not None:
         raise UsageError(f"nothing is published on {key}: it {instead}")
 
@@ -152,7 +154,7 @@ def require_followed(key: str) -> None:
 def warn_of_unknown(key: str) -> None:
     """Warn if a key is not in the table: waiting on a misspelt key looks like a dead robot."""
     if unknown(key):
-        said = f"{key} is not in the topic table ({key_hint(key)}); waiting"
+        said = f"{key} is not in the topic table ({key_hint(key)}); waiting for it all the same"
         print(f"acsard: {printable(said)}", file=sys.stderr)
 
 
@@ -163,13 +165,20 @@ def require_asked(key: str) -> None:
     answer.
     """
     if set(key.partition("?")[0]) & set("*$"):
-        raise UsageError(f"{key} is many keys: get asks one; `acsard topics` lists them")
+        raise UsageError(
+            f"{key} stands for several keys, but get asks one; `acsard topics` lists them"
+        )
     row = row_of(key)
     if row is None:
         return
     if row.direction == "service":
         raise UsageError(f"{key} is a service: acsard call {key.removeprefix('srv/')}")
     if row.direction == "in":
-        raise UsageError(f"{key} comes in and cannot be asked: acsard echo {key} follows it")
+        raise UsageError(
+            f"{key} is an input and does not answer queries: acsard echo {key} follows it"
+        )
     if row.key == "alive":
-        raise UsageError("alive is a token and cannot be asked: acsard fleet shows who is there")
+        raise UsageError(
+            "alive is a token and does not answer queries: acsard fleet lists the robots that "
+            "are present"
+        )

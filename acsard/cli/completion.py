@@ -21,19 +21,20 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     places = "; ".join(f"{shell}: {place}" for shell, place in SHELLS.items())
     completion = verbs.add_parser(
         "completion",
-        help="the script by which a shell completes with Tab",
-        description="Print the script by which a shell completes verbs, options, keys, settings, "
-        f"recordings and files with Tab. Write it to where the shell looks ({places}). Needs the "
-        "library shtab; without it, it tells what to type.",
+        help="print the script for completion with Tab in a shell",
+        description="Print the script with which a shell completes verbs, options, keys, settings, "
+        "recordings and files when you press Tab. Write it to the file that the shell "
+        f"reads ({places}). Needs the library shtab; if it is missing, a message gives the "
+        "command that installs it.",
     )
     completion.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
     completion.set_defaults(main=main_completion)
     page = verbs.add_parser(
         "man",
-        help="all of --help as a man page",
+        help="print the text of every --help as a man page",
         description="Print a man page of every verb and option, for example into "
-        "~/.local/share/man/man1/acsard.1. Needs the library argparse-manpage; without it, it "
-        "tells what to type.",
+        "~/.local/share/man/man1/acsard.1. Needs the library argparse-manpage; if it is "
+        "missing, a message gives the command that installs it.",
     )
     page.set_defaults(main=main_man)
 

@@ -16,11 +16,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "doctor",
-        help="find out what is wrong on this machine",
-        description="Look at the configuration, the serial port and who holds it, permissions, "
-        "clock, real-time limits, certificates, and the daemon if it runs: where the "
-        "configuration has it, or where the options say, as it was started. Each finding comes "
-        "with its mend. Exit 0 when nothing fails, 1 when something does.",
+        help="find the problems on this machine and their fixes",
+        description="Check the configuration, the serial port and the process that uses it, "
+        "permissions, the clock, real-time limits, certificates, and the daemon if it "
+        "runs. The daemon is looked for at the address in the configuration, or at the "
+        "address in the options. Each problem is printed with its fix. The exit code is 1 "
+        "if a check fails, else 0.",
     )
     add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -13,16 +13,17 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "door",
-        help="let clients of other machines in by TLS, beside the daemon",
-        description="Listen at the tls/ endpoints of bus.listen and hand on to the daemon what the "
-        "certificates allow. `acsard run` starts one by itself; as a service it is "
-        "acsard-door.service. Ends with 1 when it has to be opened anew.",
+        help="run the TLS gateway, which admits clients from other machines",
+        description="Listen at the tls/ endpoints of bus.listen and pass on to the daemon only the "
+        "messages that each client's certificate allows. `acsard run` starts this gateway "
+        "by itself; as a service it is acsard-door.service. It exits with code 1 when it "
+        "must be restarted.",
     )
     add_config(parser)
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
-    parser.add_argument("--namespace", metavar="NAME", help="its namespace in ROS")
+    parser.add_argument("--namespace", metavar="NAME", help="the robot's ROS namespace")
     parser.add_argument(
-        "--held", action="store_true", help="end with standard input; so `acsard run` starts it"
+        "--held", action="store_true", help="end when standard input closes; `acsard run` uses this"
     )
     parser.set_defaults(main=main)
 
@@ -43,7 +44,8 @@ def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, given)
     if not config.bus.outside:
         raise ExitError(
-            Exit.USAGE, f"{where} has no tls/ endpoint in bus.listen; `acsard lan init --write`"
+            Exit.USAGE,
+            f"{where} has no tls/ endpoint in bus.listen: `acsard lan init --write FILE` adds one",
         )
     log_from_environment()
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())

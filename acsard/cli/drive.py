@@ -36,14 +36,22 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "drive",
-        help="drive by keyboard",
-        description="Drive by keyboard from this terminal, on a screen of its own; line "
-        "by line where TERM is dumb.\n\n" + HELP,
+        help="drive the robot with the keyboard",
+        description="Drive the robot with the keyboard of this terminal. The tool uses the full "
+        "screen, or prints line by line if the terminal cannot do that (TERM=dumb).\n\n" + HELP,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--linear", type=float, default=0.5, metavar="M/S", help="default 0.5")
-    parser.add_argument("--angular", type=float, default=1.0, metavar="RAD/S", help="default 1.0")
-    parser.add_argument("--source", default="teleop", help="command as this source, default teleop")
+    for name, speed, unit in (("--linear", 0.5, "M/S"), ("--angular", 1.0, "RAD/S")):
+        parser.add_argument(
+            name,
+            type=float,
+            default=speed,
+            metavar=unit,
+            help="speed at the start, which keys change (default: %(default)s)",
+        )
+    parser.add_argument(
+        "--source", default="teleop", help="command source to send as (default: teleop)"
+    )
     add_bus(parser)
     parser.set_defaults(main=main)
 
@@ -56,7 +64,9 @@ def main(args: argparse.Namespace) -> int:
 
     endpoint, robot_id, tls = robot_address(args)
     if not sys.stdin.isatty():
-        raise UsageError("drive reads keys and needs a terminal; use acsard.client")
+        raise UsageError(
+            "drive reads single keys and needs a terminal; a program uses acsard.client"
+        )
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
         if tls and (us := robot.whoami()).role in ("", "viewer"):
             raise (NotPermittedError if us.role else NoAnswerError)(us.words())

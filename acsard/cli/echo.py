@@ -30,11 +30,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "echo",
         help="print the messages on a key as JSON lines",
-        description="Print each message on a key as one line of JSON, until Ctrl-C. Any key "
-        "below the robot's id works, also `cmd/teleop`. With --csv wheels, gyro and place as one "
-        "file that `acsard calibrate --log` reads: acsard echo wheel_states imu --csv > drive.csv. "
-        "With --short pose and speeds in words: acsard echo odom -n 1 --short. "
-        "Of several robots (--id) each line says whose it is.",
+        description="Print each message on a key as one line of JSON, until Ctrl-C. Every key "
+        "below the robot's id works, for example `cmd/teleop`. --csv prints wheel "
+        "speeds, gyro and position as one file for `acsard calibrate --log`: acsard "
+        "echo wheel_states imu --csv > drive.csv. --short prints pose and speeds as "
+        "text: acsard echo odom -n 1 --short. If --id names several robots, each "
+        "line begins with its robot.",
     )
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
@@ -43,16 +44,19 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     form.add_argument(
         "--short",
         action="store_true",
-        help="print a line for people: of odom, state, cmd_vel_out or sim/pose",
+        help="print one line of text per message (odom, state, cmd_vel_out and sim/pose only)",
     )
     form.add_argument(
         "--csv",
         action="store_true",
-        help="print rows of a log: of wheel_states, imu, sim/pose or several of them",
+        help="print the rows of a log (one or more of wheel_states, imu and sim/pose)",
     )
     parser.add_argument("-n", type=count, metavar="N", help="end after N messages")
     parser.add_argument(
-        "--timeout", type=float, metavar="S", help="end after S seconds of silence, with exit 1"
+        "--timeout",
+        type=float,
+        metavar="S",
+        help="end with exit code 1 if no message comes for S seconds",
     )
     add_bus(parser, MANY)
     parser.set_defaults(main=main)
@@ -68,14 +72,14 @@ def main(args: argparse.Namespace) -> int:
     endpoint, robot_id, tls = where
     if args.csv:
         if many:
-            raise ExitError(Exit.USAGE, "a log is of one robot: --csv takes one --id")
+            raise ExitError(Exit.USAGE, "a log holds one robot: with --csv, --id takes one robot")
         with (
             connect(endpoint, robot_id=robot_id, tls=tls) as robot,
             explained(waits_for(robot, args.topic[0], where), lost_by(robot, where)) as heard,
         ):
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
-        raise ExitError(Exit.USAGE, "several keys go into one file with --csv only")
+        raise ExitError(Exit.USAGE, "several keys need --csv, which puts them into one file")
     topic = args.topic[0]
     require_followed(topic)
     decoder = _shortened(topic) if args.short else None
@@ -136,7 +140,9 @@ def _shortened(key: str) -> Decoder[Any]:
     topic = by_key(key)
     if topic is None or topic.type not in kinds:
         known = ", ".join(one.key for one in TOPICS if one.type in kinds)
-        raise ExitError(Exit.USAGE, f"{key} has no short form, only as JSON; these have: {known}")
+        raise ExitError(
+            Exit.USAGE, f"{key} has no short form, only JSON; these keys have one: {known}"
+        )
     return Decoder(MESSAGES[topic.type])
 
 
@@ -173,7 +179,7 @@ def _record(
 
     for key in keys:
         if key not in KEYS:
-            raise ExitError(Exit.USAGE, f"{key} is no part of a log; --csv takes {', '.join(KEYS)}")
+            raise ExitError(Exit.USAGE, f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
     queues = [(robot.subscribe(key), decoder(key)) for key in keys]
     print(HEADER, flush=True)
     count, heard_s = 0, time.monotonic()
@@ -200,7 +206,7 @@ def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
     try:
         there = present(robot.session, ids, endpoint)
         missing = [one for one in ids if one not in there and one != ALL]
-        words = f"following {', '.join(there) or 'nobody yet'}"
+        words = f"following {', '.join(there) or 'no robot yet'}"
         words += f"; not there: {', '.join(missing)}" if missing else ""
     except NoAnswerError as error:
         words = f"{error} Waiting."
@@ -227,7 +233,7 @@ def json_line(encoding: str, payload: bytes) -> str:
     try:
         form = detect(encoding, payload)
         if form == "cdr":
-            raise DecodeError("unknown_encoding", "CDR does not say of what type it is")
+            raise DecodeError("unknown_encoding", "a CDR message does not contain its type")
         codec = msgspec.json if form == "json" else msgspec.msgpack
         return msgspec.json.encode(codec.decode(payload)).decode()
     except (DecodeError, msgspec.MsgspecError, ValueError, TypeError, RecursionError):

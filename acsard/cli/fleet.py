@@ -31,10 +31,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "fleet",
-        help="a line for each robot, live",
-        description="Show mode, speed, link, version and why of every robot that the bus or router "
-        "at --connect knows, live; q or Ctrl-C leaves. By TLS a role may use exact keys only: "
-        "name the robots there, --id robot1,robot2. Into a pipe, or with --once, print one table.",
+        help="show one live line per robot",
+        description="Show mode, speed, link, version and reason of every robot that the bus or "
+        "router at --connect knows, live; q or Ctrl-C quits. Over TLS a role may "
+        "use only exact keys, so name the robots: --id robot1,robot2. Into a pipe, "
+        "or with --once, the tool prints one table.",
     )
     parser.add_argument("--once", action="store_true", help="print one table and end")
     add_bus(parser, MANY + " (the default)")

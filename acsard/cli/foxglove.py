@@ -18,23 +18,24 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "foxglove",
-        help="the robot live in Foxglove and Lichtblick",
-        description="Show the robot to Foxglove and Lichtblick (2026 and later) on this machine: "
-        "its topics, and a service that stops it. With --drive also the other services, the "
-        "settings, and a Teleop panel on /cmd_vel drives it as source `app`. Open a connection "
-        "`Foxglove WebSocket` there. Until Ctrl-C.",
+        help="show the robot live in Foxglove or Lichtblick",
+        description="Serve the robot's topics to Foxglove and Lichtblick (2026 and later) on "
+        "this machine until Ctrl-C, with a service that stops the robot. With "
+        "--drive, also offer the other services and the settings, and let a Teleop "
+        "panel drive the robot by /cmd_vel as source `app`. In Foxglove, open a "
+        "connection of the type `Foxglove WebSocket`.",
     )
     parser.add_argument(
         "--address",
         default=DEFAULT,
         metavar="HOST:PORT",
-        help=f"listen here, default {DEFAULT}; this machine only",
+        help=f"address to listen at, on this machine only (default: {DEFAULT})",
     )
     parser.add_argument(
         "--drive",
         action="store_true",
-        help="take commands, services and settings too; any page that is open in a browser on "
-        "this machine can send them while this runs",
+        help="also accept commands, service calls and settings; while this runs, any page that "
+        "is open in a browser on this machine can send them",
     )
     add_bus(parser)
     parser.set_defaults(main=main)
@@ -58,7 +59,11 @@ def main(args: argparse.Namespace) -> int:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: bridge.end())
         try:
-            may = "" if args.drive else "; it shows and stops, --drive takes commands too"
+            may = (
+                ""
+                if args.drive
+                else "; it shows and stops the robot; with --drive it also accepts commands"
+            )
             where = f"ws://{address[0]}:{address[1]}"
             print(f"{robot_id} at {where}: connect Foxglove there{may}", flush=True)
             bridge.run()

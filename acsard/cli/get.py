@@ -16,10 +16,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "get",
-        help="ask a key once and print its answer as JSON",
-        description="Ask a key and print its answer as JSON, laid out for a terminal and on one "
-        "line into a pipe: info, config, interfaces, topics, schema/Twist, and the last value of "
-        "any key that is published.",
+        help="query a key once and print the answer as JSON",
+        description="Query a key and print the answer as JSON, indented on a terminal and as "
+        "one line into a pipe. The key is info, config, interfaces, topics, "
+        "schema/Twist, or any published key, which answers with its last value.",
     )
     parser.add_argument("key", help="for example info, config, schema/Twist, state")
     add_bus(parser, MANY)

@@ -16,9 +16,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "hz",
-        help="measure the rate of a key",
-        description="Measure how often messages come on a key and how even the gaps are; one "
-        "line a second until Ctrl-C, each over the last 10 s.",
+        help="measure the message rate of a key",
+        description="Measure how often messages come on a key and how regular the gaps between "
+        "them are. The tool prints one line per second over the last 10 s, until "
+        "Ctrl-C.",
     )
     parser.add_argument("topic", help="for example odom")
     parser.add_argument("-n", type=count, metavar="N", help="end after N lines")

@@ -26,18 +26,20 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
     parser = verbs.add_parser(
         "lan",
-        help="make certificates, so that other machines may join",
-        description="Certificates for a bus that leaves this machine. Needs the "
-        "library cryptography; without it, it tells what to type.",
+        help="make the certificates with which other machines connect",
+        description="Make certificates for a bus that other machines can reach. Needs the "
+        "library cryptography; if it is missing, a message gives the command that "
+        "installs it.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(
         "init",
-        help="an authority, the robot's certificate and one for each role",
-        description="Make an authority, the robot's certificate, and one certificate for each of "
-        "viewer, operator and maintainer, and print the lines of acsard.toml for them.",
+        help="make a certificate authority, the robot's certificate and one for each role",
+        description="Make a certificate authority, the robot's certificate, and one certificate "
+        "each for viewer, operator and maintainer. Print the lines of acsard.toml "
+        "that use them.",
     )
-    init.add_argument("--force", action="store_true", help="replace what is there")
+    init.add_argument("--force", action="store_true", help="overwrite existing files")
     init.add_argument(
         "--write",
         type=Path,
@@ -47,27 +49,28 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     init.set_defaults(main=main_init)
     more = actions.add_parser(
         "add",
-        help="one more certificate",
+        help="make one more certificate",
         description="Make a certificate for one more person or program.",
     )
     more.add_argument("name", type=_name, metavar="NAME", help="its common name, e.g. laptop-anna")
     more.add_argument(
         "--role",
         choices=ROLES,
-        help="what it may do; leave it out for a robot or a router",
+        help="role of the certificate; leave it out for a robot or a router",
     )
     more.add_argument(
         "--write",
         type=Path,
         metavar="FILE",
-        help="also add the name to its role's list in this acsard.toml",
+        help="also add the name to the list of its role in this acsard.toml",
     )
     add_config(more)
     more.set_defaults(main=main_add)
     renew = actions.add_parser(
         "renew",
-        help="a new certificate for the robot, of the same authority",
-        description="Make the robot's certificate anew before it ends; all others stay valid.",
+        help="make a new certificate for the robot by the same authority",
+        description="Make a new certificate for the robot before the old one expires. All other "
+        "certificates stay valid.",
     )
     renew.set_defaults(main=main_renew)
     for action in (init, more, renew):
@@ -79,10 +82,11 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     router = actions.add_parser(
         "router",
         help="print the configuration of a fleet's router",
-        description="Print router.json5 for `acsard router` or zenohd: what each robot, and each "
-        "person's certificate, may do. deploy/zenoh/README.md has the steps.",
+        description="Print router.json5 for `acsard router` or zenohd. It says what each robot "
+        "and the certificate of each person may do. The steps are in "
+        "deploy/zenoh/README.md.",
     )
-    router.add_argument("robots", nargs="+", metavar="ROBOT", help="the robots' ids")
+    router.add_argument("robots", nargs="+", metavar="ROBOT", help="ids of the robots")
     for role in ROLES:
         router.add_argument(
             f"--{role}",
@@ -90,7 +94,8 @@ def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
             type=_name,
             default=[],
             metavar="NAME",
-            help=f"a certificate that is {role}, beside the one of that name; repeat it",
+            help=f"another certificate with the role {role}, besides the one named {role}; may "
+            "be repeated",
         )
     router.set_defaults(main=main_router)
 
@@ -101,7 +106,7 @@ def _add_common(action: argparse.ArgumentParser) -> None:
         "--directory", type=Path, default=Path(TLS), metavar="DIR", help=f"default {TLS}"
     )
     action.add_argument(
-        "--days", type=_days, default=730, metavar="N", help="validity, default 730 days"
+        "--days", type=_days, default=730, metavar="N", help="validity in days (default: 730)"
     )
     action.add_argument(
         "--address",
@@ -109,7 +114,7 @@ def _add_common(action: argparse.ArgumentParser) -> None:
         type=_address,
         default=[],
         metavar="NAME",
-        help="a name or IP address it is reached by, beside its own name; repeat it",
+        help="another host name or IP address of the robot, besides its own name; may be repeated",
     )
 
 
@@ -157,7 +162,10 @@ def main_add(args: argparse.Namespace) -> int:
     where, config = load(args.config)
     if args.write:
         if not args.role:
-            raise UsageError("--write puts the name into a role's list: say which, --role operator")
+            raise UsageError(
+                "--write adds the name to the list of a role: give the role, for "
+                "example --role operator"
+            )
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
     place = identities.add(args.directory, args.name, args.address, args.days)
@@ -169,10 +177,13 @@ def main_add(args: argparse.Namespace) -> int:
         print(f"{place} is for {args.name}; {args.write}: set access.{listed} = {names}")
     else:
         names = write(keys(config)[f"access.{listed}"])
-        print(f"{place} is for {args.name}; tell the robot in acsard.toml what it may do (whom")
-        print(f"{where} has as {listed} stays; --write FILE does it):\n")
+        print(
+            f"{place} is for {args.name}; add the name to its role in acsard.toml (keep the "
+            "names that"
+        )
+        print(f"{where} already has as {listed}; --write FILE does all this):\n")
         print(f"[access]\n{listed} = {names}\n")
-    print("It counts when the daemon starts: systemctl restart acsard, or `acsard run` anew")
+    print("The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`")
     return 0
 
 
@@ -180,7 +191,7 @@ def main_renew(args: argparse.Namespace) -> int:
     """Replace the robot's own certificate."""
     names = identities.renew(args.directory, args.address, args.days)
     print(_certified(names))
-    print(f"{args.directory / CERTIFICATE} is new; systemctl restart acsard takes it into use")
+    print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
     return 0
 
 
@@ -199,7 +210,7 @@ def main_router(args: argparse.Namespace) -> int:
 
 
 def _certified(names: list[str]) -> str:
-    return f"The robot may be reached as {', '.join(names)} (more by --address).\n"
+    return f"Clients may reach the robot as {', '.join(names)} (add more with --address).\n"
 
 
 def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
@@ -222,7 +233,7 @@ def _admit_service(directory: Path) -> None:
     if step is None:
         return
     step.do()
-    print(f"{step}\nFor the service's door; look at the networks in it, then:")
+    print(f"{step}\nThis is for the service's TLS gateway. Check the networks in it, then run:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 
@@ -238,7 +249,7 @@ def _name(text: str) -> str:
 
 def _address(text: str) -> str:
     if not identities.ADDRESS.match(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no host name and no IP address")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a host name or an IP address")
     return text
 
 
@@ -260,12 +271,12 @@ tls = "{directory}"
 _NEXT = """\
 Wrote {directory}:
   {ca}, {certificate}, {key}   the robot's
-  ca-key.pem                       the authority: whoever has it can let anyone in; keep it safe
+  ca-key.pem                       the authority: a person who has it can admit anyone; keep it safe
   clients/<role>/                  one directory each for viewer, operator, maintainer
 
-{lines}The daemon opens it when it starts: systemctl restart acsard, or `acsard run` anew.
+{lines}The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`.
 
-Copy clients/<role>/ to who may do that, and there:
+Copy clients/<role>/ to the machine of each person with that role, and run there:
 
 acsard echo state --id {robot} --connect {where} --tls <that directory>
 

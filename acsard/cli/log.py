@@ -25,38 +25,44 @@ SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
 
 DESCRIPTION = """\
-What the daemon has recorded. Without a verb: the recordings, oldest first, and what happened in
-each. FILE is a recording, or its number in that list; without it the newest.
+Work with the recordings that the daemon has made. Without a verb, list them, oldest first, with the
+main events of each. FILE is a recording or its number in that list (default: the newest recording).
 """
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
-    parser = verbs.add_parser("log", help="what was recorded, told or lived again",
+    parser = verbs.add_parser("log", help="list, show, replay and export recordings",
                               description=DESCRIPTION)  # fmt: skip
     _directory(parser, None)
     parser.set_defaults(main=list_all)
     inner = parser.add_subparsers(title="verbs", metavar="VERB")
-    show = inner.add_parser("show", help="tell what happened, sentence by sentence")
+    show = inner.add_parser("show", help="print the events of a recording as text")
     show.add_argument("file", nargs="?", metavar="FILE")
     log_span.add(show)
     show.add_argument("--json", action="store_true", help="print one JSON object a line")
     show.set_defaults(main=show_one)
     replay = inner.add_parser(
         "replay",
-        help="run the robot over it again, and compare every line, mode and pose",
-        description="Run the robot over what came in, and compare every line, mode and pose with "
-        "what was recorded. With --config it tells what another configuration would have done.",
+        help="run the recorded inputs through the robot again and compare the results",
+        description="Run the recorded inputs through the robot again, and compare every line, "
+        "mode and pose with the recorded ones. With --config, show what another "
+        "configuration would have changed.",
     )
     replay.add_argument("file", nargs="?", metavar="FILE")
-    replay.add_argument("--config", metavar="FILE", help="another acsard.toml in place of its own")
+    replay.add_argument(
+        "--config",
+        metavar="FILE",
+        help="another acsard.toml to use instead of the recorded configuration",
+    )
     replay.set_defaults(main=replay_one)
     recover = inner.add_parser(
-        "recover", help="write what is whole of an unfinished or damaged one as a finished file"
+        "recover",
+        help="write the intact part of an unfinished or damaged recording as a finished file",
     )
     recover.add_argument("file", metavar="FILE")
     recover.add_argument("new", metavar="NEW", help="the file to write")
-    recover.add_argument("--force", action="store_true", help="write over what is there")
+    recover.add_argument("--force", action="store_true", help="overwrite an existing file")
     recover.set_defaults(main=recover_one)
     export = log_export.add(inner)
     log_span.add(export)
@@ -73,7 +79,7 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
         "--directory",
         default=default,
         metavar="DIRECTORY",
-        help=f"where the recordings are (else record.directory, or {SERVICE})",
+        help=f"directory of the recordings (default: record.directory, or {SERVICE})",
     )
 
 
@@ -139,7 +145,7 @@ def _ending(recording: Recording) -> str:
     from acsard.recording.end_record import how_it_ends
 
     if not recording.ended:
-        return "no end: cut, or being written"
+        return "no end: cut off, or still being recorded"
     return how_it_ends(recording.cut, recording.why)
 
 
@@ -255,13 +261,15 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     except FileNotFoundError:
         raise ExitError(
             Exit.FAILURE,
-            f"nothing is recorded in {where}: it is not there. The service records by itself, "
-            "`acsard run --record DIRECTORY` where you say; --directory reads another",
+            f"nothing is recorded in {where}: the directory does not exist. The service records "
+            "by itself; `acsard run --record DIRECTORY` records where you say. --directory "
+            "reads another directory",
         ) from None
     except OSError as error:
         raise ExitError(
             Exit.NO_PERMISSION if isinstance(error, PermissionError) else Exit.FAILURE,
-            f"cannot read {where}: {error.strerror}; say where with --directory, or use sudo",
+            f"cannot read {where}: {error.strerror}; name another directory with --directory, or "
+            "use sudo",
         ) from None
 
 

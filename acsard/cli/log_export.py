@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from acsard.recording.file import Recording
 
 DESCRIPTION = """\
-Write what the robot said then as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag play`:
-MCAP, with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each source, diagnostics,
-state and log as ROS 2 messages, and their definitions. With --config it is what the robot would
-have said with other parameters.
+Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
+play`. The file is MCAP with odom, tf, tf_static, joint_states, cmd_vel_out, cmd_vel_in of each
+source, diagnostics, state and log as ROS 2 messages, and with their definitions. With --config,
+write the messages that the robot would have published with another configuration.
 """
 
 
@@ -27,20 +27,39 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
     """Declare the action and its options."""
     parser = inner.add_parser(
         "export",
-        help="write it for Foxglove, PlotJuggler, ros2 bag or a table",
+        help="write a recording as a file for Foxglove, PlotJuggler, ros2 bag, or as a table",
         description=DESCRIPTION,
     )
     parser.add_argument("file", nargs="?", metavar="FILE")
-    parser.add_argument("new", nargs="?", metavar="NEW", help="what to write (by default in this "
-                        "directory, called as the recording, with another ending)")  # fmt: skip
+    parser.add_argument(
+        "new",
+        nargs="?",
+        metavar="NEW",
+        help="file to write (default: the recording's name with another suffix, in this directory)",
+    )
     form = parser.add_mutually_exclusive_group()
-    form.add_argument("--csv", dest="kind", action="store_const", const="csv", default="mcap",
-                      help="write a table: a line for each feedback; what `acsard calibrate --log` "
-                      "reads comes first")  # fmt: skip
-    form.add_argument("--rosbag2", dest="kind", action="store_const", const="rosbag2",
-                      help="write a directory with metadata.yaml, as `ros2 bag` does")  # fmt: skip
-    parser.add_argument("--config", metavar="FILE", help="another acsard.toml in place of its own")
-    parser.add_argument("--force", action="store_true", help="write over what is there")
+    form.add_argument(
+        "--csv",
+        dest="kind",
+        action="store_const",
+        const="csv",
+        default="mcap",
+        help="write a table with one row per feedback line; its first columns are those that "
+        "`acsard calibrate --log` reads",
+    )
+    form.add_argument(
+        "--rosbag2",
+        dest="kind",
+        action="store_const",
+        const="rosbag2",
+        help="write a directory with metadata.yaml, as `ros2 bag` does",
+    )
+    parser.add_argument(
+        "--config",
+        metavar="FILE",
+        help="another acsard.toml to use instead of the recorded configuration",
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
     return parser
 
 

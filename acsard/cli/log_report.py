@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from acsard.recording.file import Recording
 
 DESCRIPTION = """\
-Draw what happened as one HTML file that needs no network. Needs the library plotly; without it, it
-tells what to type.
+Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
+a message gives the command that installs it.
 """
 
 
@@ -38,12 +38,17 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
     """Declare the action and its options."""
     parser = inner.add_parser(
         "report",
-        help="draw it: one HTML file with path, speeds, who drove and why, link, events",
+        help="draw a recording as one HTML file with path, speeds, sources, link and events",
         description=DESCRIPTION,
     )
     parser.add_argument("file", nargs="?", metavar="FILE")
-    parser.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
-    parser.add_argument("--force", action="store_true", help="write over what is there")
+    parser.add_argument(
+        "new",
+        nargs="?",
+        metavar="NEW.html",
+        help="file to write (default: FILE.html in this directory)",
+    )
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
     parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
     return parser
 
@@ -80,7 +85,7 @@ def report_one(
         raise ExitError(
             Exit.NO_PERMISSION if denied else Exit.FAILURE, f"cannot write {new}: {error.strerror}"
         ) from None
-    print(f"{new}: {len(text) / 1e6:.1f} MB, for any browser")
+    print(f"{new}: {len(text) / 1000000.0:.1f} MB; open it in any browser")
     return known
 
 
@@ -137,13 +142,16 @@ def _drawn(
             deque(recording.messages(), maxlen=0)
             break
     if course.began is None:
-        message = f"{recording.path} has no step of that time to draw"
+        message = f"{recording.path} has no step in that span of time, so there is nothing to draw"
         raise ExitError(Exit.FAILURE, message)
     course.end()
     said = [*filter(None, [words.state(recording).strip(" []")]), *looked.notes]
     tally = looked.replay.tally
     if not (tally.same or looked.notes or course.missing):
-        said.append(f"this acsard computes it otherwise than it was: {verdict(tally)}")
+        said.append(
+            "this version of acsard computes other results than the recorded ones: "
+            f"{verdict(tally)}"
+        )
     origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
     offset_s = time.localtime(course.began).tm_gmtoff
     return page(course, origin, plotly, words.clock, offset_s), notes(course, origin)

@@ -35,7 +35,7 @@ class Stretch(NamedTuple):
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add `--from` and `--to`."""
-    when = "seconds after the beginning, or the time of day: HH:MM, HH:MM:SS"
+    when = "seconds after the beginning of the recording, or the time of day: HH:MM, HH:MM:SS"
     parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
     parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
 

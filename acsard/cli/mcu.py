@@ -22,15 +22,16 @@ if TYPE_CHECKING:
     from acsard.prompts.json_lines import JsonPerson
 
 DESCRIPTION = """\
-Find out on your own robot, wheels lifted, what its microcontroller speaks and whether it keeps
-what the robot's safety rests on: baud rate, dialect and trailing comma, reply rate and round trip,
-the checked link, each motor and encoder alone, the watchdog, damaged lines. It opens the port
-itself: stop the daemon first (exit 75 if it has the port). Motors turn one by one, then
-together, after you have typed that the wheels are lifted: told 3 rad/s at the most, but a wheel
-whose encoder is dead or reversed can reach full speed. A board that starts anew meanwhile is told,
-and what was being looked at is looked at again. The last lines out are zeros, whatever happens,
-then silence. Exit 0 when all of it was judged and nothing fails; 1 when something does, when it
-ended early, or when this computer was too late to judge a row: try again when it is free.
+Test the microcontroller on your own robot with its wheels lifted. The tool finds its protocol and
+tests everything that the robot's safety depends on: baud rate, dialect and trailing comma, reply
+rate and round trip, the checked link, each motor and encoder alone, the watchdog, and damaged
+lines. It opens the port itself, so stop the daemon first (exit code 75 if the daemon has the port).
+It asks you to type that the wheels are lifted. Then it turns the motors one by one, and then all
+together. It commands at most 3 rad/s, but a wheel whose encoder is dead or reversed can reach full
+speed. If the board restarts during a test, the tool reports that and repeats the test. Its last
+lines to the board are always zeros, then it is silent. The exit code is 0 if every test was judged
+and none failed. It is 1 if a test failed, if the tool ended early, or if this computer was too slow
+to judge a test; in that case try again when the computer is idle.
 """
 
 
@@ -38,27 +39,30 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its action and their options."""
     parser = verbs.add_parser(
         "mcu",
-        help="prove the microcontroller's side on your own robot, wheels lifted",
-        description="What has to do with the microcontroller alone, without the daemon.",
+        help="test the microcontroller on your own robot with its wheels lifted",
+        description="Work with the microcontroller alone, without the daemon.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
-        help="dialect, wheels, watchdog and damage, and the lines of acsard.toml",
+        help="test dialect, wheels, watchdog and damaged lines; print the lines for acsard.toml",
         description=DESCRIPTION,
     )
     add_config(check)
     check.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
-    check.add_argument("--baud-rate", type=int, metavar="N", help="tried first; 9600 to 115200")
+    check.add_argument(
+        "--baud-rate", type=int, metavar="N", help="baud rate to try first, from 9600 to 115200"
+    )
     check.add_argument(
         "--yes",
         action="store_true",
-        help="ask nothing: on the simulator; on a robot only with --wheels-are-lifted",
+        help="ask no questions: for the simulator, or on a robot only together with "
+        "--wheels-are-lifted",
     )
     check.add_argument(
         "--wheels-are-lifted",
         action="store_true",
-        help="with --yes: you have made sure that no wheel touches anything, and watch the robot",
+        help="with --yes: confirm that no wheel touches anything and that you watch the robot",
     )
     how = check.add_mutually_exclusive_group()
     how.add_argument("--json", action="store_true", help="print one JSON object")
@@ -66,8 +70,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     check.add_argument(
         "--write",
         action="store_true",
-        help="also write the lines into the configuration file, and --port, comments kept (needs "
-        "the library tomlkit; without it, it tells what to type)",
+        help="also write the found lines, and --port, into the configuration file and keep its "
+        "comments (needs the library tomlkit; if it is missing, a message gives the "
+        "command that installs it)",
     )
     check.set_defaults(main=main)
 
@@ -84,7 +89,7 @@ def main(args: argparse.Namespace) -> int:
     if args.write:
         writable(args.config)
         if why := withheld(config.mcu.simulated, load(args.config)[1]):
-            raise UsageError(f"nothing would be written into {where}: {why}; leave --write out")
+            raise UsageError(f"{where} would not be changed: {why}; leave --write out")
     with answering(args, config.mcu.port) as person:
         return _checked(args, config, where, person)
 
@@ -103,7 +108,7 @@ def _checked(
         findings.append(finding)
         person.found(finding)
 
-    words = " (the built-in SIMULATOR, in its own time)" if simulated else ""
+    words = " (the built-in SIMULATOR, in simulated time)" if simulated else ""
     person.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
     trouble: MendableError | None = None
     try:

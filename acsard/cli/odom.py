@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from acsard.error_budget.daemon_messages import Feed
 
 DESCRIPTION = """\
-Follow the robot while somebody drives it, and tell how much each cause alone makes its odometry
-wrong, in mm after 100 m and in degrees after a turn of 360, if it is driven on like that: the time
-of the lines, what they round away, gaps, slip, wheel radii and track, and the gyro where one is
-used; and what to do about the largest. It sends nothing. Of a robot that stands it says what the
-settings tell.
+Follow the robot while it is driven, and print how much each cause alone makes its odometry wrong if
+the drive goes on like that: in mm after 100 m, and in degrees after a turn of 360 degrees. The
+causes are the times of the feedback lines, their rounding, gaps, slip, wheel radii and track width,
+and the gyro if there is one. The tool also says how to reduce the largest error. It sends nothing.
+While the robot stands still, it prints only the errors that follow from the settings.
 """
 
 LOOK_S = 0.05
@@ -33,16 +33,22 @@ LOOK_S = 0.05
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
-        "odom", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
+        "odom",
+        help="show the causes of odometry error now, and their fixes",
+        description=DESCRIPTION,
     )
     parser.add_argument(
-        "--seconds", type=_seconds, default=5.0, metavar="S", help="how long to look; 5 s"
+        "--seconds",
+        type=_seconds,
+        default=5.0,
+        metavar="S",
+        help="how long to measure (default: 5)",
     )
     parser.add_argument(
         "--follow",
         action="store_true",
-        help="go on until Ctrl-C, and tell every S seconds of all since the start, at most of "
-        "the last ten minutes",
+        help="continue until Ctrl-C; every S seconds print the result since the start, or of "
+        "the last ten minutes at most",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     add_bus(parser)
@@ -94,7 +100,8 @@ def _config(robot: Client, path: str | None) -> Config:
     except (NoAnswerError, NotPermittedError, msgspec.ValidationError):
         where, config = load(path)
         print(
-            f"acsard: the robot does not tell its configuration: taken is {where}", file=sys.stderr
+            f"acsard: the robot does not answer with its configuration, so the tool uses {where}",
+            file=sys.stderr,
         )
         return config
 
@@ -131,7 +138,7 @@ def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None
                 except DecodeError as error:
                     raise ExitError(
                         Exit.FAILURE,
-                        f"cannot read {key} ({error}); is the daemon of another version?",
+                        f"cannot read {key} ({error}); does the daemon have another version?",
                     ) from None
 
 

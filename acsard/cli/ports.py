@@ -10,10 +10,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "ports",
-        help="list the serial ports, who holds them, and which looks like the MCU",
-        description="List what is plugged in: device, stable names, driver, USB id, who holds it, "
-        "and which usual microcontroller board it looks like. Opens nothing. Exit 1 when there "
-        "is no port at all.",
+        help="list the serial ports, the processes that use them, and the likely MCU",
+        description="List the serial ports: device, stable names, driver, USB id, the process "
+        "that has it open, and the common microcontroller board that it resembles. "
+        "The tool opens no port. The exit code is 1 if there is no port.",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(main=main)
@@ -31,8 +31,8 @@ def main(args: argparse.Namespace) -> int:
         return 0 if found else 1
     if not found:
         print(
-            "no serial ports: is the board plugged in, by a cable with data lines? "
-            "`dmesg | tail` says what the kernel saw",
+            "no serial ports: is the board plugged in, by a cable with data lines? `dmesg | "
+            "tail` shows the kernel's messages",
             file=sys.stderr,
         )
         return 1

@@ -16,12 +16,15 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "router",
-        help="a fleet's Zenoh router, watched and opened anew when it is held up",
-        description="Zenoh in router mode by a configuration of Zenoh's own, such as "
-        "deploy/zenoh/router.json5, in a process that is ended and started again when somebody "
-        "connected takes all its time or memory. Without plugins: storages are zenohd's.",
+        help="run a fleet's Zenoh router and restart it when a client blocks it",
+        description="Run Zenoh in router mode with a configuration file of Zenoh, such as "
+        "deploy/zenoh/router.json5. The router is a child process. It is ended and "
+        "restarted if a client takes all its time or memory. It runs no plugins; "
+        "for storages use zenohd.",
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="Zenoh's configuration (JSON5)")
+    parser.add_argument(
+        "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
+    )
     # The verb starts itself with this option: the child is the router and ends with its standard
     # input.
     parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)

@@ -18,12 +18,12 @@ acsard {version}, robot {robot}
   bus     {listen}, keys {root}/{robot}/...   (`acsard topics` lists them)
 {page}  config  {where}
   try, in a second terminal:
-    acsard drive{reach}      drive it by keyboard
-    acsard top{reach}        where it is, how it moves and why not, on one screen
+    acsard drive{reach}      drive it with the keyboard
+    acsard top{reach}        show position, speeds and faults on one screen
     acsard call stop{reach}  stop it, and keep it stopped until `acsard call clear`
 """
 
-_PAGE = "  page    {where}, for a browser; a line below says when it is open\n"
+_PAGE = "  page    {where}, for a browser; a line below says when it is ready\n"
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -31,36 +31,38 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "run",
         help="run the daemon (the default verb)",
-        description="Run the daemon in the foreground until SIGTERM or Ctrl-C, which ramp the "
-        "robot to zero first. Without a configured port it runs the built-in simulator.",
+        description="Run the daemon in the foreground until SIGTERM or Ctrl-C; the robot ramps "
+        "to zero before the daemon ends. If no port is configured, the daemon runs "
+        "the built-in simulator.",
     )
     add_config(parser)
     parser.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
-    parser.add_argument("--baud-rate", type=int, metavar="N", help="9600 to 115200")
+    parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 115200")
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument(
-        "--namespace", metavar="NAME", help="in front of its ROS topics (ros.namespace)"
+        "--namespace", metavar="NAME", help="prefix of the robot's ROS topics (ros.namespace)"
     )
     parser.add_argument(
         "--listen",
         metavar="ENDPOINT",
-        help="bus address in place of all of bus.listen, e.g. tcp/127.0.0.1:7448",
+        help="bus address to use instead of bus.listen, e.g. tcp/127.0.0.1:7448",
     )
     parser.add_argument(
         "--connect",
         metavar="ENDPOINT",
-        help="a router to join, in place of all of bus.connect, e.g. tcp/127.0.0.1:7447",
+        help="router to connect to instead of bus.connect, e.g. tcp/127.0.0.1:7447",
     )
     parser.add_argument(
         "--record",
         metavar="DIRECTORY",
-        help="record all that comes in and the lines that leave there (record.directory); "
-        "`acsard log` reads it",
+        help="record all inputs and all lines to the board in this directory "
+        "(record.directory); `acsard log` reads it",
     )
     parser.add_argument(
         "--no-door",
         action="store_true",
-        help="start no `acsard door` for the tls/ endpoints: it runs by itself, as a service",
+        help="do not start `acsard door` for the tls/ endpoints, because it already runs as a "
+        "service",
     )
     parser.set_defaults(main=main)
 

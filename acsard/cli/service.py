@@ -18,30 +18,34 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
     parser = verbs.add_parser(
         "service",
-        help="install acsard as a system service, remove it, or see how it is",
-        description="Install the unit, the stop script, the udev rules and a first "
-        "configuration, enable and start the service; or undo that.",
+        help="install acsard as a system service, remove it, or show its status",
+        description="Install the systemd unit, the stop script, the udev rules and a first "
+        "configuration, then enable and start the service; or remove all of that.",
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for name, main, text in (
         ("install", main_install, "write the files, enable and start the service"),
         ("uninstall", main_uninstall, "stop and disable the service, remove the files"),
-        ("status", main_status, "which files are there, does the service run"),
+        ("status", main_status, "show which files are installed and whether the service runs"),
     ):
         action = actions.add_parser(name, help=text, description=text.capitalize() + ".")
         if name != "status":
             action.add_argument(
-                "--dry-run", action="store_true", help="print every file and command; do nothing"
+                "--dry-run",
+                action="store_true",
+                help="print every file and command, but change nothing",
             )
             action.add_argument(
-                "--force", action="store_true", help="also files that somebody has changed"
+                "--force",
+                action="store_true",
+                help="also replace or remove files that have been edited",
             )
         if name == "uninstall":
             action.add_argument(
                 "--purge",
                 action="store_true",
-                help="also your configuration, certificates, drop-ins, recordings and the page's "
-                "invitations",
+                help="also remove your configuration, certificates, drop-ins, recordings and "
+                "the page's invitations",
             )
         action.set_defaults(main=main)
 
@@ -80,7 +84,7 @@ def main_uninstall(args: argparse.Namespace) -> int:
         stateful=[unit for unit, (where, _) in service.STATES.items() if where.exists()],
     )
     _do(steps, args.dry_run)
-    print(f"\nkept as well: the program, in {sys.prefix}; removing that directory removes it")
+    print(f"\nThe program itself stays in {sys.prefix}; delete that directory to remove it")
     return 0
 
 
@@ -101,7 +105,9 @@ def main_status(args: argparse.Namespace) -> int:
 
 def _ready(args: argparse.Namespace) -> None:
     if not args.dry_run and os.geteuid() != 0:
-        raise ExitError(Exit.NO_PERMISSION, "run it by sudo, or look at it with --dry-run")
+        raise ExitError(
+            Exit.NO_PERMISSION, "run it with sudo, or use --dry-run to see what it would do"
+        )
 
 
 def _do(steps: Iterable[Step], dry_run: bool) -> None:
@@ -115,5 +121,5 @@ def _do(steps: Iterable[Step], dry_run: bool) -> None:
             raise
         except OSError as error:
             raise ExitError(
-                Exit.FAILURE, f"could not: {step}: {error.strerror}; mend that and run it again"
+                Exit.FAILURE, f"could not: {step}: {error.strerror}; fix that and run it again"
             ) from None

@@ -17,12 +17,13 @@ if TYPE_CHECKING:
     from acsard.core.values import Plain
 
 DESCRIPTION = """\
-Change settings of the robot that runs, all or none: limits, timeouts, covariances, publishing
-rates, the log's level. They are checked as the file is, told in the log and on the key `config`,
-and gone with the next start, except a lowered speed, acceleration or jerk, unless --write puts
-them into the configuration file too (all but a source's timeout: [[commands.sources]] is yours to
-write). A lower speed limit is reached by the deceleration. Without a setting: list
-those that there are. Exit 1 when it is refused.
+Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
+level. Either all given settings change or none. The daemon checks them like the configuration file,
+logs them and publishes them on the key `config`. They last until the daemon's next start; only a
+lowered speed, acceleration or jerk survives it. --write also puts the settings into the
+configuration file, except a source's timeout: edit [[commands.sources]] yourself. The robot
+decelerates to a lowered speed limit. Without a setting, list the settings that can be changed. The
+exit code is 1 if the robot refuses.
 """
 
 
@@ -30,21 +31,23 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "set",
-        help="change a setting of the running robot, or list those that can be",
+        help="change a setting of the running robot, or list the changeable settings",
         description=DESCRIPTION,
     )
     parser.add_argument(
         "settings",
         nargs="*",
         metavar="KEY VALUE",
-        help="a key of acsard.toml with its table, as limits.linear_speed; write a list as [1, 2]",
+        help="a key of acsard.toml with its table, for example limits.linear_speed; write a "
+        "list as [1, 2]",
     )
     parser.add_argument(
         "--write",
         action="store_true",
-        help=f"also into the configuration file here, comments kept (an extra: {install('mcu')})",
+        help="also write it into the local configuration file and keep its comments (needs an "
+        f"extra: {install('mcu')})",
     )
-    parser.add_argument("--json", action="store_true", help="print the answer, or list, as JSON")
+    parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser)
     parser.set_defaults(main=main)
 
@@ -69,7 +72,7 @@ def main(args: argparse.Namespace) -> int:
         reply = robot.set(settings)
     until = "until the next start"
     if any(stays(key) for key in settings):
-        until += "; a lowered limit survives it"
+        until += "; a lowered limit survives the restart"
     if reply.success and file is not None:
         try:
             change(file, settings)
@@ -91,7 +94,7 @@ def pairs(words: Sequence[str]) -> dict[str, Plain]:
     from acsard.host.errors import UsageError
 
     if len(words) % 2:
-        raise UsageError("write: acsard set KEY VALUE, as in acsard set limits.linear_speed 0.8")
+        raise UsageError("give pairs of KEY VALUE, for example acsard set limits.linear_speed 0.8")
     return {key: _value(word) for key, word in zip(words[::2], words[1::2], strict=True)}
 
 
@@ -115,9 +118,10 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
     if any(key.startswith("commands.sources.") for key in settings):
         raise UsageError(
-            "--write cannot change [[commands.sources]]: set it without --write, and write the "
-            "timeout into the file yourself; a file that has none of these tables needs all that "
-            "`acsard check` prints, for those in the file replace the built-in ones"
+            "--write cannot change [[commands.sources]]: set the timeout without --write, and "
+            "write it into the file yourself. If the file has no [[commands.sources]], copy all "
+            "of these tables from `acsard check`, because those in the file replace the "
+            "built-in ones"
         )
     return writable(path)
 

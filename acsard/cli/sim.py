@@ -17,9 +17,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "sim",
-        help="a simulated microcontroller on a pty, for a separate `acsard run --port …`",
-        description="Play the microcontroller's side of the serial protocol on a pty, until "
-        "Ctrl-C. Prints the device to give to `acsard run --port`.",
+        help="simulate a microcontroller on a pty, for a separate `acsard run --port …`",
+        description="Simulate the microcontroller's side of the serial protocol on a pty, until "
+        "Ctrl-C. The tool prints the device for `acsard run --port`.",
     )
     add_config(parser)
     parser.add_argument(
@@ -28,8 +28,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         default=[],
         type=fault,
         metavar="NAME",
-        help=f"misbehave, may be repeated: {', '.join(FAULTS)}; with motors (a to d) or numbers: "
-        f"{', '.join(forms())}; reset=SECONDS (again and again)",
+        help=f"simulate a fault; may be repeated: {', '.join(FAULTS)}; with motors (a to d) or "
+        f"numbers: {', '.join(forms())}; reset=SECONDS (repeatedly)",
     )
     parser.add_argument(
         "--link", metavar="PATH", help="also make a symbolic link at PATH to the device"
@@ -104,5 +104,5 @@ async def _play(config: Config, args: argparse.Namespace) -> int:
         faults = ", ".join((*config.sim.faults, *(fault.name for fault in args.fault))) or "none"
         print(f"simulated MCU on {device}, faults: {faults}; Ctrl-C ends it", file=sys.stderr)
         await ended.wait()
-    print(f"heard {mcu.valid_lines} valid lines", file=sys.stderr)
+    print(f"received {mcu.valid_lines} valid lines", file=sys.stderr)
     return 0

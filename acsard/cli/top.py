@@ -11,9 +11,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "top",
-        help="the robot on one screen, live",
+        help="show the robot's status on one screen, live",
         description="Show mode, pose, wheels, command sources, link and timing on one screen, "
-        "live; q or Ctrl-C leaves. Into a pipe, or with --once, print one screen as plain text.",
+        "live; q or Ctrl-C quits. Into a pipe, or with --once, the tool prints one "
+        "screen as plain text.",
     )
     parser.add_argument("--once", action="store_true", help="print one screen and end")
     add_bus(parser)

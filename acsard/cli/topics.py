@@ -17,7 +17,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser = verbs.add_parser(
         "topics",
         help="list the keys on the bus: direction, type, rate, meaning",
-        description="List every key of the daemon. Needs no running daemon.",
+        description="List every key of the daemon. No daemon has to run.",
     )
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -57,7 +57,11 @@ def ros_table(config: Config) -> Topics:
         note = f"as {row.native}" + (f": {native.note}" if native else "")
         if row.direction == "query":
             sets = row.name.endswith(SETTING)
-            note = "sets what `acsard set` lists" if sets else "the configuration as parameters"
+            note = (
+                "changes the settings that `acsard set` lists"
+                if sets
+                else "the configuration as parameters"
+            )
         name = full_name(ros.namespace, row.name)
         rows.append(TopicInfo(name, row.direction, row.type, native.rate if native else "", note))
     return Topics(rows)

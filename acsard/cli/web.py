@@ -31,37 +31,51 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "web",
-        help="the robot's page: see it, stop it, drive it in a browser",
-        description="Serve the robot's page until Ctrl-C, beside a running daemon, which starts it "
-        "by itself in a terminal. At the machine everybody may do all; elsewhere by HTTPS, with "
-        f"the robot's certificate and a token. An extra: {install('web')}.",
+        help="serve the robot's page: see, stop and drive the robot in a browser",
+        description="Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in "
+        "a terminal starts this by itself. A browser on the robot's machine has "
+        "every permission. A browser on another machine needs HTTPS with the "
+        f"robot's certificate, and a token. Needs an extra: {install('web')}.",
     )
     add_bus(parser)
     parser.add_argument(
         "--address",
         action="append",
         metavar="URL",
-        help="where to listen, may be repeated, in place of all of web.address; "
+        help="address to listen at instead of web.address; may be repeated; "
         "https://0.0.0.0:8443 is for other machines",
     )
     parser.add_argument(
         "--record",
         metavar="DIRECTORY",
-        help="where the recordings are until the robot says so (else record.directory)",
+        help="directory of the recordings until the robot reports its own (default: "
+        "record.directory)",
     )
     doing = parser.add_mutually_exclusive_group()
     doing.add_argument(
-        "--invite", choices=ROLES, help="print an address with a new token, and its QR code"
+        "--invite",
+        choices=ROLES,
+        help="print a link with a new token of this role, and its QR code",
     )
     doing.add_argument("--tokens", action="store_true", help="list the tokens")
-    doing.add_argument("--revoke", metavar="NAME", help="end a token; its pages close at once")
-    parser.add_argument("--name", type=_name, help="of the token: whose it is (default: the role)")
+    doing.add_argument(
+        "--revoke", metavar="NAME", help="revoke a token; the pages that use it close at once"
+    )
+    parser.add_argument(
+        "--name", type=_name, help="name of the token, for example its user (default: the role)"
+    )
     lasting = parser.add_mutually_exclusive_group()
     lasting.add_argument(
-        "--days", type=_days, metavar="N", help=f"until the token ends (default {USUAL_DAYS})"
+        "--days",
+        type=_days,
+        metavar="N",
+        help=f"days until the token expires (default: {USUAL_DAYS})",
     )
     lasting.add_argument(
-        "--hours", type=_hours, metavar="N", help=f"the same, for a visitor: 1 to {MOST_HOURS}"
+        "--hours",
+        type=_hours,
+        metavar="N",
+        help=f"hours until the token expires, for a visitor: 1 to {MOST_HOURS}",
     )
     parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
@@ -144,8 +158,8 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
     urls = invitations(listen, tls)
     if not urls:
         raise UsageError(
-            f"nobody could come with it: web.address in {where} has no https://; add "
-            '"https://0.0.0.0:8443" there, or name another file by --config (or --address); and '
+            f"no browser could use the link: web.address in {where} has no https://. Add "
+            '"https://0.0.0.0:8443" there, or name another file with --config (or --address); '
             "`acsard lan init` makes a certificate"
         )
     vault = _vault(args, config)
@@ -157,7 +171,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
         print(f"  {url}#token={text}")
     print()
     segno.make(f"{urls[0]}#token={text}", error="l").terminal(sys.stdout, compact=True)
-    print(f"\nended sooner by: acsard web --revoke {token.name}")
+    print(f"\nto end it sooner: acsard web --revoke {token.name}")
     if unknown := vault.unknown_to():
         print(unknown)
     return int(Exit.OK)
@@ -190,7 +204,7 @@ def _list(vault: Vault) -> int:
 
 def _revoke(vault: Vault, name: str) -> int:
     vault.revoke(name)
-    print(f"{name} counts no more")
+    print(f"{name} is revoked")
     return int(Exit.OK)
 
 
@@ -200,20 +214,22 @@ def _clock(seconds: int) -> str:
 
 def _name(text: str) -> str:
     if not NAME.match(text):
-        raise argparse.ArgumentTypeError(f"{text!r} is no name: 1 to 32 of A-Z a-z 0-9 _ . -")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a name: use 1 to 32 of A-Z a-z 0-9 _ . -"
+        )
     return text
 
 
 def _days(text: str) -> int:
-    return _whole(text, MOST_DAYS, "days", "; for less than a day --hours")
+    return _whole(text, MOST_DAYS, "days", "; for less than a day use --hours")
 
 
 def _hours(text: str) -> int:
-    return _whole(text, MOST_HOURS, "hours", "; for more --days")
+    return _whole(text, MOST_HOURS, "hours", "; for more use --days")
 
 
 def _whole(text: str, most: int, units: str, else_: str) -> int:
     if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
-        words = f"{text} is no whole number of {units} from 1 to {most}{else_}"
+        words = f"{text} is not a whole number of {units} from 1 to {most}{else_}"
         raise argparse.ArgumentTypeError(words)
     return int(text)

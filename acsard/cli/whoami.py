@@ -12,10 +12,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "whoami",
-        help="what you may do there: role, certificate, sender",
-        description="Ask the robot which role it gives us: viewer, operator or maintainer. By TLS "
-        "the certificate decides, at the machine itself everybody is maintainer. Exit 77 when we "
-        "have no role.",
+        help="show your role on this robot, your certificate and your sender id",
+        description="Ask the robot for the role of this client: viewer, operator or maintainer. "
+        "Over TLS the certificate decides; on the robot's own machine every client "
+        "is maintainer. The exit code is 77 if the client has no role.",
     )
     parser.add_argument("--json", action="store_true", help="print it as JSON")
     add_bus(parser)

@@ -78,7 +78,7 @@ class Exit(IntEnum):
 WORDS: dict[int, str] = {
     Exit.OK: "done",
     Exit.FAILURE: "failure",
-    Exit.USAGE: "usage",
+    Exit.USAGE: "wrong usage",
     Exit.NO_PORT: "no such port",
     Exit.UNREACHABLE: "daemon unreachable",
     Exit.IN_USE: "port, bus address or robot id in use",

@@ -338,7 +338,7 @@ def test_whatever_else_ends_a_leg_is_told(tmp_path: Path, how: str) -> None:
                 why = "teleop commands the robot now"
             else:
                 terminal.press("\x03")
-                why = "ended by the person"
+                why = "the operator ended the drive"
             assert program.ended(5.0) == 1
             until(lambda: not any(bus.state()["wheels"]), 5.0, "at rest")
             assert why in terminal.screen

@@ -468,8 +468,8 @@ def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> N
     [
         (("limits.linear_speed", "20"), 1, "expected a number from 0 to 10 m/s"),
         (("mcu.port", "/dev/x"), 1, "takes a start"),
-        (("limits.linear_speed",), 2, "acsard set KEY VALUE"),
-        (("commands.sources.nav.timeout", "0.5", "--write"), 2, "all that `acsard check` prints"),
+        (("limits.linear_speed",), 2, "pairs of KEY VALUE"),
+        (("commands.sources.nav.timeout", "0.5", "--write"), 2, "from `acsard check`"),
         (("--write",), 2, "--write needs a setting"),
     ],
 )

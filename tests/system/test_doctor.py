@@ -173,7 +173,7 @@ def test_of_a_daemon_on_another_machine_only_what_it_says_of_itself_is_told(tmp_
         (("--connect", "tcp/127.0.0.1"), "tcp/127.0.0.1 is not an endpoint"),
         (("--connect", "tcp/127.0.0.1:99999"), "tcp/127.0.0.1:99999 is not an endpoint"),
         (("--id", "a/b"), "'a/b' is not a robot's id"),
-        (("--id", "*"), "names many robots"),
+        (("--id", "*"), "names several robots"),
     ],
 )
 def test_what_can_be_no_place_of_a_daemon_is_a_sentence(

@@ -175,15 +175,15 @@ def driving(*words: str) -> int:
         (["--way", "positions"], "--positions KEY"),
         (["--way", "tape", "--positions", "sim/pose"], "leave one out"),
         (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
-        (["--positions", "odom"], "what the wheels say"),
-        (["--positions", "acsard/acsar/odom"], "what the wheels say"),
+        (["--positions", "odom"], "computed from the wheels themselves"),
+        (["--positions", "acsard/acsar/odom"], "computed from the wheels themselves"),
         (["--log", "drive.csv", "--way", "tape"], "--way is for a guided drive"),
         (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
         (["--way", "tape", "--imu", "imu"], "--imu is for --way gyro, not for --way tape"),
         (["--positions", "sim/pose", "--imu", "x/imu"], "not for --positions"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
         (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),
-        (["--yes", "--json-lines"], "--json-lines a program"),
+        (["--yes", "--json-lines"], "--json-lines asks them through a program"),
     ],
 )
 def test_what_cannot_be_meant_is_said_before_anything_is_connected_to(

@@ -22,5 +22,5 @@ def test_what_is_not_for_many_says_why_and_what_to_type_instead(
     assert main(["call", *words]) == Exit.USAGE
     told = capsys.readouterr().err
     assert "only stop goes to many robots at once" in told
-    assert "somebody has to look at each" in told
+    assert "a person must look at each" in told
     assert all(one in told for one in instead)

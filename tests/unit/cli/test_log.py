@@ -64,7 +64,9 @@ def test_the_list_has_a_line_each_and_says_what_happened(
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
     assert first.endswith("start, 1 change of who drives, 1 stop (stopped by unnamed (native))")
-    assert second.endswith("start, 1 change of who drives  [no end: cut, or being written]")
+    assert second.endswith(
+        "start, 1 change of who drives  [no end: cut off, or still being recorded]"
+    )
 
 
 def test_the_list_tells_a_start_from_a_file_that_goes_on(

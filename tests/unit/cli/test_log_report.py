@@ -135,7 +135,7 @@ def test_of_a_time_without_steps_there_is_no_report(
     new = tmp_path / "none.html"
     code, _, err = report(capsys, QUIET, new, "--from", "9999")
     assert code == 1
-    assert "no step of that time" in err
+    assert "no step in that span of time" in err
     assert not new.exists()
 
 

@@ -47,7 +47,7 @@ def test_several_settings_are_pairs_one_after_the_other() -> None:
 
 
 def test_a_key_without_a_value_is_told_how_to_write_it() -> None:
-    with pytest.raises(UsageError, match=r"acsard set KEY VALUE"):
+    with pytest.raises(UsageError, match=r"pairs of KEY VALUE"):
         pairs(["limits.linear_speed"])
 
 
@@ -66,7 +66,7 @@ def test_the_help_and_the_ros_page_say_what_write_does_not_write(
 @pytest.mark.parametrize(
     ("key", "until"),
     [
-        ("limits.linear_speed", "; until the next start; a lowered limit survives it"),
+        ("limits.linear_speed", "; until the next start; a lowered limit survives the restart"),
         ("limits.linear_deceleration", "; until the next start"),
         ("rates.state", "; until the next start"),
     ],

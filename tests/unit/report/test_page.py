@@ -140,9 +140,9 @@ def escaped_words(mark: Mark) -> str:
 def test_what_is_missing_is_said_on_top() -> None:
     _, steps = drive_of_two()
     course = followed(steps[:200] + steps[260:])
-    notes = Origin("a", "r", "1", "3", ("no end: cut, or being written",))
+    notes = Origin("a", "r", "1", "3", ("no end: cut off, or still being recorded",))
     words = Read(page(course, notes, LIBRARY, clock)).words
-    assert "no end: cut, or being written" in words
+    assert "no end: cut off, or still being recorded" in words
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
 
