@@ -131,7 +131,7 @@ class Guard:
             abs(new) > abs(old) or new * old < 0 for new, old in zip(wheels, before, strict=True)
         )
         if grows and not self._commanded(outputs):
-            return "a wheel grows without a fresh command in mode driving"
+            return "a wheel speeds up without a fresh command in mode driving"
         if self._late(outputs.now.mono_ns):
             return "it still moves a wheel although the longest ramp to rest is over"
         return ""

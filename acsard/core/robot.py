@@ -385,7 +385,7 @@ class Robot:
         if self.config.commands != before.commands:
             self._arbiter.use(self.config.commands)
             self._arbiter.require_neutral(now_ns)
-        return news or "nothing new: all of it is so already"
+        return news or "nothing changes: all settings have these values already"
 
     def _fault(self, why: str, now: Instant, events: list[Event]) -> None:
         if self._life.fault(why, now):

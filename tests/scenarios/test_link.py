@@ -483,9 +483,13 @@ def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
 @pytest.mark.parametrize(
     ("fault", "heard", "mend"),
     [
-        ("mute", "nothing at all heard", "is it powered"),
-        ("noise", r"none good, the last `\x00\xff~ap00.00,", "what disturbs the cable"),
-        ("partial_line", "bytes heard but no line end, the last `", "cut its lines short"),
+        ("mute", "nothing was received", "has the board power"),
+        ("noise", r"none good, the last `\x00\xff~ap00.00,", "does something disturb the cable"),
+        (
+            "partial_line",
+            "bytes received but no line end; the last bytes are `",
+            "cut its lines short",
+        ),
     ],
 )
 def test_a_silent_or_garbled_board_is_told_by_what_was_heard(

@@ -274,7 +274,7 @@ def test_noise_never_talks_an_mcu_out_of_the_check() -> None:
         with world.mcu.no_check():
             world.hold(0.5, seconds=2.0)
             assert stopped(world)
-            assert "before and now does not" in world.state.reason
+            assert "before and now answers without" in world.state.reason
         world.run(0.3)
         assert check_of(world) == "checked"
 
@@ -580,7 +580,7 @@ def test_a_line_that_echoes_is_never_driven_on(check: str, counts: int) -> None:
     world.run(0.3)
     world.drive(0.5, seconds=5.0)
     assert world.state.link == "booting"
-    assert "what is sent comes back" in world.state.reason
+    assert "the daemon's own lines come back" in world.state.reason
     assert moving([line for _, line in world.port.sent]) == []
 
 
@@ -607,7 +607,7 @@ def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
     assert world.state.link == "up"  # at rest it makes no difference
     world.drive(0.5, seconds=2.0)
     assert (world.state.mode, world.state.link) == ("waiting", "stale")
-    assert "TX and RX are joined, or the terminal echoes" in world.state.reason
+    assert "TX and RX are connected to each other, or a terminal" in world.state.reason
     assert abs(world.state.x) <= most
     (event,) = [event for event in world.events if event.name == "link_check"]
     assert (event.level, event.text) == ("error", world.state.reason)

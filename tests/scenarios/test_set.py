@@ -112,7 +112,7 @@ def test_several_settings_one_after_the_other_are_each_told(world: World) -> Non
 def test_a_refused_change_changes_nothing_and_says_why(world: World) -> None:
     reply = sets(world, limits__angular_speed=1.0, limits__linear_deceleration=0.15)
     assert not reply.success
-    assert "limits.linear_deceleration = 0.15: would take" in reply.message
+    assert "limits.linear_deceleration = 0.15: braking from full speed" in reply.message
     assert config(world) == Config()
     assert not [event for event in world.events if event.name == "set"]
 
@@ -242,7 +242,10 @@ def test_noise_set_higher_makes_the_pose_less_certain(world: World) -> None:
 
 def test_setting_what_is_so_already_says_so(world: World) -> None:
     reply = sets(world, limits__linear_speed=1.0)
-    assert (reply.success, reply.message) == (True, "nothing new: all of it is so already")
+    assert (reply.success, reply.message) == (
+        True,
+        "nothing changes: all settings have these values already",
+    )
 
 
 @pytest.mark.parametrize("via", ["bridge"])
@@ -265,7 +268,7 @@ def test_ros_sets_parameters_the_same_way(world: World, service: str, via: Via) 
     assert (event.text, event.by) == ("limits.linear_speed = 0.7 (was 1.0)", "unnamed (bridge)")
     refused = ask("limits.linear_speed", 70.0)
     assert (refused.successful, "from 0 to 10 m/s" in refused.reason) == (False, True)
-    assert "takes a start" in ask("drive.wheel_radius", 0.07).reason
+    assert "read only when the daemon starts" in ask("drive.wheel_radius", 0.07).reason
     assert config(world).limits.linear_speed == 0.7
 
 

@@ -247,7 +247,7 @@ class Run:
                 case "deactivate":
                     witness.offs.append(true_ns)
                 case "set":
-                    if not text.startswith("nothing new"):
+                    if not text.startswith("nothing changes"):
                         witness.set_limits(self.true_ns, event["settings"], true_ns)
                 case "set_pose" | "reset_odometry":
                     self.pose.placed()

@@ -14,7 +14,7 @@ from __future__ import annotations
 DIFFERENCES: tuple[tuple[str, str, str, str], ...] = (
     (
         "reason",
-        "; if this goes on, look at the network, then restart the sender",
+        "; if this goes on, check the network, then restart the sender",
         "",
         "a late command says what to do",
     ),

@@ -177,7 +177,7 @@ def test_a_command_held_up_on_the_way_is_counted_as_stale(bus: Bus) -> None:
         return bus.count("commands") > heard
 
     until(counted, 5.0, "stamped zeros")
-    refused_without_motion(bus, send, "stale", "the network held it up")
+    refused_without_motion(bus, send, "stale", "the network delayed it")
 
 
 @pytest.mark.parametrize("key", ["cmd/app", "wheel_cmd/app"])

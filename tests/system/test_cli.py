@@ -346,7 +346,7 @@ def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str,
     words = {"hz": ["odom"]}.get(verb, [])
     ended = tool(shared, verb, *words, "--id", ids)
     assert (ended.code, ended.out) == (2, "")
-    assert f"`acsard {verb}` is for one" in ended.err
+    assert f"`acsard {verb}` takes one" in ended.err
     assert "acsard fleet" in ended.err
 
 
@@ -467,7 +467,7 @@ def test_set_alone_lists_what_can_be_set_and_when(shared: Daemon, bus: Bus) -> N
     ("words", "code", "said"),
     [
         (("limits.linear_speed", "20"), 1, "expected a number from 0 to 10 m/s"),
-        (("mcu.port", "/dev/x"), 1, "takes a start"),
+        (("mcu.port", "/dev/x"), 1, "read only when the daemon starts"),
         (("limits.linear_speed",), 2, "pairs of KEY VALUE"),
         (("commands.sources.nav.timeout", "0.5", "--write"), 2, "from `acsard check`"),
         (("--write",), 2, "--write needs a setting"),

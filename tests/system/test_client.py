@@ -395,7 +395,7 @@ def test_a_drive_behind_another_commander_raises_and_says_who_drives(
     ):
         driving = other.submit(lambda: first.drive(0.1, seconds=4.0))
         until(lambda: (fresh.state()["linear"] or 0.0) > 0.05, 5.0, "the first drives")
-        told = first.sender if source == "app" else "teleop has the higher priority"
+        told = first.sender if source == "app" else "teleop has priority"
         with pytest.raises(NotDrivenError, match=re.escape(told)):
             robot.drive(0.5, seconds=0.2)
         driving.result()

@@ -104,10 +104,10 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
     with one, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
         assert one.endpoint in told(two, "no_router", 1)
         with Bus(two.endpoint, robot_id="two") as bus:
-            until(lambda: "is no router" in row(bus)["message"], 2.0, "diagnostics say it")
+            until(lambda: "is not a router" in row(bus)["message"], 2.0, "diagnostics say it")
         toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
         _, found = examined(tmp_path, toml + f'connect = ["{one.endpoint}"]\n')
-        (mend,) = (each["mend"] for each in found["router"] if "no router" in each["text"])
+        (mend,) = (each["mend"] for each in found["router"] if "not a router" in each["text"])
         assert "a router that all connect to" in mend
         stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
         assert stopped.out.startswith("one: stopped")

@@ -188,7 +188,7 @@ def test_what_can_be_no_place_of_a_daemon_is_a_sentence(
 @pytest.mark.parametrize(
     ("fault", "subject", "words"),
     [
-        ("mute", "link", "nothing at all heard"),
+        ("mute", "link", "nothing was received"),
         pytest.param("noise", "link", r"last `\x00\xff~ap00.00", marks=pytest.mark.slow),
         pytest.param("partial_line", "link", "no line end", marks=pytest.mark.slow),
         ("lost_replies", "link", "were answered"),

@@ -414,7 +414,7 @@ def test_parameters_are_the_live_settings_and_errors_are_told(viewer: Viewer, bu
     assert viewer.set({"limits.linear_speed": 99}) == {"limits.linear_speed": 2.0}
     assert "a number from 0 to 10 m/s" in viewer.status("not set: limits.linear_speed")["message"]
     viewer.set({"drive.wheel_radius": 1.0})
-    viewer.status("takes a start")
+    viewer.status("read only when the daemon starts")
     bus.get("srv/set", {"settings": {"limits.linear_speed": 1.0}})
     until(lambda: viewer.get()["limits.linear_speed"] == 1.0, 5.0, "what another has set")
 

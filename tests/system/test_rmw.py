@@ -513,7 +513,7 @@ def test_a_command_held_up_on_the_way_is_stale_by_its_attachment(bus: Bus, ros: 
         ros.session.put(ros.key("cmd_vel", TWIST), GO, attachment=attached)
 
     ros.zeros(bus)
-    refused_without_motion(bus, late, "stale", "the network held it up")
+    refused_without_motion(bus, late, "stale", "the network delayed it")
 
 
 def test_a_clock_that_is_an_hour_off_harms_no_commander(bus: Bus, ros: RmwClient) -> None:

@@ -209,7 +209,7 @@ GO = twist(0.5)
 BAD = {
     "a twist cut short": Bad(raw(GO[:-1]), "malformed", "ends after 51"),
     "a stamped twist cut short": Bad(raw(stamped(0.5)[:-1]), "malformed", "ends after 75"),
-    "between both": Bad(raw(GO + bytes(8)), "wrong_shape", "no Twist"),
+    "between both": Bad(raw(GO + bytes(8)), "wrong_shape", "neither a Twist"),
     "nothing": Bad(raw(b""), "malformed", "header"),
     "JSON": Bad(raw(b'{"linear":{"x":0.5},"angular":{}}'), "malformed", "header"),
     "5 kB": Bad(raw(GO + bytes(5000)), "too_big", "bytes"),

@@ -166,7 +166,7 @@ def test_a_simulator_that_the_file_makes_mute_never_links_and_the_log_says_why(
         Bus(daemon.endpoint) as bus,
         bus.follow("state") as states,
     ):
-        states.find(lambda state: "nothing at all heard" in state["reason"], 20.0, "no reply")
+        states.find(lambda state: "nothing was received" in state["reason"], 20.0, "no reply")
         assert bus.get("sim/pose")["header"]["frame_id"] == "sim"
         assert "up" not in {seen.value["link"] for seen in list(states.seen)}
         told = daemon.events("configuration")

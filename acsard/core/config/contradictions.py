@@ -36,7 +36,7 @@ def warnings(config: Config) -> list[str]:
         comfortable = highest_rate(config.mcu.baud_rate, count, COMFORTABLE_USE)
         found.append(
             f"control.rate = {config.rate_hz:g} takes {use:.0%} of the wire at "
-            f"{config.mcu.baud_rate} baud: lines will be superseded; "
+            f"{config.mcu.baud_rate} baud, so newer lines will supersede waiting ones; "
             f"{comfortable} Hz is comfortable"
         )
     found += _count_warnings(config)
@@ -44,26 +44,29 @@ def warnings(config: Config) -> list[str]:
     needed = limits.linear_speed / drive.wheel_radius
     if needed > limits.wheel_speed:
         found.append(
-            f"limits.linear_speed = {limits.linear_speed:g} m/s needs {needed:.1f} rad/s but "
-            f"limits.wheel_speed = {limits.wheel_speed:g}: the robot will not reach it"
+            f"limits.linear_speed = {limits.linear_speed:g} m/s needs wheels at {needed:.1f} "
+            f"rad/s, but limits.wheel_speed = {limits.wheel_speed:g}: the robot will not reach "
+            "that speed"
         )
     if config.bus.insecure:
-        found.append("bus.insecure = true: everyone who reaches the bus can drive this robot")
+        found.append("bus.insecure = true: every program that reaches the bus can drive this robot")
     if config.access.wildcards:
-        found.append("access.wildcards = true: everyone with a certificate can stall the bus")
+        found.append("access.wildcards = true: every client with a certificate can stall the bus")
     hosts = [_host(endpoint) for ends in _endpoints(config.bus).values() for endpoint in ends]
     outside = not all(_is_loopback(host) for host in hosts if host)
     if outside and config.robot.id == Config().robot.id:
         found.append(
-            f'robot.id = "{config.robot.id}" is the default, on a bus that leaves this machine: '
-            "a second robot there would share its keys; give each its own id"
+            f'robot.id = "{config.robot.id}" is the default id, on a bus that other machines '
+            "reach: a second robot there would share its keys; give each robot its own id"
         )
     ros = config.ros
-    where = "that leaves this machine" if outside else "with a router" if config.bus.connect else ""
+    where = (
+        "that other machines reach" if outside else "with a router" if config.bus.connect else ""
+    )
     if where and (ros.bridge or ros.rmw) and not ros.namespace:
         found.append(
-            f'ros.namespace = "" on a bus {where}: a second robot there would '
-            "share its ROS topics; give each its own namespace"
+            f'ros.namespace = "" on a bus {where}: a second robot there would share its ROS '
+            "topics; give each robot its own namespace"
         )
     return found + named_faults.warnings(config)
 
@@ -74,12 +77,12 @@ def _count_warnings(config: Config) -> list[str]:
         return []
     if not mcu.wants_samples:
         return [
-            f"mcu.encoder_counts = {mcu.encoder_counts} changes nothing: counts come with checked "
-            'lines only, and mcu.link_check = "off"; write "auto" or "require"'
+            f"mcu.encoder_counts = {mcu.encoder_counts} changes nothing: only checked lines "
+            'carry counts, and mcu.link_check = "off"; write "auto" or "require"'
         ]
     if mcu.simulated and mcu.encoder_counts != config.sim.encoder_counts:
         return [
-            f"mcu.encoder_counts = {mcu.encoder_counts} but the simulated robot's encoders have "
+            f"mcu.encoder_counts = {mcu.encoder_counts}, but the simulated robot's encoders have "
             f"sim.encoder_counts = {config.sim.encoder_counts}: every distance will be wrong"
         ]
     return []
@@ -127,10 +130,11 @@ def _count_problems(config: Config) -> list[str]:
         return []
     return [
         f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
-        f"{config.feedback.wheel_speed:g} rad/s they could wrap in "
-        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, and must last {LEAST_BRIDGE} control "
-        f"periods ({lasts * 1000:.0f} ms); write {int(FIELD / 2 / fastest / lasts)} at most "
-        "(count fewer edges), a lower feedback.wheel_speed, or 0"
+        f"{config.feedback.wheel_speed:g} rad/s the counts could wrap in "
+        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, but they must last {LEAST_BRIDGE} "
+        f"control periods ({lasts * 1000:.0f} ms); write "
+        f"{int(FIELD / 2 / fastest / lasts)} at most (count fewer edges), a "
+        "lower feedback.wheel_speed, or 0"
     ]
 
 
@@ -164,7 +168,7 @@ def _gyro_problems(config: Config) -> list[str]:
     if not config.odometry.learned_track or config.odometry.gyro:
         return []
     return [
-        "odometry.learned_track = true: a gyro teaches it, and odometry.gyro = false; write "
+        "odometry.learned_track = true needs a gyro, but odometry.gyro = false; write "
         "odometry.gyro = true or odometry.learned_track = false"
     ]
 
@@ -186,7 +190,7 @@ def _source_problems(config: Config) -> list[str]:
         if source.timeout < 2 * period:
             found.append(
                 f"commands.sources[{i}].timeout = {source.timeout:g}: shorter than two control "
-                f"periods, the robot would stutter; write {2 * period:g} or more"
+                f"periods, so the robot would stutter; write {2 * period:g} or more"
             )
     return found
 
@@ -196,15 +200,15 @@ def _way_problems(config: Config) -> list[str]:
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
         found.append(
-            'bus.mode = "client": connects to nothing; write bus.connect = ["tcp/127.0.0.1:7447"] '
-            'or bus.mode = "peer"'
+            'bus.mode = "client" without an address to connect to; write bus.connect = '
+            '["tcp/127.0.0.1:7447"] or bus.mode = "peer"'
         )
     if not bus.listen and bus.mode == "peer":
-        found.append('bus.listen = []: nobody could connect; write ["tcp/127.0.0.1:7448"]')
+        found.append('bus.listen = []: no client could connect; write ["tcp/127.0.0.1:7448"]')
     if bus.outside and not bus.plain:
         found.append(
-            f"bus.listen = {show(list(bus.listen))}: who comes by TLS reaches the daemon through "
-            'its address on this machine; add "tcp/127.0.0.1:7448"'
+            f"bus.listen = {show(list(bus.listen))}: clients that connect by TLS reach the "
+            'daemon through an address on this machine; add "tcp/127.0.0.1:7448"'
         )
     return found
 
@@ -222,15 +226,15 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
         elif endpoint.startswith("tls/"):
             if not bus.tls:
                 found.append(
-                    f"{where}: needs certificates; `acsard lan init` makes them and tells "
-                    "the bus.tls to write"
+                    f"{where}: needs certificates; `acsard lan init` makes them and prints the "
+                    "bus.tls to write"
                 )
         elif not _is_loopback(host) and not bus.insecure:
             found.append(
-                f"{where}: leaves this machine, and there is no encryption or access control "
-                "on it; use 127.0.0.1 (a laptop joins by an SSH tunnel), certificates (`acsard "
-                'lan init`, then "tls/…"), or accept that anyone there can drive the robot: '
-                "bus.insecure = true"
+                f"{where}: leaves this machine, but it has no encryption and no access control; "
+                "use 127.0.0.1 (a laptop connects through an SSH tunnel), use "
+                'certificates (`acsard lan init`, then "tls/…"), or accept that anyone there '
+                "can drive the robot: bus.insecure = true"
             )
     return found
 
@@ -247,8 +251,8 @@ def _ros_problems(config: Config) -> list[str]:
     ros = config.ros
     if ros.bridge and ros.namespace.partition("/")[0] == ROOT:
         return [
-            f'ros.namespace = {show(ros.namespace)}: "{ROOT}" begins the native keys, which the '
-            'bridge\'s would fall among; write another, like "robot1"'
+            f'ros.namespace = {show(ros.namespace)}: "{ROOT}" begins the native keys, so the '
+            'bridge\'s keys would mix with them; write another, like "robot1"'
         ]
     return []
 

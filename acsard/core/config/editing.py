@@ -32,7 +32,7 @@ def edited(text: str, keys: Mapping[str, object]) -> str:
     except TOMLKitError as error:
         raise ValueError(str(error)) from None
     if parse(changed.encode()) != from_builtins(wanted):
-        raise ValueError("its tables are written in a way that cannot be changed safely")
+        raise ValueError("its tables are written in a form that cannot be changed safely")
     return changed
 
 

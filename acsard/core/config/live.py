@@ -45,23 +45,30 @@ class Live(Struct, frozen=True):
 LIVE: dict[str, Live] = {
     "limits.linear_speed": Live("always", "highest speed, forwards and backwards"),
     "limits.angular_speed": Live("always", "highest turn rate"),
-    "limits.linear_acceleration": Live("always", "speeding up"),
-    "limits.angular_acceleration": Live("always", "speeding up a turn"),
-    "limits.linear_deceleration": Live("raised", "slowing down, also when commands end"),
-    "limits.angular_deceleration": Live("raised", "slowing down a turn, also when commands end"),
-    "limits.linear_stop_deceleration": Live("raised", "braking by a stop or a fault"),
-    "limits.angular_stop_deceleration": Live("raised", "braking a turn by a stop or a fault"),
-    "limits.linear_jerk": Live("always", "how fast speeding up may begin"),
-    "limits.angular_jerk": Live("always", "how fast speeding up a turn may begin"),
+    "limits.linear_acceleration": Live("always", "acceleration"),
+    "limits.angular_acceleration": Live("always", "acceleration of a turn"),
+    "limits.linear_deceleration": Live("raised", "deceleration, also when commands end"),
+    "limits.angular_deceleration": Live("raised", "deceleration of a turn, also when commands end"),
+    "limits.linear_stop_deceleration": Live("raised", "deceleration of a stop or a fault"),
+    "limits.angular_stop_deceleration": Live(
+        "raised", "deceleration of a turn by a stop or a fault"
+    ),
+    "limits.linear_jerk": Live("always", "how fast the acceleration may grow"),
+    "limits.angular_jerk": Live("always", "how fast the acceleration of a turn may grow"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
-    "commands.pause": Live("rest", "time that no speed may follow a zero of a shared identity"),
-    "commands.sources.*.timeout": Live("rest", "silence after which a source is gone"),
-    "odometry.covariance": Live("always", "by the model, or the diagonals as they stand"),
+    "commands.pause": Live(
+        "rest", "after a zero of a shared sender identity, time in which no speed may follow"
+    ),
+    "commands.sources.*.timeout": Live("rest", "silence after which the source is stale"),
+    "odometry.covariance": Live(
+        "always", '"model" computes the covariances, "constant" publishes the configured diagonals'
+    ),
     "odometry.pose_covariance_diagonal": Live(
-        "always", "x y z roll pitch yaw: where the robot is set, and of what no wheel measures"
+        "always",
+        "x y z roll pitch yaw: uncertainty of the start pose and of the axes without a sensor",
     ),
     "odometry.twist_covariance_diagonal": Live(
-        "always", "x y z roll pitch yaw: of what no wheel measures"
+        "always", "x y z roll pitch yaw: uncertainty of the axes without a sensor"
     ),
     "odometry.distance_variance_per_metre": Live("always", "error of the distance, m2 per m"),
     "odometry.yaw_variance_per_metre": Live("always", "error of the heading, rad2 per m"),
@@ -71,7 +78,7 @@ LIVE: dict[str, Live] = {
     "rates.cmd_vel_out": Live("always", "how often cmd_vel_out is published"),
     "rates.state": Live("always", "how often state is published"),
     "rates.diagnostics": Live("always", "how often diagnostics are published"),
-    "log.level": Live("always", "the least that the log tells"),
+    "log.level": Live("always", "lowest level that is logged"),
 }
 """The settings by dotted key as in `acsard.toml`. A source is named in place of its index, and
 "*" stands for every source.
@@ -143,10 +150,10 @@ def _same(before: object, value: object) -> bool:
 def _refusal(key: str, value: object, known: Mapping[str, object]) -> str:
     if key in known:
         return (
-            f"{key} = {show(value)}: takes a start: change it in acsard.toml and start acsard anew "
-            "(`acsard set` lists what does not)"
+            f"{key} = {show(value)}: this key is read only when the daemon starts: change it in "
+            "acsard.toml and restart acsard (`acsard set` lists the keys that change at once)"
         )
-    return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists what can be set')}"
+    return f"{show(key)}: unknown key; {hint(key, known, '`acsard set` lists the settings')}"
 
 
 def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
@@ -167,7 +174,7 @@ def _must_stand(key: str, before: object, after: object) -> str:
     if row.when == "raised":
         if not (isinstance(before, float) and isinstance(after, float) and after < before):
             return ""
-        words = f"lower than {show(before)}, which may be set only while the robot stands"
+        words = f"lower than {show(before)}, and may be lowered only while the robot stands"
     else:
-        words = "may be set only while the robot stands"
-    return f"{key} = {show(after)}: {words}; stop it first"
+        words = "may be changed only while the robot stands"
+    return f"{key} = {show(after)}: {words}; stop the robot first"

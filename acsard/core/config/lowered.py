@@ -56,7 +56,9 @@ def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, lis
                 config, more = _applied(config, {key: value})
                 events += more
             except ConfigError as error:
-                text = f"{key} = {value}, kept from before the restart, is dropped: {error}"
+                text = (
+                    f"{key} = {value} was lowered before the restart, and is dropped now: {error}"
+                )
                 events.append(Event("set", text, "warning"))
         return config, events
 

@@ -75,9 +75,9 @@ def _braking_problems(config: Config, axis: str, speed: float, unit: str) -> lis
             )
         elif value < least:
             found.append(
-                f"limits.{name} = {value:g}: would take {speed / value:.1f} s from full speed "
-                f"({speed:g} {unit}) to rest, and may take {most_s:g}; write {least:g} or more, "
-                f"or a lower limits.{axis}_speed"
+                f"limits.{name} = {value:g}: braking from full speed ({speed:g} {unit}) would "
+                f"take {speed / value:.1f} s, but may take {most_s:g} s; write {least:g} or "
+                f"more, or a lower limits.{axis}_speed"
             )
     return found
 
@@ -99,9 +99,9 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
     if most >= needed:
         return []
     return [
-        f"feedback.wheel_speed = {most:g}: the limits let a wheel be asked {asked:.1f} rad/s, and "
-        f"lines above {most:g} are a fault; write {needed:g} or more, or a lower "
-        "limits.wheel_speed"
+        f"feedback.wheel_speed = {most:g}: the limits allow commands of {asked:.1f} rad/s for a "
+        f"wheel, but feedback above {most:g} counts as a fault; write {needed:g} or more, or a "
+        "lower limits.wheel_speed"
     ]
 
 
@@ -115,8 +115,8 @@ def _reply_problems(config: Config) -> list[str]:
     if period <= LONGEST_REPLY_S:
         way = f", or feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
     return [
-        f"mcu.reply_period = {period:g}: a line that is lost would be a fault of a wheel, or look "
-        f"like a new start; write {most:g} at most (the firmware must report more often){way}"
+        f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault or like a "
+        f"restart of the board; write {most:g} at most (the firmware must report more often){way}"
     ]
 
 

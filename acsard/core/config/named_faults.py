@@ -66,18 +66,19 @@ def named(text: str) -> NamedFault:
     if name not in known:
         near = nearest(name, known)
         meant = f"did you mean {_form(near[0], known[near[0]])}?" if near else _all()
-        raise ValueError(f"not a fault; {meant}")
+        raise ValueError(f"not a known fault; {meant}")
     kinds, values = known[name], [word for word in given.split(":") if word]
     if len(values) != len(kinds):
-        raise ValueError(f"it is written {_form(name, kinds)}")
+        raise ValueError(f"write it as {_form(name, kinds)}")
     fault = NamedFault(
         name, tuple(_value(kind, word) for kind, word in zip(kinds, values, strict=True))
     )
     if name == RESET and not fault.values[0] > 0:
-        raise ValueError("seconds between resets must be above 0")
+        raise ValueError("the seconds between resets must be above 0")
     if name == "stalls" and not fault.values[0] > fault.values[1] >= SHORTEST_S:
         raise ValueError(
-            f"seconds from one stall to the next, and fewer for each, {SHORTEST_S} at least"
+            "needs the seconds from one stall to the next, and fewer seconds for each stall; "
+            f"both at least {SHORTEST_S}"
         )
     if name == "other_baud" and fault.values[0] not in get_args(Baud):
         raise ValueError(f"rates are {', '.join(map(str, get_args(Baud)))}")
@@ -89,7 +90,7 @@ def warnings(config: Config) -> list[str]:
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []
-    return [f"sim.faults = {show(faults)}: the simulator misbehaves as told; [] ends it"]
+    return [f"sim.faults = {show(faults)}: the simulator has these faults on purpose; [] ends them"]
 
 
 def _problems(config: Config) -> list[str]:
@@ -98,7 +99,7 @@ def _problems(config: Config) -> list[str]:
         where = f"sim.faults[{i}] = {show(text)}"
         try:
             if named(text).name == RESET:
-                found.append(f"{where}: needs `acsard sim --fault {text}`; take it out here")
+                found.append(f"{where}: needs `acsard sim --fault {text}`; remove it here")
         except ValueError as error:
             found.append(f"{where}: {error}")
     return found
@@ -119,12 +120,12 @@ def _form(name: str, kinds: str) -> str:
 def _value(kind: str, word: str) -> int | float:
     if kind == "m":
         if word not in tuple(MOTORS):
-            raise ValueError("motors are a, b, c and d")
+            raise ValueError("the motors are a, b, c and d")
         return MOTORS.index(word)
     try:
         value = float(word)
     except ValueError:
         value = math.nan
     if not abs(value) <= MOST:
-        raise ValueError(f"numbers are written like 5 or 0.15, up to {MOST:g}")
+        raise ValueError(f"write a number like 5 or 0.15, up to {MOST:g}")
     return int(value) if value.is_integer() else value

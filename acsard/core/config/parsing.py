@@ -35,16 +35,22 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
     table and key; they win over the file.
     """
     if len(text) > MAX_BYTES:
-        raise ConfigError([f"{len(text)} bytes: not a configuration; at most {MAX_BYTES}"])
+        raise ConfigError(
+            [f"{len(text)} bytes: too large for a configuration; at most {MAX_BYTES}"]
+        )
     try:
         table = tomllib.loads(text.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError([f"not UTF-8 text: {error}; save the file as UTF-8"]) from None
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError([f"not TOML: {error}; texts need quotes, true/false none"]) from None
+        raise ConfigError(
+            [f"not TOML: {error}; write texts in quotes, and true or false without"]
+        ) from None
     # Python limits the length of numbers and the depth of nesting.
     except (ValueError, RecursionError):
-        raise ConfigError(["not TOML: a number too long or lists too deep; mend it"]) from None
+        raise ConfigError(
+            ["not TOML: a number is too long or lists are nested too deep; correct it"]
+        ) from None
     for section, values in (overrides or {}).items():
         inner = table.setdefault(section, {})
         if isinstance(inner, dict):
@@ -54,7 +60,7 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
     try:
         config = build_partly(Config, table, "", problems, spoilt)
     except RecursionError:
-        raise ConfigError(["lists or tables nested too deep; no key needs that"]) from None
+        raise ConfigError(["lists or tables are nested too deep; no key needs that"]) from None
     if config is not None:
         problems += contradictions(without(config, spoilt))
     if config is None or problems:

@@ -62,7 +62,10 @@ WebAddress = Annotated[
     str,
     Meta(
         pattern=r"^https?://(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9.-]{1,253}):[0-9]{1,5}\Z",
-        extra={"unit": "http(s)://, an address, a port", "example": "http://127.0.0.1:8080"},
+        extra={
+            "unit": "http(s)://, an address, a colon and a port",
+            "example": "http://127.0.0.1:8080",
+        },
     ),
 ]
 FaultName = Annotated[
@@ -91,7 +94,7 @@ SlowRate = Annotated[float, Meta(ge=0.1, le=100.0, extra={"unit": "Hz"})]
 Diagonal = tuple[Variance, Variance, Variance, Variance, Variance, Variance]
 Motor = Literal["+a", "-a", "+b", "-b", "+c", "-c", "+d", "-d"]
 EncoderCounts = Annotated[
-    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = do not ask for them)"})
+    int, Meta(ge=0, le=100_000, extra={"unit": "per wheel turn (0 = ask the board for none)"})
 ]
 Baud = Literal[9600, 19200, 38400, 57600, 115200]
 

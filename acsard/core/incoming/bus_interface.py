@@ -103,9 +103,9 @@ class DoorTold:
 
 
 PEER = (
-    "is no router but another peer, a robot's daemon perhaps: neither hands on what the other "
-    "says, so who connects to one sees that one only, and `acsard call stop --id '*'` stops no "
-    "other; put a router between them (deploy/zenoh/README.md)"
+    "is not a router but another peer, perhaps a robot's daemon. A peer does not forward "
+    "messages, so a client of one robot sees only that robot, and `acsard call stop --id '*'` "
+    "stops no other; put a router between the robots (deploy/zenoh/README.md)"
 )
 
 
@@ -133,5 +133,9 @@ class RoutersTold:
 
 
 def _words(what: str, endpoints: list[str]) -> str:
-    tried = "; tried again until it answers, driving goes on" if what.startswith("not") else ""
+    tried = (
+        "; the daemon tries again until it connects, and driving goes on"
+        if what.startswith("not")
+        else ""
+    )
     return f"{what} {', '.join(endpoints)}{tried}"

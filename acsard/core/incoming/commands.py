@@ -171,7 +171,8 @@ class Receiver:
                 where = f"certificate {bound}" if bound else "the robot's own machine"
                 raise DecodeError(
                     "other_certificate",
-                    f"its sender id was first seen under {where}: attach an id of its own",
+                    f"its sender id was first seen under {where}: give each program its own "
+                    "sender id",
                 )
         ours = arrival.received_ns
         return Command(
@@ -195,7 +196,7 @@ class Receiver:
         linear, angular = got.linear, got.angular
         if not isinstance(got.twist, UnsetType):
             if not (isinstance(linear, UnsetType) and isinstance(angular, UnsetType)):
-                raise DecodeError("wrong_shape", "a twist inside and beside `twist`")
+                raise DecodeError("wrong_shape", "a twist both inside and outside `twist`")
             linear, angular = got.twist.linear, got.twist.angular
             header = None if isinstance(got.header, UnsetType) else got.header
         elif not isinstance(got.header, UnsetType):
@@ -213,7 +214,7 @@ class Receiver:
         named, count = [got.name.count(joint) for joint in self._joints], len(got.name)
         if named != [1] * 4 or len(got.velocity) != count:
             raise DecodeError(
-                "wrong_wheels", f"needs a velocity for each of {', '.join(self._joints)}, once"
+                "wrong_wheels", f"needs one velocity for each of {', '.join(self._joints)}"
             )
         places = [got.name.index(joint) for joint in self._joints]
         # Values of other joints, for example of an arm, are not for this daemon.
@@ -225,7 +226,7 @@ class Receiver:
             raise DecodeError("not_finite", "NaN or infinity in the wheel speeds")
         twist = self._kinematics.twist(WheelSpeeds(*velocity))
         if not (math.isfinite(twist.linear) and math.isfinite(twist.angular)):
-            raise DecodeError("not_finite", "wheel speeds beyond all numbers")
+            raise DecodeError("not_finite", "wheel speeds too large for a number")
         return twist, got.header, twist == REST and any(velocity)
 
     @staticmethod
@@ -341,7 +342,9 @@ def _twist_payload(arrival: Arrival) -> _TwistPayload:
         twist = decode_cdr(Twist, arrival.payload)
         return _TwistPayload(linear=twist.linear, angular=twist.angular)
     if not told and size < STAMPED_CDR_BYTES:
-        raise DecodeError("wrong_shape", f"{size} bytes of CDR are no Twist and no TwistStamped")
+        raise DecodeError(
+            "wrong_shape", f"{size} bytes of CDR are neither a Twist nor a TwistStamped"
+        )
     stamped = decode_cdr(TwistStamped, arrival.payload)
     return _TwistPayload(header=stamped.header, twist=stamped.twist)
 

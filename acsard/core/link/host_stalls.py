@@ -13,12 +13,12 @@ from acsard.core.values import NS_PER_S
 SHARE = 0.5
 """Share of the silence that ends a link. Two steps this far apart have caused the silence."""
 
-BUSY = "what else runs here? (`top`; as a service it goes first)"
+BUSY = "which other program uses the processor? (`top` shows it; as a service acsard has priority)"
 """The advice for a computer that is late."""
 
 HOST = "this computer did not run for"
 
-SIMULATOR = "the built-in simulator, a part of this program, is late"
+SIMULATOR = "the built-in simulator, which is a part of this program, is late"
 
 
 def is_ours(words: str) -> bool:
@@ -58,7 +58,9 @@ class Lateness:
     def words(self, link: LinkState) -> str:
         """Return a sentence about the link."""
         if link == "stale" and self.late_s:
-            return f"{HOST} {self.late_s:.2f} s, and heard nothing of the microcontroller: {BUSY}"
+            return (
+                f"{HOST} {self.late_s:.2f} s, and received nothing from the microcontroller: {BUSY}"
+            )
         if link == "stale" and self._simulated:
             return f"{SIMULATOR}: {BUSY}"
         return WORDS[link]

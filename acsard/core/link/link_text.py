@@ -8,7 +8,10 @@ from acsard.core.link.negotiation import MENDS, Negotiation
 from acsard.core.link.silence_diagnosis import SilenceDiagnosis
 from acsard.core.values import Event
 
-BLOCKED = "the serial port sends nothing: its driver accepts no bytes; replug the adapter"
+BLOCKED = (
+    "the serial port sends nothing, because its driver accepts no bytes: unplug the "
+    "adapter and plug it in again"
+)
 """The reason while the driver takes no bytes."""
 
 
@@ -35,7 +38,10 @@ def words(
         if heard is not None and not heard.good:
             return heard.words
         if damaged(link, check):
-            return "the microcontroller's replies come damaged; asking it for the check again"
+            return (
+                "the microcontroller's replies arrive damaged; the daemon asks it for the "
+                "check again"
+            )
         if link.sparse_s:
             return _sparse(link.sparse_s, longest_reply)
         if heard is not None:
@@ -48,8 +54,8 @@ def _sparse(sparse_s: float, longest_reply: float) -> str:
     told = f"the microcontroller's lines come {apart} s apart"
     if float(apart) > longest_reply:
         return (
-            f"{told}: too seldom for a link by any setting; firmware that reports by its own "
-            f"clock must do so every {longest_reply:g} s or sooner"
+            f"{told}, which is too seldom for any setting; firmware that reports by its own "
+            f"clock must send a line at least every {longest_reply:g} s"
         )
     return f"{told}; if it reports by its own clock, set mcu.reply_period = {apart}"
 
@@ -59,7 +65,7 @@ def check_event(check: Negotiation, wants_samples: bool) -> Event:
     fallen = check.state == "plain" or (wants_samples and check.state == "checked")
     text = f"the serial lines are {check.in_force}"
     if check.state == "plain":
-        text += ": the microcontroller answers without a check"
+        text += ": the microcontroller answers without the check"
     elif fallen:
         text += ": the microcontroller sends no counts"
     return Event("link_check", text, "warning" if fallen else "info")

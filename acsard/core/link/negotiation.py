@@ -73,15 +73,15 @@ Trouble = Literal["", "echo", "forgotten", "unknown"]
 
 MENDS: dict[Trouble, str] = {
     "": "",
-    "echo": "what is sent comes back: TX and RX are joined, or the terminal echoes, or the RS-485 "
-    "adapter, or the board reports the speeds it was sent, not those it measures; mend that, then "
-    "replug it",
-    "forgotten": "the microcontroller answered with a check before and now does not: its replies "
-    "are damaged on the way (look at cable and baud rate), or it has other firmware "
-    "(then replug it)",
-    "unknown": 'the microcontroller answers without a check, and mcu.link_check = "require" drives '
-    "only with one: give it firmware that has it, or write "
-    'mcu.link_check = "auto"',
+    "echo": "the daemon's own lines come back: TX and RX are connected to each other, or a "
+    "terminal or the RS-485 adapter echoes, or the board reports the commanded speeds "
+    "instead of the measured ones; fix that, then unplug the board and plug it in again",
+    "forgotten": "the microcontroller answered with a check before and now answers without: "
+    "either its replies are damaged (check cable and baud rate), or it runs other "
+    "firmware (then unplug it and plug it in again)",
+    "unknown": 'the microcontroller answers without a check, but mcu.link_check = "require" '
+    "lets the robot drive only with one: install firmware that has the check, or "
+    'write mcu.link_check = "auto"',
 }
 
 TRIES = 3

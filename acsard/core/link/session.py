@@ -362,5 +362,5 @@ class McuSession:
         if more > 0:
             self._reject("count_leap", more=more)
         if self._timeline.restarted:
-            self._restart("has started again: its clock went back")
+            self._restart("has restarted: its clock went back")
         return self.snapping.look(feedback)

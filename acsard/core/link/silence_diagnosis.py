@@ -34,12 +34,13 @@ Look = Literal["nothing", "cut", "foreign", "garbage", "few", "sparse"]
 """
 
 MENDS: dict[Look, str] = {
-    "nothing": "is it powered, is this its port and mcu.baud_rate its own, are TX and RX crossed?",
-    "cut": "does it cut its lines short, or leave out their ends?",
-    "foreign": "what disturbs the cable, or prints on it too?",
-    "garbage": "is mcu.baud_rate the board's own?",
-    "few": "look at cable, ground and baud rate",
-    "sparse": "if its lines are further apart than ours, say so by mcu.reply_period",
+    "nothing": "has the board power, is this its port, does mcu.baud_rate fit, are TX and RX "
+    "swapped?",
+    "cut": "does the board cut its lines short, or omit the line ends?",
+    "foreign": "does something disturb the cable, or print on it too?",
+    "garbage": "does mcu.baud_rate fit the board?",
+    "few": "check cable, ground and baud rate",
+    "sparse": "if the board sends its lines less often than the daemon, set mcu.reply_period",
 }
 
 _RIGHT = re.compile(TOKENS)
@@ -89,25 +90,27 @@ class Heard(Struct):
     def counted(self) -> str:
         """The number of bytes or lines and the last bad one, as text."""
         if not self.size:
-            return "nothing at all heard"
+            return "nothing was received"
         if not self.lines:
             last = printable_bytes(self.last, SHOWN, last=True)
-            return f"{many(self.size, 'byte')} heard but no line end, the last `{last}`"
+            return (
+                f"{many(self.size, 'byte')} received but no line end; the last bytes are `{last}`"
+            )
         good, which = "none good", "last"
         if self.good:
             good, which = f"only {self.good} good", "last other"
             if self.good == self.lines:
-                good = "all good, but too few"
+                good = "all of them good, but too few"
         bad = printable_bytes(self.last, SHOWN)
         last = f", the {which} `{bad}`" if self.good < self.lines else ""
-        return f"{many(self.lines, 'line')} heard, {good}{last}"
+        return f"{many(self.lines, 'line')} received, {good}{last}"
 
     @property
     def words(self) -> str:
         """The whole diagnosis as a sentence for `state`."""
         if self.looks == "sparse" and self.late_s:
-            return f"{HOST} {self.late_s:.2f} s, and heard too little for a link: {BUSY}"
-        mend = f"{MENDS[self.looks]} `acsard mcu check` looks closer"
+            return f"{HOST} {self.late_s:.2f} s, and received too little for a link: {BUSY}"
+        mend = f"{MENDS[self.looks]} `acsard mcu check` finds out more"
         return f"the microcontroller: {self.counted}; {mend}"
 
 

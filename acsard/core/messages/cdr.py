@@ -66,7 +66,7 @@ class Cdr(Generic[T]):
         """
         order = _ORDERS.get(payload[:2])
         if order is None or len(payload) < 4:
-            raise CdrError(f"needs the header of plain CDR, has {payload[:4].hex(' ')}")
+            raise CdrError(f"needs the header of plain CDR, but has {payload[:4].hex(' ')}")
         source = _Source(payload, order)
         found: list[object] = []
         for part in self._parts:
@@ -182,7 +182,7 @@ class _Numbers:
         values = source.take(self._codes)
         for index, low, high in self._limits:
             if not low <= values[index] <= high:
-                raise CdrError(f"{values[index]} where {low:g} to {high:g} may be")
+                raise CdrError(f"{values[index]} is outside the range from {low:g} to {high:g}")
         found += values
 
 
@@ -214,7 +214,7 @@ class _List:
         if isinstance(item, inspect.StructType):
             self._parts, self._build = _compiled(item.cls)
         elif not (self._code or self._text):
-            raise TypeError(f"CDR has no sequence of {kind}")
+            raise TypeError(f"CDR cannot encode a sequence of {kind}")
 
     def write(self, out: bytearray, message: object) -> None:
         items = self._get(message)
@@ -242,7 +242,7 @@ class _List:
         least = SIZES[self._code] if self._code else 1
         count = source.count(least) if self._fixed is None else self._fixed
         if self._most is not None and count > self._most:
-            raise CdrError(f"{count} items where {self._most} may be")
+            raise CdrError(f"{count} items, but at most {self._most} are allowed")
         if self._array:
             found.append(list(source.take(self._array)))
         elif self._code:
@@ -285,6 +285,6 @@ def _compiled(cls: Any) -> tuple[tuple[_Part, ...], Build]:
             case inspect.ListType(item_type=item, min_length=least, max_length=most):
                 parts.append(_List(attrgetter(path), item, most, fixed=most == least))
             case _:
-                raise TypeError(f"CDR cannot tell {cls.__name__}.{path}")
+                raise TypeError(f"CDR cannot encode {cls.__name__}.{path}")
     end_run()
     return tuple(parts), builder(info)

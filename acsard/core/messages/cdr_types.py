@@ -22,7 +22,7 @@ def struct_info(cls: Any) -> inspect.StructType:
     """Return the type information of a struct type; raise `TypeError` for any other type."""
     info = inspect.type_info(cls)
     if not isinstance(info, inspect.StructType):
-        raise TypeError(f"{cls} is no struct")
+        raise TypeError(f"{cls} is not a struct")
     return info
 
 

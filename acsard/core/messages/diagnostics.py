@@ -39,7 +39,7 @@ REFUSED_S = 2.0
 MISSED_SHARE = 0.01
 """Share of the last minute's periods above which missed periods are a warning."""
 
-NO_ROUTER, NOT_YET = "a peer, no router", "not connected yet"
+NO_ROUTER, NOT_YET = "a peer, not a router", "not connected yet"
 
 
 class Row(Struct, frozen=True):
@@ -97,7 +97,7 @@ def _serial_link(config: Config, outputs: Outputs, snapshot: Snapshot) -> Row:
     values |= {f"counts_{name}": str(counts) for name, counts in named if counts}
     level, message = OK if outputs.link == "up" else ERROR, outputs.link
     if mcu.simulated:
-        level, message = max(level, WARN), f"{message}: the simulator, no wheel turns"
+        level, message = max(level, WARN), f"{message}: the simulator; no real wheel turns"
     return Row("serial link", level, message, values | _counted(snapshot.counters, "line"))
 
 
@@ -170,7 +170,9 @@ def _routers(endpoints: Sequence[str], routers: RoutersStatus) -> list[Row]:
     if NOT_YET in values.values():
         words = NOT_YET
     if peers:
-        words += f"; {', '.join(peers)} is no router: who connects here sees this robot only"
+        words += (
+            f"; {', '.join(peers)} is not a router: clients that connect here see only this robot"
+        )
     return [Row("router", WARN if missing or peers else OK, words, values)] if values else []
 
 

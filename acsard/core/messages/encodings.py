@@ -57,7 +57,7 @@ def _codec(cls: type[T]) -> Cdr[T]:
         return Cdr(cls)
     except TypeError:
         raise DecodeError(
-            "unknown_format", f"{cls.__name__} is no ROS message and has no CDR form: use JSON"
+            "unknown_format", f"{cls.__name__} is not a ROS message and has no CDR form: use JSON"
         ) from None
 
 
@@ -111,7 +111,7 @@ def _where(words: str, payload: bytes) -> str:
         return words
     before, what = payload[: int(match[2])], match[1]
     if payload[len(before) :].lower().startswith((b"nan", b"inf")):
-        what, before = "JSON has no NaN and no infinity", before.removesuffix(b"-")
+        what, before = "JSON cannot contain NaN or infinity", before.removesuffix(b"-")
     line = before.rpartition(b"\n")[2].decode(errors="replace")
     return f"line {before.count(10) + 1}, column {len(line) + 1}: {what}"
 

@@ -16,8 +16,12 @@ def expiry(ends_ns: int | None, now_ns: int) -> tuple[int, str]:
     Both times are wall-clock ns since 1970. `ends_ns` is None if the end is unknown.
     """
     if ends_ns is None:
-        return 1, "unknown: no door, or no library to read it (`acsard doctor` says which)"
+        return (
+            1,
+            "unknown: the TLS gateway does not run, or the library that reads "
+            "certificates is missing (`acsard doctor` says which)",
+        )
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
-        return 2, f"ended {-days:.0f} days ago: nobody can join any more"
+        return 2, f"expired {-days:.0f} days ago: TLS refuses every client"
     return int(days < EXPIRY_DAYS), f"valid for {days:.0f} days"

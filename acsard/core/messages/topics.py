@@ -51,13 +51,13 @@ class Topic(Struct, frozen=True):
 SERVICES: tuple[Verb, ...] = get_args(Verb)
 
 _SERVICE_NOTES: dict[Verb, str] = {
-    "stop": "stop and stay stopped until clear",
-    "clear": "release the fault if there is one, else the stop; the payload {latch} names it",
-    "activate": "switch on; commands count; the payload {latch} names the latch",
-    "deactivate": "switch off; ramps to zero, commands do not count",
-    "reset_odometry": "the pose becomes x 0, y 0, yaw 0",
-    "set_pose": "the pose becomes the payload {x, y, yaw}",
-    "set": "settings become those of the payload {settings: {key: value}}",
+    "stop": "stop, and stay stopped until clear",
+    "clear": "clear the fault if there is one, else the stop; the payload {latch} names it",
+    "activate": "switch on, so that commands count; the payload {latch} names the latch",
+    "deactivate": "switch off: ramp to zero and ignore commands",
+    "reset_odometry": "set the pose to x 0, y 0, yaw 0",
+    "set_pose": "set the pose to the payload {x, y, yaw}",
+    "set": "change settings; the payload is {settings: {key: value}}",
 }
 
 
@@ -100,25 +100,31 @@ TOPICS: tuple[Topic, ...] = (
     Topic("cmd_vel_out", "out", "TwistStamped", "every period", "the twist applied after limits"),
     Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
     Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
-    Topic("events", "out", "Events", "on change", "the last 20 events: what, when, by whom"),
+    Topic("events", "out", "Events", "on change", "the last 20 events with time, text and caller"),
     Topic(
         "sim/pose", "out", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True
     ),
-    Topic(json_key("<key>"), "out", "JSON", "as the key", "each key above, for subscribers"),
+    Topic(
+        json_key("<key>"), "out", "JSON", "as the key", "each key above as JSON, for subscribers"
+    ),
     Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
     Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
-    Topic("cmd/<source>/<certificate>", "in", "Twist or TwistStamped", "any", "the same by TLS"),
-    Topic("wheel_cmd/<source>/<certificate>", "in", "JointState", "any", "the same by TLS"),
-    Topic(IMU, "in", "Imu", "any", "turn rate by a gyro, with [odometry] gyro", gyro=True),
-    Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does"),
-    Topic("door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only"),
+    Topic(
+        "cmd/<source>/<certificate>", "in", "Twist or TwistStamped", "any", "cmd/<source> over TLS"
+    ),
+    Topic(
+        "wheel_cmd/<source>/<certificate>", "in", "JointState", "any", "wheel_cmd/<source> over TLS"
+    ),
+    Topic(IMU, "in", "Imu", "any", "turn rate from a gyro, with [odometry] gyro", gyro=True),
+    Topic("stop", "in", "anything", "any", "any PUT stops the robot like srv/stop"),
+    Topic("door", "in", "DoorState", "4 Hz", "status of the TLS gateway, on this machine only"),
     *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
-    Topic("info", "query", "Info", "", "who is this daemon"),
-    Topic("config", "query", "Config", "", "the configuration in force"),
+    Topic("info", "query", "Info", "", "name, version and settings of the daemon"),
+    Topic("config", "query", "Config", "", "the effective configuration"),
     Topic("interfaces", "query", "Interfaces", "", "command and state interfaces"),
     Topic("topics", "query", "Topics", "", "this table"),
-    Topic(WHOAMI, "query", "WhoAmI", "", "answers who may do what this role may"),
-    Topic("schema/<Type>", "query", "JSON Schema", "", "the fields of a type"),
+    Topic(WHOAMI, "query", "WhoAmI", "", "role of the client that asks, one key per role"),
+    Topic("schema/<Type>", "query", "JSON Schema", "", "the fields of a message type"),
     Topic("alive", "out", "liveliness token", "", "present while the daemon runs"),
 )
 

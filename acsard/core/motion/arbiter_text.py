@@ -9,18 +9,17 @@ from acsard.core.values import Wait
 REFUSED = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
-    "crowded": f"{MAX_SENDERS} other senders of this source are live",
-    "unproven": "a sender that is new here counts once its delays have proved steady; this is "
-    "not an error",
-    "stale": "older than the source's timeout allows, or than a command that was accepted: the "
-    "network held it up, or the sender's clock was set",
+    "crowded": f"{MAX_SENDERS} other senders of this source are active",
+    "unproven": "a new sender counts once its delays have proved steady; this is not an error",
+    "stale": "older than the source's timeout allows, or older than a command that was "
+    "accepted: the network delayed it, or the sender's clock was set",
 }
 """The words for each reason to refuse a command."""
 
 
 ROS_NEVER = (
-    " (`ros2 topic pub` of a speed sends none: "
-    '"After a clear" in deploy/ros2/README.md has tools that do)'
+    ' (`ros2 topic pub` of a speed never sends one; "After a clear" in deploy/ros2/README.md '
+    "lists tools that do)"
 )
 
 
@@ -40,14 +39,14 @@ def waiting(wait: Wait) -> str:
             return "a command"
         case "proof":
             return (
-                f"{wait.source} is new here: it drives once its delays have been steady for "
+                f"{wait.source} is new: it drives once its delays have been steady for "
                 f"{wait.seconds:g} s"
             )
         case "late":
             return (
-                f"commands of {wait.source} come too late, by more than {wait.seconds:g} s: the "
-                "network holds them up, or the sender's clock was set; if this goes on, look at "
-                "the network, then restart the sender"
+                f"commands of {wait.source} arrive more than {wait.seconds:g} s too late: the "
+                "network delays them, or the sender's clock was set; if this goes on, check the "
+                "network, then restart the sender"
             )
         case "neutral":
             lasts = f"; it has sent speeds for over {lasting(wait.lasts)}" if wait.lasts else ""
@@ -57,12 +56,12 @@ def waiting(wait: Wait) -> str:
                 f"{lasts}{ROS_NEVER if wait.ros else ''}"
             )
         case "zeros":
-            kept = f"; {wait.kept} sends speeds and is kept waiting" if wait.kept else ""
-            zeros = f"nothing but zeros for over {lasting(wait.lasts)}"
+            kept = f"; {wait.kept} sends speeds and must wait" if wait.kept else ""
+            zeros = f"only zeros for over {lasting(wait.lasts)}"
             return f"held by {wait.source}, which sends {zeros}{kept}"
         case "higher":
-            return f"{wait.source} has the higher priority: until it is silent"
+            return f"{wait.source} has priority: wait until it is silent"
         case "equal":
-            return f"{wait.source}, of the same priority, came first: until it is silent"
+            return f"{wait.source} has the same priority and came first: wait until it is silent"
         case "senders":
-            return f"{wait.senders} more of its senders: the first until it is silent"
+            return f"{wait.senders} more of its senders: wait until the first one is silent"

@@ -61,12 +61,15 @@ WORDS: dict[GyroDoes, str] = {
     "waiting for rest": "the gyro's bias is not known yet: the robot must stand for "
     f"{REST_S + KNOWN_S:.1f} s",
     "used": "the heading is the gyro's",
-    "silent": "the gyro is silent: the heading is the wheels' alone",
-    "disagrees": "the wheels slip: the gyro says another turn than they do",
-    "reversed": "not used: the gyro turns the other way than the wheels: check its mounting",
-    "in degrees": "not used: the gyro reads 57 times too much: degrees per second, not radians",
-    "dead": "not used: the gyro says no rate while the wheels turn the robot",
-    "not believed": "the gyro turns out of all proportion to the wheels: does its z point up?",
+    "silent": "the gyro is silent: the heading comes from the wheels alone",
+    "disagrees": "the wheels slip: the gyro measures another turn than the wheels",
+    "reversed": "not used: the gyro turns in the opposite direction to the wheels: check its "
+    "mounting",
+    "in degrees": "not used: the gyro reads 57 times too much: it sends degrees per second, not "
+    "radians",
+    "dead": "not used: the gyro measures no rate while the wheels turn the robot",
+    "not believed": "not used: the gyro's rate does not fit the wheels at all: does its z axis "
+    "point up?",
 }
 
 

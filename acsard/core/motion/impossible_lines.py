@@ -36,7 +36,8 @@ class ImpossibleLines:
 
     def _words(self, why: str) -> str:
         return (
-            f"{self._count} of {self._lines} lines were dropped, as no wheel can do what they say; "
-            f"the last: {why}. If a wheel does, raise that setting. Else lines come damaged: look "
-            'at cable and ground; firmware that knows mcu.link_check = "auto" proves each line'
+            f"{self._count} of {self._lines} lines were dropped, because no wheel can do what "
+            f"they report; the last: {why}. If a wheel really does that, raise the setting. "
+            "Otherwise lines arrive damaged: check cable and ground; firmware that supports "
+            'mcu.link_check = "auto" protects each line with a checksum'
         )

@@ -235,8 +235,8 @@ class Lifecycle:
             # been set since.
             came = f"the daemon started {age_s:.1f} s ago and the robot is still {latch.why}"
         raise RefusedError(
-            f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, or "
-            "with the latch of the state that you have looked at"
+            f"{came}: look at the robot, then call {call} again {LOOK_FIRST_S:g} s after that, "
+            "or with the number of the latch that you have seen"
         )
 
 

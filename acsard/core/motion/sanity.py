@@ -42,10 +42,10 @@ TOLD_AGAIN_S = 1.0
 
 
 _FAULTS = {
-    "dead": "does not turn, or its encoder is dead: look at cable, motor and encoder; if it "
-    "is motor d, at mcu.trailing_comma",
-    "reversed": "turns against its command: look at the motor's leads, its encoder's A and B, and "
-    "its sign in mcu.wheels",
+    "dead": "does not turn, or its encoder is dead: check cable, motor and encoder, and for "
+    "motor d also mcu.trailing_comma",
+    "reversed": "turns against its command: check the motor's leads, the A and B lines of its "
+    "encoder, and its sign in mcu.wheels",
     "runaway": "turns faster than commanded: the motor driver or its encoder is at fault",
     "stuck": "reports one and the same speed: its encoder is stuck",
 }
@@ -178,7 +178,10 @@ class Sanity:
                 lasted = wheel.evidence[kind] + dt if bad else 0.0
                 wheel.evidence[kind] = lasted
                 if limit and lasted > limit:
-                    return f"{name} wheel {_FAULTS[kind]} (told {told:.1f}, saw {speed:.1f} rad/s)"
+                    return (
+                        f"{name} wheel {_FAULTS[kind]} (commanded {told:.1f}, measured "
+                        f"{speed:.1f} rad/s)"
+                    )
         return ""
 
     def _notice(self, seen: WheelSpeeds, dt: float, still: bool) -> None:
@@ -192,4 +195,6 @@ class Sanity:
         self.turned = ""
         if self._rolled > ROLLED_S and self._untold >= TOLD_AGAIN_S:
             self._untold = 0.0
-            self.turned = f"wheels turn at {fastest:.1f} rad/s with nothing commanded: pushed?"
+            self.turned = (
+                f"wheels turn at {fastest:.1f} rad/s without a command: is the robot being pushed?"
+            )

@@ -40,7 +40,8 @@ class UnansweredLines:
             return None
         return Event(
             "lines_lost",
-            f"of {lines} lines {answers} were answered: the others are lost on the way there or "
-            "back, or the microcontroller reports by its own clock; `acsard mcu check` tells which",
+            f"only {answers} of {lines} lines were answered: the others are lost on the way "
+            "there or back, or the microcontroller reports by its own clock; `acsard mcu check` "
+            "finds out which",
             "warning",
         )

@@ -33,7 +33,9 @@ class Attachment(Struct, frozen=True):
 def unpack(data: bytes) -> Attachment:
     """Decode an attachment; raise `DecodeError` if it is not valid."""
     if not data:
-        raise DecodeError("no_attachment", "has no attachment, as rmw_zenoh gives every sample one")
+        raise DecodeError(
+            "no_attachment", "has no attachment, but rmw_zenoh gives every sample one"
+        )
     if len(data) != _LAYOUT.size:
         raise DecodeError(
             "bad_attachment",

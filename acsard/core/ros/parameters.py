@@ -80,7 +80,7 @@ def _described(name: str, type_of: int) -> ParameterDescriptor:
         name,
         type_of,
         words if row is None else f"{row.what}: {words}",
-        "acsard.toml and a start" if row is None else WHEN[row.when],
+        "only in acsard.toml, with a restart" if row is None else WHEN[row.when],
         read_only=row is None,
         floating_point_range=floats,
         integer_range=whole,
@@ -290,7 +290,7 @@ def wished(payload: bytes) -> dict[str, Plain]:
     wishes: dict[str, Plain] = {}
     for one in asked.parameters:
         if one.name in wishes:
-            raise CdrError(f"{one.name} is in it twice: set it once; nothing was set")
+            raise CdrError(f"{one.name} is in the request twice; nothing was set")
         wishes[one.name] = _plain(one)
     return wishes
 
@@ -316,7 +316,7 @@ def _plain(parameter: Parameter) -> Plain:
         STRING_ARRAY: [*value.string_array_value],
     }
     if value.type not in fields:
-        raise CdrError(f"{parameter.name}: no value that a setting could have")
+        raise CdrError(f"{parameter.name}: no setting can have a value of this type")
     return fields[value.type]
 
 

@@ -501,11 +501,11 @@ def test_mute_noise_and_half_lines_are_three_mends_with_what_was_heard() -> None
     found = {fault: check(fault)["baud rate"] for fault in ("mute", "noise", "partial_line")}
     assert len({finding.mend for finding in found.values()}) == 3
     assert "TX and RX crossed" in found["mute"].mend
-    assert "nothing at all heard" in found["mute"].text
+    assert "nothing was received" in found["mute"].text
     assert "ground" in found["noise"].mend
     assert r"`\x00\xff~ap00.00,bp00.00" in found["noise"].text
     assert "line end" in found["partial_line"].mend
-    assert "bytes heard but no line end, the last `" in found["partial_line"].text
+    assert "bytes received but no line end; the last bytes are `" in found["partial_line"].text
 
 
 @pytest.mark.variations(3)

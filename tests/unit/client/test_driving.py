@@ -43,7 +43,7 @@ HIGHER = replace(
     FOLLOWED,
     source="teleop",
     reason="commanded by teleop",
-    sources=[source("teleop has the higher priority: until it is silent")],
+    sources=[source("teleop has priority: wait until it is silent")],
 )
 
 Says = Callable[[float, float, list[float]], RobotState | None]
@@ -214,7 +214,7 @@ AGAINST: list[tuple[str, Says, type[Exception], str, float, bool]] = [
      NotDrivenError, "no line", 1.0 + GRACE_S, True),
     ("unheard", after(0, replace(STOPPED, mode="ready", sources=[source("a command", None)])),
      UnheardError, "hears no command of source app", OPENED_S, False),
-    ("outranked", after(0, HIGHER), NotDrivenError, "higher priority", OPENED_S, False),
+    ("outranked", after(0, HIGHER), NotDrivenError, "has priority", OPENED_S, False),
     ("outranked on the way", after(0.9, HIGHER), NotDrivenError, "higher", 0.9 + GRACE_S, True),
     ("another sender", after(0, replace(FOLLOWED, sender=OTHER)), NotDrivenError, OTHER, OPENED_S,
      False),
@@ -248,7 +248,7 @@ def test_a_drive_that_is_not_followed_ends_with_the_reason_and_a_zero(
 def test_a_short_drive_that_hardly_counted_does_not_return_as_if_it_had(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with pytest.raises(NotDrivenError, match="higher priority"):
+    with pytest.raises(NotDrivenError, match="has priority"):
         World(after(0.45, HIGHER)).drive(monkeypatch, 0.8 * GRACE_S)
 
 
@@ -363,10 +363,10 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
     [
         (FOLLOWED, ""),
         (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
-        (replace(FOLLOWED, sources=[source("1 more of its senders: the first")]), ""),
+        (replace(FOLLOWED, sources=[source("1 more of its senders: wait")]), ""),
         (replace(FOLLOWED, sender=OTHER), f"another program drives as app, {OTHER}"),
         (OPENING, NEUTRAL),
-        (HIGHER, "teleop has the higher priority"),
+        (HIGHER, "teleop has priority"),
         (replace(STOPPED, mode="ready", sources=[source("a command", 7.0)]), "hears no command"),
         (replace(STOPPED, mode="ready", sources=[source("app may be late")]), "may be late"),
     ],

@@ -115,7 +115,7 @@ def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
 
 
 US, OTHER = "joe/1/aa", "joe/2/bb"
-TWO = [SourceState("app", 50, 0.01, "1 more of its senders: the first until it is silent")]
+TWO = [SourceState("app", 50, 0.01, "1 more of its senders: wait until the first one is silent")]
 
 
 def of_two(leg: Leg, sender: str) -> World:

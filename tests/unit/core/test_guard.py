@@ -55,7 +55,7 @@ STOP = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 NOT_A_LINE = "it is not a whole line of four wheels"
 TOO_FAST = "a wheel is over limits.wheel_speed"
 NO_LINK = "it moves a wheel without a link"
-GROWS = "a wheel grows without a fresh command in mode driving"
+GROWS = "a wheel speeds up without a fresh command in mode driving"
 LATE = "it still moves a wheel although the longest ramp to rest is over"
 
 

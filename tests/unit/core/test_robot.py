@@ -414,7 +414,7 @@ def test_the_higher_source_drives_and_the_snapshot_tells_the_lower_why() -> None
     assert bench.step(GO).source == "teleop"
     snapshot = bench.robot.snapshot(bench.now_ns)
     waits = {source.name: waiting(source.waits_for) for source in snapshot.sources}
-    assert waits["app"] == "teleop has the higher priority: until it is silent"
+    assert waits["app"] == "teleop has priority: wait until it is silent"
     assert waits["teleop"] == ""
 
 
@@ -469,7 +469,7 @@ def test_a_silent_mcu_is_rest_after_quiet() -> None:
         assert bench.step(GO).applied == GO
     out = bench.step(GO)
     assert (out.applied, out.link, out.mode) == (REST, "stale", "waiting")
-    assert out.reason.startswith("the built-in simulator, a part of this program, is late")
+    assert out.reason.startswith("the built-in simulator, which is a part of this program, is late")
 
 
 def test_without_feedback_only_zero_lines_go_out_ten_times_a_second() -> None:

@@ -579,7 +579,7 @@ class RobotMachine(RuleBasedStateMachine):
             assert mode in ("fault", "leaving")
         if mode == "ready" and outputs.due:
             begins = ("send a zero first: ", "waiting for a command: ", "commands of ")
-            assert outputs.reason.startswith(begins) or "is new here" in outputs.reason
+            assert outputs.reason.startswith(begins) or "is new: it drives" in outputs.reason
         if mode == "driving":
             assert outputs.reason.startswith("driving: ")
             assert outputs.linked

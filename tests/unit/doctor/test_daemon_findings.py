@@ -123,9 +123,9 @@ def test_a_sound_link_is_one_ok() -> None:
 
 @pytest.mark.parametrize("state", ["booting", "stale"])
 def test_no_link_is_a_failure_with_what_was_heard_and_the_check(state: str) -> None:
-    (finding,) = found({}, {}, link=state, mode="waiting", reason="nothing at all heard")
+    (finding,) = found({}, {}, link=state, mode="waiting", reason="nothing was received")
     assert finding.level == "failure"
-    assert "nothing at all heard" in finding.text
+    assert "nothing was received" in finding.text
     assert "acsard mcu check --port /dev/ttyX" in finding.mend
     assert "kill 77" in finding.mend
 

@@ -26,7 +26,7 @@ def test_who_drives_is_who_the_recording_says_drives() -> None:
 
 def test_who_waits_says_for_whom() -> None:
     (wait,) = [span for span in spans("nav") if span.kind == "waits"]
-    assert wait.words == "teleop has the higher priority: until it is silent"
+    assert wait.words == "teleop has priority: wait until it is silent"
     assert 1.5 < wait.end - wait.begin < 2.5
 
 

@@ -80,7 +80,7 @@ def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None
 def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
     waits = trace(figures["who"], "waits")
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
-    assert "<b>waits</b> teleop has the higher priority: until it is silent" in words
+    assert "<b>waits</b> teleop has priority: wait until it is silent" in words
     assert max(column(waits["x"])) > 1500  # in ms
     rows = [note["text"] for note in figures["who"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]

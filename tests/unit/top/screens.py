@@ -30,7 +30,7 @@ STATE = RobotState(
     sources=[
         SourceState("teleop", 100, None, "a command"),
         SourceState("app", 50, 0.02, ""),
-        SourceState("nav", 10, 3.0, "app has the higher priority: until it is silent"),
+        SourceState("nav", 10, 3.0, "app has priority: wait until it is silent"),
     ],
     refused="",
     counters={"lines": 1300, "lines_sent": 1301, "commands": 220, "missed_periods": 3},

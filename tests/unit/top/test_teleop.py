@@ -67,7 +67,7 @@ def test_help_stays_on_a_screen_of_few_lines() -> None:
 
 
 def test_keys_that_do_not_drive_are_told() -> None:
-    why = "app, of the same priority, came first: until it is silent"
+    why = "app has the same priority and came first: wait until it is silent"
     seen = replace(SEEN, objection=why)
     assert why in " ".join(" ".join(texts(seen, 40)).split())
     assert why in told(news(seen, 40))

@@ -49,7 +49,7 @@ def test_wheels_that_are_not_four_numbers_are_shown_as_far_as_they_go(wheels: li
 def test_sources_tell_priority_age_and_what_they_wait_for() -> None:
     assert line_with("teleop").split() == ["teleop", "100", "never", "a", "command"]
     assert line_with("▶").split() == ["▶", "app", "50", "0.0", "s", "nothing:", "it", "drives"]
-    assert "app has the higher priority" in line_with("  nav")
+    assert "app has priority" in line_with("  nav")
 
 
 def test_a_source_that_is_heard_by_a_stopped_robot_is_not_said_to_drive() -> None:
@@ -136,8 +136,8 @@ def test_the_certificate_is_told_when_there_is_one() -> None:
     assert "certificate valid for 700 days" in line_with(
         "link ", of(certificate="valid for 700 days")
     )
-    ended = of(certificate="ended 3 days ago: nobody can join any more")
-    assert "certificate ended 3 days ago" in line_with("link ", ended)
+    ended = of(certificate="expired 3 days ago: TLS refuses every client")
+    assert "certificate expired 3 days ago" in line_with("link ", ended)
 
 
 def test_each_figure_is_told_for_the_last_minute_and_since_the_start() -> None:

@@ -42,8 +42,8 @@ next to a wheel at a steady speed."""
 Lie = Literal["dead", "reversed", "stuck"]
 
 WORDS: dict[Lie, str] = {
-    "dead": "says it stands while the other wheel of its side turns",
-    "reversed": "says the opposite of the other wheel of its side",
+    "dead": "reports that it stands while the other wheel of its side turns",
+    "reversed": "reports the opposite direction of the other wheel of its side",
     "stuck": "says one and the same speed",
 }
 

@@ -76,7 +76,10 @@ class _Side:
     def text(self) -> str:
         """The trouble of the side in words, "" without any."""
         if self.out is not None:
-            return f"{self.left_out} wheel is left out: it {WORDS[self._lie]}, look at its encoder"
+            return (
+                f"{self.left_out} wheel is left out of the pose: it {WORDS[self._lie]}; check "
+                "its encoder"
+            )
         if self.slip_s > 0.0:
             return f"{self.name} wheels slip: front and rear turn differently"
         return ""
@@ -92,7 +95,10 @@ class _Side:
             return
         self._agreed_s += dt
         if self._agreed_s >= BACK_S:
-            again = f"{self.left_out} wheel agrees with the other one of its side: it counts again"
+            again = (
+                f"{self.left_out} wheel agrees with the other wheel of its side again: the "
+                "pose uses it"
+            )
             self.event = Event("wheels_doubted", again, kind="again")
             self.out, self.residual.learns = None, True
 

@@ -43,8 +43,8 @@ def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
 def test_the_door_needs_a_way_to_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
-        'bus.listen = ["tls/0.0.0.0:7449"]: who comes by TLS reaches the daemon through its '
-        f'address on this machine; add "{HERE}"'
+        'bus.listen = ["tls/0.0.0.0:7449"]: clients that connect by TLS reach the daemon '
+        f'through an address on this machine; add "{HERE}"'
     )
 
 
@@ -179,8 +179,10 @@ def test_counts_that_are_not_the_simulators_are_a_surprise() -> None:
 def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_not() -> None:
     control = ControlConfig(rate=10)
     (line,) = problems(mcu=McuConfig(encoder_counts=20_000), control=control)
-    assert line.startswith("mcu.encoder_counts = 20000: at feedback.wheel_speed = 80 rad/s they ")
-    assert "could wrap in 129 ms, and must last 2 control periods (200 ms)" in line
+    assert line.startswith(
+        "mcu.encoder_counts = 20000: at feedback.wheel_speed = 80 rad/s the counts "
+    )
+    assert "could wrap in 129 ms, but they must last 2 control periods (200 ms)" in line
     assert "write 12867 at most" in line
     assert problems(mcu=McuConfig(encoder_counts=12_867), control=control) == []
     assert problems(mcu=McuConfig(encoder_counts=12_868), control=control) != []
@@ -190,6 +192,6 @@ def test_counts_that_wrap_within_two_periods_are_refused_with_the_most_that_do_n
 
 def test_a_track_is_learned_only_where_there_is_a_gyro() -> None:
     (line,) = problems(odometry=OdometryConfig(learned_track=True))
-    assert line.startswith("odometry.learned_track = true: ")
+    assert line.startswith("odometry.learned_track = true needs a gyro")
     assert "odometry.gyro = true" in line
     assert problems(odometry=OdometryConfig(learned_track=True, gyro=True)) == []

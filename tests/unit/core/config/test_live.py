@@ -135,14 +135,14 @@ def test_one_that_cannot_be_refuses_all() -> None:
 
 def test_a_rule_between_keys_refuses_what_breaks_it_and_takes_both_together() -> None:
     softer: dict[str, object] = {"limits.linear_deceleration": 0.15}
-    assert "would take 6.7 s from full speed" in problems(softer)[0]
+    assert "would take 6.7 s, but may take" in problems(softer)[0]
     made, _ = changed(CONFIG, softer | {"limits.linear_speed": 0.5}, True)
     assert made.limits.linear_deceleration == 0.15
 
 
 def test_limits_beyond_what_feedback_may_say_are_refused() -> None:
     (line,) = problems({"limits.wheel_speed": 79.0, "limits.linear_speed": 4.0})
-    assert "feedback.wheel_speed = 80: the limits let a wheel be asked 79.0 rad/s" in line
+    assert "feedback.wheel_speed = 80: the limits allow commands of 79.0 rad/s for a wheel" in line
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,11 @@ def test_limits_beyond_what_feedback_may_say_are_refused() -> None:
         ("limits", {"linear_speed": 1.0}, "unknown key"),
         ("commands.sources.ghost.timeout", 0.5, "did you mean commands.sources."),
         ("x" * 4000, 1.0, "unknown key"),
-        ("mcu.port", "/dev/x", "takes a start: change it in acsard.toml"),
+        (
+            "mcu.port",
+            "/dev/x",
+            "this key is read only when the daemon starts: change it in acsard.toml",
+        ),
     ],
 )
 def test_what_cannot_be_set_is_said_with_what_to_do(key: str, value: object, words: str) -> None:
@@ -182,7 +186,7 @@ def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> 
     assert changed(config, harder, False)[1]
     assert changed(config, softer, True)[1]
     (line,) = problems(softer, False, config)
-    assert "only while the robot stands; stop it first" in line
+    assert "only while the robot stands; stop the robot first" in line
 
 
 @pytest.mark.parametrize(
@@ -192,7 +196,7 @@ def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> 
 )  # fmt: skip
 def test_what_would_jump_or_forget_who_drives_waits_for_rest(key: str, value: float) -> None:
     (line,) = problems({key: value}, at_rest=False)
-    assert "may be set only while the robot stands" in line
+    assert "only while the robot stands" in line
     assert changed(CONFIG, {key: value}, at_rest=True)[1]
 
 

@@ -64,6 +64,6 @@ def test_a_limit_that_contradicts_the_rest_is_dropped_and_an_event_names_it() ->
     dropped, used = events
     assert (dropped.name, dropped.level) == ("set", "warning")
     assert dropped.text.startswith(
-        "limits.linear_acceleration = 0.001, kept from before the restart, is dropped: "
+        "limits.linear_acceleration = 0.001 was lowered before the restart, and is dropped now: "
     )
     assert used.text == "limits.angular_speed = 2.0 (was 4.0): lowered before the restart"

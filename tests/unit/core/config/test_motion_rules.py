@@ -126,7 +126,7 @@ def test_a_stop_of_exactly_the_longest_is_accepted_and_a_softer_one_is_not() -> 
 
     assert stops_by(0.5) == []
     (line,) = stops_by(0.49)
-    assert line.startswith("limits.linear_stop_deceleration = 0.49: would take 2.0 s")
+    assert line.startswith("limits.linear_stop_deceleration = 0.49: braking from full speed")
 
 
 def test_a_stop_that_is_both_too_soft_and_softer_than_the_ramp_is_told_once() -> None:
@@ -157,7 +157,7 @@ def test_the_most_that_a_line_can_say_is_room_enough() -> None:
 def test_a_smaller_wheel_has_to_turn_faster() -> None:
     drive = DriveConfig(left_wheel_radius_multiplier=0.5)
     (line,) = problems(Config(drive=drive, feedback=FeedbackConfig(wheel_speed=43.0)))
-    assert "asked 40.0 rad/s" in line
+    assert "commands of 40.0 rad/s" in line
 
 
 @pytest.mark.parametrize(

@@ -31,31 +31,31 @@ def test_a_fault_is_read_with_its_numbers(text: str, values: tuple[float, ...]) 
 
 
 REFUSED = [
-    ("x", "not a fault; there are mute, noise, "),
-    ("mut", "not a fault; did you mean mute?"),
-    ("stall=5:0.15", "not a fault; did you mean stalls=NUMBER:NUMBER?"),
-    ("mute=1", "it is written mute"),
-    ("bias", "it is written bias=MOTOR:NUMBER"),
-    ("bias=a", "it is written bias=MOTOR:NUMBER"),
-    ("swapped_wheels=a:b:c", "it is written swapped_wheels=MOTOR:MOTOR"),
-    ("stalls=5", "it is written stalls=NUMBER:NUMBER"),
+    ("x", "not a known fault; there are mute, noise, "),
+    ("mut", "not a known fault; did you mean mute?"),
+    ("stall=5:0.15", "not a known fault; did you mean stalls=NUMBER:NUMBER?"),
+    ("mute=1", "write it as mute"),
+    ("bias", "write it as bias=MOTOR:NUMBER"),
+    ("bias=a", "write it as bias=MOTOR:NUMBER"),
+    ("swapped_wheels=a:b:c", "write it as swapped_wheels=MOTOR:MOTOR"),
+    ("stalls=5", "write it as stalls=NUMBER:NUMBER"),
     ("stuck_encoder=e", "motors are a, b, c and d"),
     ("stuck_encoder=ab", "motors are a, b, c and d"),
-    ("bias=a:much", "numbers are written like 5 or 0.15, up to 1e+06"),
-    ("pushed=nan", "numbers are written like"),
-    ("pushed=-inf", "numbers are written like"),
+    ("bias=a:much", "write a number like 5 or 0.15, up to 1e+06"),
+    ("pushed=nan", "write a number like"),
+    ("pushed=-inf", "write a number like"),
     ("pushed=1000001", "up to 1e+06"),
     ("other_baud=300", "rates are 9600"),
-    ("stalls=0.1:0.2", "fewer for each"),
-    ("stalls=0.2:0.2", "fewer for each"),
-    ("stalls=5:0", "0.001 at least"),
-    ("stalls=5:0.0009", "0.001 at least"),
+    ("stalls=0.1:0.2", "fewer seconds for each"),
+    ("stalls=0.2:0.2", "fewer seconds for each"),
+    ("stalls=5:0", "both at least 0.001"),
+    ("stalls=5:0.0009", "both at least 0.001"),
 ]
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [*REFUSED, ("", "not a fault"), ("reset=0", "above 0"), ("reset=-1", "above")],
+    [*REFUSED, ("", "not a known fault"), ("reset=0", "above 0"), ("reset=-1", "above")],
 )
 def test_what_is_no_fault_is_refused_in_words(text: str, words: str) -> None:
     with pytest.raises(ValueError, match=re.escape(words)):
@@ -95,7 +95,7 @@ def test_every_mistake_is_told() -> None:
 
 def test_what_needs_a_timer_is_told_where_it_goes() -> None:
     assert problems('["reset=5"]') == [
-        'sim.faults[0] = "reset=5": needs `acsard sim --fault reset=5`; take it out here'
+        'sim.faults[0] = "reset=5": needs `acsard sim --fault reset=5`; remove it here'
     ]
 
 
@@ -109,5 +109,7 @@ def test_what_is_no_list_of_short_texts_is_told_as_of_any_key(faults: str) -> No
 def test_a_simulator_with_faults_is_a_surprise_and_a_device_has_none() -> None:
     sim = SimConfig(faults=("ftdi",))
     (warning,) = warnings(Config(sim=sim))
-    assert warning == 'sim.faults = ["ftdi"]: the simulator misbehaves as told; [] ends it'
+    assert (
+        warning == 'sim.faults = ["ftdi"]: the simulator has these faults on purpose; [] ends them'
+    )
     assert warnings(Config(sim=sim, mcu=McuConfig(port="/dev/x"))) == []

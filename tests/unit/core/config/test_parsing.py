@@ -254,19 +254,19 @@ PLANTED = [
         "[limits]\nlinear_deceleration = 0.19",
         "limits.linear_deceleration",
         "0.19",
-        "would take 5.3 s from full speed (1 m/s) to rest, and may take 5; write 0.2 or more",
+        "braking from full speed (1 m/s) would take 5.3 s, but may take 5 s; write 0.2 or more",
     ),
     (
         "[limits]\nangular_deceleration = 0.1",
         "limits.angular_deceleration",
         "0.1",
-        "would take 40.0 s from full speed (4 rad/s) to rest, and may take 5; write 0.8 or more",
+        "braking from full speed (4 rad/s) would take 40.0 s, but may take 5 s; write 0.8 or more",
     ),
     (
         "[limits]\nangular_deceleration = 1\nangular_stop_deceleration = 1.5",
         "limits.angular_stop_deceleration",
         "1.5",
-        "may take 2; write 2 or more",
+        "may take 2 s; write 2 or more",
     ),
     ("[feedback]\nwheel_speed = 30", "feedback.wheel_speed", "30", "write 35.2 or more"),
     ("[mcu]\nreply_period = 1.0", "mcu.reply_period", "1", "write 0.25 at most"),
@@ -515,7 +515,7 @@ def test_what_leaves_this_machine_is_refused_unless_insecure_is_said(key: str, h
     assert line.startswith(f'bus.{key} = "tcp/{host}:7448": leaves this machine')
     assert line.endswith("bus.insecure = true")
     config = accepted(text + "insecure = true")
-    assert any("everyone who reaches the bus can drive" in text for text in warnings(config))
+    assert any("every program that reaches the bus can drive" in text for text in warnings(config))
 
 
 @pytest.mark.parametrize(
@@ -564,7 +564,7 @@ def test_a_frame_that_is_not_published_may_have_any_name(table: str) -> None:
 
 def test_a_speed_the_wheels_cannot_reach_is_a_warning() -> None:
     (text,) = warnings(accepted("[limits]\nlinear_speed = 3.0"))
-    assert text.startswith("limits.linear_speed = 3 m/s needs 60.0 rad/s")
+    assert text.startswith("limits.linear_speed = 3 m/s needs wheels at 60.0 rad/s")
     assert "limits.wheel_speed = 40" in text
 
 

@@ -85,7 +85,10 @@ def test_a_router_that_is_missing_from_the_start_is_told_and_counted() -> None:
     daemon = Daemon()
     (event,) = daemon.hears((), (A,))
     assert (event.name, event.level) == ("router_missing", "warning")
-    assert event.text == f"not connected to {A}; tried again until it answers, driving goes on"
+    assert (
+        event.text
+        == f"not connected to {A}; the daemon tries again until it connects, and driving goes on"
+    )
     assert daemon.counters == {"router_missing": 1}
 
 
@@ -113,7 +116,7 @@ def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     found = [(event.name, event.level) for event in events]
     assert found == [("router_found", "info"), ("no_router", "warning")]
-    assert events[-1].text.startswith(f"{A} is no router")
+    assert events[-1].text.startswith(f"{A} is not a router")
     assert "call stop --id '*'" in events[-1].text
 
 

@@ -455,7 +455,7 @@ def test_more_names_than_any_robot_has_are_refused_for_their_number_alone() -> N
     assert len(payload) == MAX_COMMAND_BYTES
     # the decoder looked at no item
     for more in (payload, payload[:24] + b"\xff" * len(payload[24:])):
-        with pytest.raises(DecodeError, match=r"1018 items where 64 may be"):
+        with pytest.raises(DecodeError, match=r"1018 items, but at most 64 are allowed"):
             RECEIVER.command(arrival(more, key="wheel_cmd/app"))
 
 

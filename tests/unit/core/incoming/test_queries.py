@@ -32,7 +32,7 @@ NATIVE = ("odom", "tf", "tf_static", "wheel_states", "cmd_vel_out", "diagnostics
 
 CONFIG = Config(robot=RobotConfig("r7"))
 WALL_NS = 1_700_000_000_000_000_000
-NO = rcl.SetParametersResult(False, "needs the header of plain CDR, has 00")
+NO = rcl.SetParametersResult(False, "needs the header of plain CDR, but has 00")
 INFO = Info("r7", "1.2.3", 42, "/dev/pts/3", True, 100.0, ["tcp/127.0.0.1:7448"], [])
 
 WILDCARDS = ["**", "*", "srv/*", "srv/**", "*/stop", "srv/st$*", "acsard/*/srv/stop", "acsard/**"]
@@ -120,7 +120,7 @@ def test_what_is_no_ros_message_is_refused_as_cdr_in_words(
     assert answer(query(topic, asked, fmt="cdr")) == Reply(
         7,
         topic,
-        f"{kind} is no ROS message and has no CDR form: use JSON".encode(),
+        f"{kind} is not a ROS message and has no CDR form: use JSON".encode(),
         "text/plain",
         ok=False,
     )
@@ -534,7 +534,9 @@ def test_a_parameter_that_is_set_twice_at_once_is_refused_with_a_result_for_each
     ]
     payload = Cdr(rcl.SetRequest).encode(rcl.SetRequest(wishes))
     asked = ros_query(f"parameters/{service}", "rmw", payload)
-    with pytest.raises(DecodeError, match=r"limits\.linear_speed is in it twice") as caught:
+    with pytest.raises(
+        DecodeError, match=r"limits\.linear_speed is in the request twice"
+    ) as caught:
         queries().serve(asked, nothing, OUTPUTS)
     reply = refused(asked, str(caught.value), WALL_NS)
     assert reply is not None

@@ -32,7 +32,7 @@ def test_a_computer_that_did_not_run_is_told_with_how_long() -> None:
     for steps in ((800,), (10, 800, 10), (60, 800)):
         told = after(*steps).words("stale")
         assert told.startswith("this computer did not run for 0.80 s")
-        assert "what else runs" in told
+        assert "which other program" in told
 
 
 def test_a_good_line_ends_it() -> None:

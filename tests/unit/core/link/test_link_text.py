@@ -20,7 +20,7 @@ def test_a_board_that_only_prints_noise_is_told_with_what_it_said() -> None:
         texts += [event.text for event in bench.session.events if event.name == "link_booting"]
     told = [text for text in texts if "none good" in text]
     assert len(told) == 1
-    assert "150 lines heard, none good, the last `" in told[0]
+    assert "150 lines received, none good, the last `" in told[0]
     assert bench.session.words() == told[0]
     bench.wait(10, GOOD * 3)
     assert bench.session.words() == "linked"
@@ -31,20 +31,20 @@ def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
     for _ in range(20):
         bench.wait(10)
     assert bench.session.words().startswith(
-        "the built-in simulator, a part of this program, is late"
+        "the built-in simulator, which is a part of this program, is late"
     )
     for _ in range(302):
         bench.wait(10)
-    assert "nothing at all heard" in bench.session.words()
+    assert "nothing was received" in bench.session.words()
 
 
 @pytest.mark.parametrize(
     ("apart", "longest", "told", "untold"),
     [
         (20, 0.25, "set mcu.reply_period = 0.20", "seldom"),
-        (20, 0.15, "every 0.15 s or sooner", "mcu.reply_period"),
-        (74, 0.25, "every 0.25 s or sooner", "mcu.reply_period"),
-        (136, 0.25, "every 0.25 s or sooner", "mcu.reply_period"),
+        (20, 0.15, "at least every 0.15 s", "mcu.reply_period"),
+        (74, 0.25, "at least every 0.25 s", "mcu.reply_period"),
+        (136, 0.25, "at least every 0.25 s", "mcu.reply_period"),
     ],
 )
 def test_lines_too_far_apart_are_told_and_no_setting_that_would_be_refused(

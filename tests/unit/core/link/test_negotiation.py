@@ -384,7 +384,7 @@ def test_an_echo_is_never_taken_for_an_answer_and_nothing_drives_on_it() -> None
             for line in bench.ask():
                 assert bench.check.echoed(line[:-2])
         assert (bench.check.asking, bool(bench.check.trouble)) == (True, True)
-        assert "what is sent comes back" in MENDS[bench.check.trouble]
+        assert "the daemon's own lines come back" in MENDS[bench.check.trouble]
         bench.check.begin(fresh=True)
         assert not bench.check.trouble
 

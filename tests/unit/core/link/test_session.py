@@ -597,7 +597,7 @@ def test_who_answered_with_a_check_is_never_driven_plainly() -> None:
         line = bench.line()
         assert line is None or line.startswith(ZERO) or bench.link() == "up"
     assert bench.session.negotiation.asking
-    assert "before and now does not" in bench.session.words()
+    assert "before and now answers without" in bench.session.words()
 
 
 @pytest.mark.parametrize("mcu", [McuConfig(), AUTO], ids=["plain", "checked"])

@@ -10,18 +10,24 @@ from acsard.core.link.silence_diagnosis import MENDS, PATIENCE_NS, Heard, Look, 
 GOOD = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
 
 HEARD: dict[str, tuple[bytes, Look, str]] = {
-    "mute": (b"", "nothing", "nothing at all heard"),
-    "half lines": (b"ap00.00,bp00.00,c" * 9, "cut", "153 bytes heard but no line end, the last `"),
+    "mute": (b"", "nothing", "nothing was received"),
+    "half lines": (
+        b"ap00.00,bp00.00,c" * 9,
+        "cut",
+        "153 bytes received but no line end; the last bytes are `",
+    ),
     "cut lines": (b"ap00.00,bp0\r\n" * 4, "cut", "none good, the last `ap00.00,bp0`"),
     "noise": (
         (b"\x00\xff~" + GOOD) * 144,
         "foreign",
-        r"144 lines heard, none good, the last `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
+        r"144 lines received, none good, the last `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
     ),
-    "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines heard, none good"),
-    "no end": (b"\xf8\x00\xe6" * 3, "garbage", r"the last `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"),
-    "some good": (GOOD + b"ap?\r\n", "few", "2 lines heard, only 1 good, the last other `ap?`"),
-    "all good": (GOOD * 2, "sparse", "2 lines heard, all good, but too few"),
+    "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines received, none good"),
+    "no end": (
+        b"\xf8\x00\xe6" * 3, "garbage", r"the last bytes are `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"
+    ),
+    "some good": (GOOD + b"ap?\r\n", "few", "2 lines received, only 1 good, the last other `ap?`"),
+    "all good": (GOOD * 2, "sparse", "2 lines received, all of them good, but too few"),
 }  # fmt: skip
 
 

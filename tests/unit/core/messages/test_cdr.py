@@ -740,7 +740,7 @@ def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
     if count <= 3:
         assert Cdr(Bounded).decode(payload) == message
         return
-    with pytest.raises(CdrError, match=rf"^{count} items where 3 may be$"):
+    with pytest.raises(CdrError, match=rf"^{count} items, but at most 3 are allowed$"):
         Cdr(Bounded).decode(payload)
 
 
@@ -764,7 +764,7 @@ def test_too_many_items_are_refused_before_one_of_them_is_decoded(
     for items in (bytes(4 * count), b"\xff" * 4 * count):  # the second body contains no valid item
         payload = head + struct.pack(order + "I", count) + items
         assert len(payload) == 4096
-        with pytest.raises(CdrError, match=rf"^{count} items where {most} may be$"):
+        with pytest.raises(CdrError, match=rf"^{count} items, but at most {most} are allowed$"):
             Cdr(cls).decode(payload)
 
 
@@ -782,7 +782,7 @@ def test_as_many_names_as_there_may_be_are_read(cls: type[Struct], most: int) ->
 def test_each_list_of_a_joint_state_is_bounded(field: str) -> None:
     items = ["j"] * 65 if field == "name" else [0.5] * 65
     payload = oracle_bytes(JointState(**cast(dict[str, Any], {field: items})))
-    with pytest.raises(CdrError, match=r"65 items where 64 may be"):
+    with pytest.raises(CdrError, match=r"65 items, but at most 64 are allowed"):
         Cdr(JointState).decode(payload)
 
 

@@ -44,7 +44,7 @@ def test_a_builder_makes_the_struct_of_its_leaves() -> None:
 
 @pytest.mark.parametrize("kind", [dict, list[int], float, int])
 def test_what_is_no_struct_is_a_type_error(kind: object) -> None:
-    with pytest.raises(TypeError, match="no struct"):
+    with pytest.raises(TypeError, match="not a struct"):
         struct_info(kind)
 
 

@@ -110,7 +110,7 @@ def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
 @pytest.mark.parametrize(("link", "level"), [("up", WARN), ("down", ERROR)])
 def test_the_simulator_is_never_taken_for_a_robot(link: str, level: int) -> None:
     one = row("serial link", Config(), replace(OUTPUTS, link=link))
-    assert (one.level, one.message) == (level, f"{link}: the simulator, no wheel turns")
+    assert (one.level, one.message) == (level, f"{link}: the simulator; no real wheel turns")
 
 
 def test_the_link_shows_its_port_its_wire_use_and_its_rejects_by_reason() -> None:

@@ -70,7 +70,7 @@ def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
     ids=lambda value: type(value).__name__,
 )
 def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
-    with pytest.raises(DecodeError, match=f"{type(value).__name__} is no ROS message") as caught:
+    with pytest.raises(DecodeError, match=f"{type(value).__name__} is not a ROS message") as caught:
         encode(value, "cdr")
     assert caught.value.reason == "unknown_format"
 
@@ -281,8 +281,11 @@ def test_every_finite_twist_comes_back_bit_for_bit(twist: Twist, form: Format) -
 @pytest.mark.parametrize(
     ("payload", "says"),
     [
-        (b'{"linear": {"x": NaN}}', "line 1, column 18: JSON has no NaN and no infinity"),
-        (b'{\n "linear": {"x": -Infinity}}', "line 2, column 18: JSON has no NaN and no infinity"),
+        (b'{"linear": {"x": NaN}}', "line 1, column 18: JSON cannot contain NaN or infinity"),
+        (
+            b'{\n "linear": {"x": -Infinity}}',
+            "line 2, column 18: JSON cannot contain NaN or infinity",
+        ),
         (b'{"linear":\n}', "line 2, column 1: invalid character"),
     ],
 )

@@ -16,7 +16,7 @@ NOW_NS = 1_700_000_000_000_000_000
         (30, 0, "valid for 30 days"),
         (29, 1, "valid for 29 days"),
         (0, 1, "valid for 0 days"),
-        (-2, 2, "ended 2 days ago: nobody can join any more"),
+        (-2, 2, "expired 2 days ago: TLS refuses every client"),
     ],
 )
 def test_it_is_a_warning_a_month_before_and_an_error_after(

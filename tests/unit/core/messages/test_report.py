@@ -390,8 +390,8 @@ def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> N
         (
             RoutersStatus(("a", "b"), peers=("b",)),
             1,
-            "connected; b is no router: who connects here sees this robot only",
-            {"a": "connected", "b": "a peer, no router"},
+            "connected; b is not a router: clients that connect here see only this robot",
+            {"a": "connected", "b": "a peer, not a router"},
         ),
     ],
 )
@@ -695,7 +695,7 @@ DAY_NS = 86400 * 10**9
         (400, 0, "valid for 400 days"),
         (30, 0, "valid for 30 days"),
         (29, 1, "valid for 29 days"),
-        (-2, 2, "ended 2 days ago"),
+        (-2, 2, "expired 2 days ago"),
     ],
 )
 def test_a_certificate_that_ends_is_said_in_time(days: int, level: int, words: str) -> None:

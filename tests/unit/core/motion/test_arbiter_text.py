@@ -25,28 +25,28 @@ SENTENCES = [
     (
         Wait("neutral", "nav", 1.0, lasts=3.0, ros=True),
         "send a zero first: nav must send a zero before it can drive; it has sent speeds for over "
-        '3 s (`ros2 topic pub` of a speed sends none: "After a clear" in deploy/ros2/README.md has '
-        "tools that do)",
+        '3 s (`ros2 topic pub` of a speed never sends one; "After a clear" in '
+        "deploy/ros2/README.md lists tools that do)",
     ),
-    (Wait("zeros", "app", lasts=3.0), "held by app, which sends nothing but zeros for over 3 s"),
+    (Wait("zeros", "app", lasts=3.0), "held by app, which sends only zeros for over 3 s"),
     (
         Wait("zeros", "ros2_control", lasts=600.0, kept="nav"),
-        "held by ros2_control, which sends nothing but zeros for over 10 min; nav sends speeds "
-        "and is kept waiting",
+        "held by ros2_control, which sends only zeros for over 10 min; nav sends speeds "
+        "and must wait",
     ),
-    (Wait("zeros", "app", lasts=3600.0), "held by app, which sends nothing but zeros for over 1 h"),
+    (Wait("zeros", "app", lasts=3600.0), "held by app, which sends only zeros for over 1 h"),
     (
         Wait("proof", "high", 0.25),
-        "high is new here: it drives once its delays have been steady for 0.25 s",
+        "high is new: it drives once its delays have been steady for 0.25 s",
     ),
     (
         Wait("late", "high", 0.25),
-        "commands of high come too late, by more than 0.25 s: the network holds them up, or the "
-        "sender's clock was set; if this goes on, look at the network, then restart the sender",
+        "commands of high arrive more than 0.25 s too late: the network delays them, or the "
+        "sender's clock was set; if this goes on, check the network, then restart the sender",
     ),
-    (Wait("higher", "high"), "high has the higher priority: until it is silent"),
-    (Wait("equal", "right"), "right, of the same priority, came first: until it is silent"),
-    (Wait("senders", senders=15), "15 more of its senders: the first until it is silent"),
+    (Wait("higher", "high"), "high has priority: wait until it is silent"),
+    (Wait("equal", "right"), "right has the same priority and came first: wait until it is silent"),
+    (Wait("senders", senders=15), "15 more of its senders: wait until the first one is silent"),
 ]
 
 
@@ -66,7 +66,7 @@ def test_every_wait_has_its_sentence_above() -> None:
         (Choice(), "waiting for a command: no source has sent one within its timeout"),
         (
             Choice(wait=Wait("proof", "app", 2.0)),
-            "app is new here: it drives once its delays have been steady for 2 s",
+            "app is new: it drives once its delays have been steady for 2 s",
         ),
         (Choice("app", REST, Wait("nothing"), 1), "commanded by app"),
         (
@@ -81,4 +81,4 @@ def test_whose_command_is_followed_or_why_nobody_s_is_a_sentence(choice: Choice,
 
 def test_whatever_a_command_is_refused_for_is_said_in_words() -> None:
     assert {"", *REFUSED} == {*get_args(Objection)}
-    assert REFUSED["crowded"] == "16 other senders of this source are live"
+    assert REFUSED["crowded"] == "16 other senders of this source are active"

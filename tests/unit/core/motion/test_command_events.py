@@ -82,7 +82,7 @@ def test_who_is_held_up_by_zeros_is_told_once_however_often_he_pauses() -> None:
     assert zeros("") == []
     (event,) = zeros("nav")
     assert (event.name, event.by, event.kind) == ("kept_waiting", "app (joe)", "nav")
-    assert event.text.startswith("held by app, which sends nothing but zeros for over 3 s; nav")
+    assert event.text.startswith("held by app, which sends only zeros for over 3 s; nav")
     assert zeros("") + zeros("nav") == []
     assert [event.kind for event in zeros("teleop")] == ["teleop"]
 

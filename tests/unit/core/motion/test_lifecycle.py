@@ -211,7 +211,7 @@ def test_a_clear_without_a_number_is_refused_right_after_a_stop(since_s: float) 
     age = {0.1: "0.1", 0.4: "0.4", 1.999: "1.9"}[since_s]
     assert str(caught.value) == (
         f"the robot was stopped by ann {age} s ago: look at the robot, then call srv/clear again "
-        "2 s after that, or with the latch of the state that you have looked at"
+        "2 s after that, or with the number of the latch that you have seen"
     )
     assert mode(life) is Mode.STOPPED
 
@@ -253,8 +253,8 @@ def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
             life.clear(None, ns(asked_s), Instant(ns(11.5), WALL_NS + ns(wall_s)))
         assert str(caught.value) == (
             f"the daemon started {age} s ago and the robot is still stopped by ann: look at the "
-            "robot, then call srv/clear again 2 s after that, or with the latch of the state that "
-            "you have looked at"
+            "robot, then call srv/clear again 2 s after that, or with the number of the latch that "
+            "you have seen"
         )
     assert life.clear(None, ns(12.0), Instant(ns(12.0), WALL_NS + ns(wall_s)))
 
@@ -444,7 +444,7 @@ def test_an_activate_without_a_number_is_refused_right_after_a_deactivate(since_
         activate(life, 1.0 + since_s)
     assert str(caught.value) == (
         f"the robot was switched off by joe {age} s ago: look at the robot, then call srv/activate "
-        "again 2 s after that, or with the latch of the state that you have looked at"
+        "again 2 s after that, or with the number of the latch that you have seen"
     )
     assert mode(life) is Mode.INACTIVE
     assert activate(life, 1.0 + LOOK_FIRST_S)

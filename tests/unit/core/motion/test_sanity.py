@@ -328,7 +328,7 @@ def test_one_wheel_turned_by_hand_is_told_too() -> None:
     for step in range(30):
         assert not sanity.watch(STILL, only(2, -5.0 + step % 2), DT)
         told.append(sanity.turned)
-    assert "rad/s with nothing commanded" in next(filter(None, told))
+    assert "rad/s without a command" in next(filter(None, told))
 
 
 def test_one_and_the_same_speed_by_hand_is_not_a_stuck_encoder() -> None:

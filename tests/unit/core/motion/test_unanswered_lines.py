@@ -17,7 +17,7 @@ def told(every: int, windows: int = 3, period: float = 0.0, linked: bool = True)
 
 def test_a_fifth_lost_is_told_once_with_its_figures() -> None:
     (text,) = told(5)
-    assert f"of {WINDOW} lines {WINDOW * 4 // 5} were answered" in text
+    assert f"only {WINDOW * 4 // 5} of {WINDOW} lines were answered" in text
     assert "`acsard mcu check`" in text
 
 

@@ -199,7 +199,7 @@ def test_what_can_be_set_says_what_it_is_its_range_and_when() -> None:
     assert described("limits.linear_stop_deceleration", DOUBLE) == ParameterDescriptor(
         "limits.linear_stop_deceleration",
         DOUBLE,
-        "braking by a stop or a fault: a number from 0.01 to 100 m/s2",
+        "deceleration of a stop or a fault: a number from 0.01 to 100 m/s2",
         "lowered only while the robot stands",
         read_only=False,
         floating_point_range=[FloatingPointRange(0.01, 100.0, 0.0)],
@@ -210,8 +210,8 @@ def test_what_takes_a_start_is_read_only_and_says_so() -> None:
     assert described("mcu.encoder_counts", INTEGER) == ParameterDescriptor(
         "mcu.encoder_counts",
         INTEGER,
-        "a whole number from 0 to 100000 per wheel turn (0 = do not ask for them)",
-        "acsard.toml and a start",
+        "a whole number from 0 to 100000 per wheel turn (0 = ask the board for none)",
+        "only in acsard.toml, with a restart",
         integer_range=[IntegerRange(0, 100_000, 1)],
     )
 
@@ -228,7 +228,7 @@ def test_a_source_is_described_by_its_name() -> None:
 def test_a_choice_names_what_there_is() -> None:
     found = described("log.level", 4)
     assert found.description == (
-        'the least that the log tells: one of "debug", "error", "info", "warning"'
+        'lowest level that is logged: one of "debug", "error", "info", "warning"'
     )
 
 
