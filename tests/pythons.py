@@ -36,7 +36,9 @@ FULL = replace(
     odometry=replace(PLAIN.odometry, gyro=True),
 )
 
-VERDICT = re.compile(r"([\d ]+) of \1 lines the same, ([\d ]+) of \2 poses, ([\d ]+) of \3 modes$")
+VERDICT = re.compile(
+    r"([\d ]+) of \1 lines are the same, ([\d ]+) of \2 poses, ([\d ]+) of \3 modes$"
+)
 """The verdict when everything is the same to the last bit, not merely to the micrometre."""
 
 

@@ -115,8 +115,8 @@ def _own(state: RobotState) -> dict[str, Summary]:
 def _nothing_seen(sent: int, state: RobotState) -> ExitError:
     return ExitError(
         Exit.FAILURE,
-        f"none of the {sent} commands came out on the wire, so nothing was measured; the daemon "
-        f"says: {state.reason}",
+        f"none of the {sent} commands arrived at the port's far end, so nothing was measured; "
+        f"the daemon says: {state.reason}",
     )
 
 

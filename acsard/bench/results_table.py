@@ -16,15 +16,15 @@ from acsard.bench.matching import Summary
 from acsard.terminal.tables import table
 
 POINTS = {
-    "command_to_wire": "command put here -> first byte of its line at the port's far end",
-    "feedback_to_odometry": "feedback line's last byte handed over -> its odometry here",
+    "command_to_wire": "put() of a command here -> first byte of its line at the port's far end",
+    "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
 """The figures measured from outside, and their points; "here" is the benchmark's own process."""
 
 OWN = {
-    "period_lateness": "period due (of several missed, the first) -> its step",
-    "step_time": "start of a step -> its work done",
+    "period_lateness": "period due (the first one, if several were missed) -> its step",
+    "step_time": "start of a step -> end of its work",
     "command_age": "command arrived -> each line that follows it",
     "command_to_wire": "command arrived in its source's turn -> first line after it",
     "feedback_to_bus": "feedback line read -> its last message handed to the bus",

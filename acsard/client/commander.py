@@ -187,7 +187,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
     if state.mode == "waiting":
         return state.reason
     if not heard(state, source):
-        return f"the daemon hears no command of source {source}"
+        return f"the daemon receives no command of source {source}"
     if state.source != source:
         return ours.waits_for or state.reason
     # The robot is `ready`: the zeros of this client arrive, but they do not count.
@@ -195,7 +195,7 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         return state.reason
     if state.sender in ("", sender):
         return ""
-    return f"another program drives as {source}, {state.sender}: until it is silent"
+    return f"another program drives as {source}, {state.sender}: wait until it is silent"
 
 
 def heard(state: RobotState, source: str) -> bool:

@@ -65,7 +65,10 @@ def drive(
     """
     _require(linear=linear, angular=angular, seconds=seconds)
     if seconds <= 0:
-        raise UsageError(f"seconds = {seconds:g}: a drive takes a time above 0; back is linear < 0")
+        raise UsageError(
+            f"seconds = {seconds:g}: a drive needs a time above 0; to drive "
+            "backwards, use linear < 0"
+        )
     checks = _Drive(robot)
     try:
         # Send the zeros before each drive: since the last one, the robot may have been stopped and
@@ -88,7 +91,7 @@ def _require(**numbers: object) -> None:
         try:
             finite = isinstance(value, Real) and math.isfinite(value)
         except OverflowError:
-            raise UsageError(f"{name}: so large a number is no speed and no time") from None
+            raise UsageError(f"{name}: this number is too large for a speed or a time") from None
         if not finite:
             raise UsageError(f"{name} = {value!r}: it must be a finite number")
 
@@ -156,10 +159,10 @@ class _Drive:
                 self._fine = now
         if watch.silent(now):
             raise NoAnswerError(
-                "the daemon's state cannot be read: is it of another version?"
+                "the daemon's state cannot be read: does the daemon have another version?"
                 if watch.unreadable
-                else f"no word from the daemon for {watch.patience_s:g} s: does it run, with this "
-                "robot.id?"
+                else f"nothing received from the daemon for {watch.patience_s:g} s: does it run, "
+                "with this robot.id?"
             )
 
     def require(self, grace: float) -> None:

@@ -76,7 +76,7 @@ class Sensor:
         end = time.monotonic() + FIRST_S
         while not self.hear(lambda message, now: None, 0.0):
             if time.monotonic() > end:
-                raise GuideError(f"{what} does not come on {self.key}")
+                raise GuideError(f"{what} does not arrive on {self.key}")
             time.sleep(LOOK_S)
 
     def _decoded(self, sample: zenoh.Sample) -> Any:
@@ -89,7 +89,7 @@ class Sensor:
                 continue
             self._decoders = self._decoders[at : at + 1]
             return message
-        raise GuideError(f"what comes on {self.key} cannot be read: {'; '.join(errors)}")
+        raise GuideError(f"the messages on {self.key} cannot be read: {'; '.join(errors)}")
 
 
 class Robot:
@@ -129,7 +129,7 @@ class Robot:
             for _ in range(ZEROS):
                 self._client.send(0.0, 0.0)
         if riding.halted:
-            raise GuideError(f"{riding.halted}. Zero was commanded, and nothing is written")
+            raise GuideError(f"{riding.halted}. The tool commanded zero, and writes nothing")
         return recorder.run()
 
     def _drive(self, riding: Riding, recorder: Recorder) -> None:

@@ -108,7 +108,7 @@ def times(samples: Sequence[Sample]) -> Floats:
     return np.asarray(made + float(late.min()))
 
 
-HELD_UP = "this computer was too busy to run the calibration: end what else runs on it"
+HELD_UP = "this computer was too busy for the calibration: end the other programs on it"
 
 OBEYED_S = 1.5
 """Time allowed for the robot to follow a changed command, s. The ramp takes a part of it."""
@@ -154,7 +154,7 @@ class Riding:
         self._begun = self._heard = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
-        self._waits: str | None = "a daemon that hears us"
+        self._waits: str | None = "a daemon that receives our commands"
         self._another = ""
         """Another program that drives as our source, as a sentence, or ""."""
         self._still_since: float | None = None
@@ -220,7 +220,7 @@ class Riding:
         if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP)
         elif now - self._heard > QUIET_S:
-            self._halt("no word from the daemon" if held_up <= QUIET_S / 2 else HELD_UP)
+            self._halt("nothing received from the daemon" if held_up <= QUIET_S / 2 else HELD_UP)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:
@@ -234,14 +234,14 @@ class Riding:
         if passed >= OPENING_S and not self._waits:
             self.phase, self._ends = Phase.MOVING, now
         elif passed >= OPENED_S:
-            waits = f"the daemon does not take our commands: it waits for {self._waits}"
+            waits = f"the daemon does not accept our commands: it waits for {self._waits}"
             self._halt(self._another or waits)
 
     def _next(self, now: float) -> None:
         self._number += 1
         if self._number >= len(self._leg.moves):
             if self._leg.by_key:
-                self._halt("no key was pressed when the robot had come round")
+                self._halt("no key was pressed although the robot must have turned a full circle")
             else:
                 self._settle(now)
             return
@@ -259,7 +259,7 @@ class Riding:
         if self._still_since is not None and now - self._still_since >= STANDING_S:
             self.phase = Phase.DONE
         elif now - self._ends > STANDS_S:
-            self._halt("the wheels do not come to rest though zero is commanded")
+            self._halt("the wheels do not come to rest although zero is commanded")
 
     def _doubt(self, why: str, now: float) -> None:
         """Halt the leg if a deviation lasts for `DOUBT_S`.
@@ -281,7 +281,7 @@ class Riding:
         is not disobedience.
         """
         if waits := self._missing(state):
-            return f"the daemon does not follow us, it waits for {waits}"
+            return f"the daemon does not follow our commands: it waits for {waits}"
         if now - self._changed < OBEYED_S:
             return ""
         if not state.wheels:
@@ -296,8 +296,8 @@ class Riding:
         ):
             if abs(does - told) > off + OFF_SHARE * abs(told):
                 return (
-                    f"the wheels do {does:.2f} {unit} where {told:.2f} are commanded: another "
-                    "commander, a limit or an obstacle"
+                    f"the wheels turn at {does:.2f} {unit} although {told:.2f} is commanded: is "
+                    "there another commander, a limit or an obstacle?"
                 )
         return ""
 
@@ -305,8 +305,8 @@ class Riding:
         """Return whether another program drives as our source, for example a second calibration."""
         other = bool(self._sender) and state.sender not in ("", self._sender)
         self._another = (
-            f"another program drives the robot as {self._source}, {state.sender}: a calibration or "
-            "a client; end it, or wait until it is done"
+            f"another program drives the robot as {self._source}, {state.sender}: a calibration "
+            "or a client; end it, or wait until it is done"
             if other and state.source == self._source
             else ""
         )

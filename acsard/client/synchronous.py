@@ -288,7 +288,7 @@ class Client:
             if said == TIMED_OUT:
                 raise NoAnswerError(
                     f"no answer on {self.key(name)} within {REPLY_TIMEOUT_S:g} s: the daemon or "
-                    "the way to it is stuck; `acsard doctor` on the robot looks at it, or try again"
+                    "the network is stuck; try again, or run `acsard doctor` on the robot"
                 )
             # Repeat only queries. The effect of a service call may have been overruled by another
             # client since.
@@ -322,8 +322,8 @@ class Client:
         seen = around(self.session, self._id, self._endpoint)
         if seen is None or seen.here or not self._endpoint:
             return NoAnswerError(
-                f"{no_answer}; is the daemon of robot.id {self._id!r} stuck, or has it no such key "
-                "(`acsard topics`), and may you ask it?"
+                f"{no_answer}; is the daemon of robot.id {self._id!r} stuck, does it have this "
+                "key (`acsard topics`), and may you query it?"
             )
         return NoAnswerError(f"{no_answer}: {why_quiet(key, self._id, self._endpoint, seen)}")
 

@@ -75,7 +75,7 @@ class Watch(Follower):
     def objection(self, source: str, sender: str, now: float) -> str:
         """Return why commands have no effect, or "" if they have or no state has arrived yet."""
         if self.silent(now):
-            return "no word from the daemon: is it running?"
+            return "nothing received from the daemon: does it run?"
         return "" if self.state is None else objection(self.state, source, sender)
 
     def end(self) -> None:

@@ -52,7 +52,7 @@ FEEDBACK = ("odom", "tf", "wheel_states")
 QUERIES_PER_STEP = 8
 """Most queries that one step answers. The others wait, so that many of them cost no period."""
 
-BUS_STUCK = Event("bus_stuck", "the bus takes no messages; driving goes on", "warning")
+BUS_STUCK = Event("bus_stuck", "the bus accepts no messages; driving goes on", "warning")
 
 
 class ControlLoop:

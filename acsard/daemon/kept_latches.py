@@ -67,7 +67,7 @@ def decode(robot: str, data: bytes) -> Latches:
         number = raw.get("format") if isinstance(raw, dict) else None
         if type(number) is int and number != FORMAT:
             raise LatchFileError(
-                f"it is of another version (format {number}, and this daemon reads {FORMAT})"
+                f"it is of another version (format {number}, but this daemon reads {FORMAT})"
             )
         content = msgspec.convert(raw, _Content)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

@@ -150,7 +150,7 @@ class LatchFile:
         try:
             thread.start()
         except RuntimeError as error:
-            self._fail(f"this process has no room for another thread ({error})")
+            self._fail(f"this process cannot start another thread ({error})")
             return stopped(latches, at_start(unwritable(self.where, self._failed)), now)
         self._thread = thread
         return latches
@@ -199,8 +199,9 @@ class LatchFile:
         except BlockingIOError:
             os.close(lock)
             self._barred = (
-                f"another daemon keeps the stop of robot {self._robot} in {path}; end it, or give "
-                "this robot an id (robot.id) or a directory (control.state_directory) of its own"
+                f"another daemon stores the stop of robot {self._robot} in {path}; end that "
+                "daemon, or give this robot its own id (robot.id) or its own directory "
+                "(control.state_directory)"
             )
             raise InUseError(self._barred) from None
         except OSError:
@@ -366,7 +367,7 @@ class LatchFile:
 
     def _fail(self, reason: str) -> None:
         self._failed = reason
-        text = f"{unwritable(self.where, reason)}; it is tried again every {RETRY_S:g} s"
+        text = f"{unwritable(self.where, reason)}; the daemon tries again every {RETRY_S:g} s"
         self._news.append(Event("latch_file", text, "warning"))
 
     def _recover(self) -> None:

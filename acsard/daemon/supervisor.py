@@ -51,7 +51,7 @@ class Kind(Struct, frozen=True):
     """Seconds before it is started again."""
 
 
-DOOR = Kind("the door to the network", "door_ended")
+DOOR = Kind("the TLS gateway", "door_ended")
 """The gateway is always started again: the robot drives on, and an operator may fix its files
 meanwhile."""
 
@@ -85,7 +85,7 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Ki
                 return code
         finally:
             door.let_go()
-        log(Event(kind.ended, f"{kind.name} {why}; it is opened anew", "warning"))
+        log(Event(kind.ended, f"{kind.name} {why}; it is restarted", "warning"))
         await asyncio.sleep(kind.again_s if code <= Exit.FAILURE else LATER_S)
 
 
@@ -133,7 +133,7 @@ class _Door:
                 heard, silence = True, Silence(SILENT_NS)
             now_ns = clock.mono_ns()
             if silence.too_long(bool(said), now_ns - before_ns):
-                self.silent = "did not say any more that it is alive (stopped, or hung): ended"
+                self.silent = "no longer reported that it is alive (stopped or hung), and was ended"
                 return True
             before_ns = now_ns
 

@@ -35,7 +35,11 @@ def link(running: Running) -> Iterator[Finding]:
     mend = check(running)
     if state.link != "up":
         if state.link == "down":
-            mend = "see the port above" if running.here else "`acsard doctor` there: its port"
+            mend = (
+                "see the port above"
+                if running.here
+                else "run `acsard doctor` on that machine, which checks its port"
+            )
         if config.mcu.simulated or is_ours(state.reason):
             mend = BUSY
         text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
@@ -70,8 +74,8 @@ def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     if config.mcu.reply_period or sent < ENOUGH or came >= (1 - LOST) * sent - 1:
         return
     yield (
-        f"of {sent} lines that were sent in a second {came} were answered: the others are lost on "
-        "the way there or back, or it reports by its own clock"
+        f"only {came} of {sent} lines that were sent in a second were answered: the others are "
+        "lost on the way there or back, or the board reports by its own clock"
     )
 
 
@@ -85,14 +89,14 @@ def refused(counters: Mapping[str, int]) -> list[str]:
     if sum(kinds.values()) <= LOST * max(1, counters.get("lines", 0)):
         return []
     told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
-    return [f"lines of the microcontroller that did not count: {told}"]
+    return [f"lines of the microcontroller that were rejected: {told}"]
 
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return the number of lost links that this computer did not cause, with a description."""
     times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
     text = (
-        f"it was lost {many(times, 'time')} since the daemon's start: the board starts anew, is "
+        f"it was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
         "silent at times or was unplugged; the log says when (link_stale, link_down)"
     )
     return [(times, text)] if times > 0 else []
@@ -102,8 +106,8 @@ def check(running: Running) -> str:
     """Return the command that examines the board more closely, and its preconditions."""
     port = running.config.mcu.port
     return (
-        f"`acsard mcu check --port {port}` finds out why, wheels lifted; stop the daemon first: "
-        f"systemctl stop acsard, or kill {running.info.pid}"
+        f"`acsard mcu check --port {port}` finds the cause, with the wheels lifted; stop the "
+        f"daemon first: systemctl stop acsard, or kill {running.info.pid}"
     )
 
 
@@ -117,34 +121,37 @@ GYRO_MENDS = {
     "used": "",
     "waiting for rest": "",
     "silent": "is its driver running, and does it send to the key imu (ROS: imu/data)?",
-    "disagrees": "slower turns, other ground; if it stays so: its z must point up, in rad/s",
-    "not believed": "its z must point up, in rad/s; then `acsard calibrate` finds the track",
+    "disagrees": "turn more slowly, or drive on other ground; if that does not help, check that "
+    "its z axis points up and that it sends rad/s",
+    "not believed": "check that its z axis points up and that it sends rad/s; then `acsard "
+    "calibrate` measures the track width",
 }
 """Remedy for each gyro status in `state`; "" if the status is good."""
 
 START = (
-    "systemctl status acsard; or start it: acsard run; one that was started with --listen is asked "
-    "by --connect and what that says"
+    "see systemctl status acsard; or start the daemon: acsard run; if it was started with "
+    "--listen, name that address with --connect"
 )
 
 ANOTHER = (
-    "one with another id is asked by --id (`acsard fleet` shows who is there); or is another "
-    "program on that port?"
+    "select a daemon with another id with --id (`acsard fleet` lists the robots); or does "
+    "another program use that port?"
 )
 
 ROUTER = "acsard: router"
 LOOP = "acsard: control loop"
 """Names of rows in the daemon's diagnostics."""
 
-SIGN = "commands signed as the README says need no common clock"
+SIGN = "commands signed as the README describes need no common clock"
 
 
 START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon connects by itself"
 
 
 PUT_ROUTER = (
-    "robots that are joined directly hand on nothing: `acsard fleet` and `acsard call stop --id "
-    "'*'` miss the others; a router that all connect to mends that (deploy/zenoh/README.md)"
+    "daemons that are connected directly forward no messages: `acsard fleet` and `acsard call "
+    "stop --id '*'` miss the others; a router between all of them solves that "
+    "(deploy/zenoh/README.md)"
 )
 
 
@@ -152,10 +159,13 @@ def routers(config: Config) -> Iterator[Finding]:
     """Yield findings about the routers: whether they listen, and which rights they pass on."""
     for endpoint in config.bus.connect:
         if not answers(endpoint):
-            yield Finding("router", "warning", f"nobody listens at {endpoint}", START_ROUTER)
+            yield Finding("router", "warning", f"no program listens at {endpoint}", START_ROUTER)
         if endpoint.startswith("tls/"):
             continue
-        text = f"connects to {endpoint}: everyone behind that router has the rights of this machine"
+        text = (
+            f"connects to {endpoint}: every program behind that router has the rights of this "
+            "machine"
+        )
         yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
 
 
@@ -167,16 +177,19 @@ def found(config: Config, address: Address) -> Running | Finding:
     endpoint = address.endpoint
     if not answers(endpoint):
         if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
-            text = f"cannot be asked: the router at {endpoint}, by which it is reached, is missing"
-            mend = "the router first; see `systemctl status acsard`"
+            text = (
+                f"cannot be asked: the router at {endpoint} is missing, and the daemon is "
+                "reached through it"
+            )
+            mend = "start the router first; see `systemctl status acsard`"
             return Finding("daemon", "warning", text, mend)
-        return Finding("daemon", "warning", f"nobody listens at {endpoint}", START)
+        return Finding("daemon", "warning", f"no program listens at {endpoint}", START)
     try:
         return asked(config, address)
     except NoAnswerError as error:
         return Finding("daemon", "failure", str(error), ANOTHER)
     except AcsardError as error:
-        return Finding("daemon", "failure", str(error), "is another program on that port?")
+        return Finding("daemon", "failure", str(error), "does another program use that port?")
 
 
 def daemon(running: Running) -> Iterator[Finding]:
@@ -191,8 +204,13 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from gyro(state.gyro, state.counters)
     yield from linked({row.name: row for row in running.rows})
     if state.counters.get("door_crowded"):
-        text = "all connections from the network were taken at times: the log says by whom"
-        yield Finding("door", "warning", text, "take his certificate from [access], or his program")
+        text = "clients from the network took all connections at times: the log names them"
+        yield Finding(
+            "door",
+            "warning",
+            text,
+            "remove the client's certificate from [access], or end its program",
+        )
     yield from latch_file(state.latch_file)
     yield from late(running)
 
@@ -200,7 +218,7 @@ def daemon(running: Running) -> Iterator[Finding]:
 def latch_file(trouble: str) -> Iterator[Finding]:
     """Report that a stop would be lost at a restart, if it would."""
     if trouble:
-        mend = "free the disk, or name a directory that can be written: control.state_directory"
+        mend = "free disk space, or name a writable directory: control.state_directory"
         yield Finding("latch file", "warning", trouble, mend)
 
 
@@ -215,7 +233,7 @@ def late(running: Running) -> Iterator[Finding]:
     if missed > 0.01 * max(1, lines):
         told = [f"missed {missed} control periods"]
     for text in told:
-        mend = "what else runs here? `top`; the service runs real-time"
+        mend = "which other program uses the processor? `top` shows it; the service runs real-time"
         yield Finding("daemon", "warning", text, mend)
 
 
@@ -248,7 +266,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
         most = sorted(refused.items(), key=lambda one: -one[1])
         told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
         mend = "the log says by whom (imu_refused); one gyro, rad/s, z up, finite values"
-        yield Finding("gyro", "warning", f"samples on imu that did not count: {told}", mend)
+        yield Finding("gyro", "warning", f"samples on imu that were rejected: {told}", mend)
 
 
 def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
@@ -267,5 +285,5 @@ def door(config: Config) -> Iterator[Finding]:
         if answers(endpoint):
             yield Finding("door", "ok", f"open at {endpoint}")
         else:
-            mend = "systemctl status acsard-door; `acsard run` opens one by itself"
-            yield Finding("door", "warning", f"nobody listens at {endpoint}", mend)
+            mend = "see systemctl status acsard-door; `acsard run` starts one by itself"
+            yield Finding("door", "warning", f"no program listens at {endpoint}", mend)

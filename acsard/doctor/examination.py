@@ -45,10 +45,17 @@ def certificates(tls: str) -> Iterator[Finding]:
     for name in (CA, CERTIFICATE, KEY):
         file = directory / name
         if not os.access(file, os.R_OK):
-            text = f"{file} is missing or not yours to read"
-            yield Finding("certificates", "failure", text, "`sudo acsard lan init`, or sudo doctor")
+            text = f"{file} is missing, or you may not read it"
+            yield Finding(
+                "certificates",
+                "failure",
+                text,
+                "run `sudo acsard lan init`, or this command with sudo",
+            )
         elif name == KEY and file.stat().st_mode & 0o077:
-            yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
+            yield Finding(
+                "certificates", "failure", f"other users may read {file}", f"chmod 600 {file}"
+            )
     try:
         require_usable(tls)
     except MendableError as error:
@@ -56,13 +63,16 @@ def certificates(tls: str) -> Iterator[Finding]:
         return
     ends = ends_ns(tls)
     level, words = expiry(ends, now().wall_ns)
-    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
+    mend = "run `acsard lan renew`, or in a fleet `lan add`, where ca-key.pem is"
     if ends is None:
-        mend = f"{install('lan')}, to have it read"
+        mend = f"run {install('lan')}, to read the certificate"
     yield Finding("certificates", LEVELS[level], words, mend if level else "")
 
 
-REAL = "run it as the service (deploy/systemd), which has it; without, load adds lateness"
+REAL = (
+    "run the daemon as the service (deploy/systemd), which has it; without it, load makes "
+    "the daemon late"
+)
 
 LEAST_YEAR = 2026
 """Year before which a clock was never set. Boards without a battery start in the past."""
@@ -71,18 +81,21 @@ LEAST_YEAR = 2026
 def meddlers() -> Iterator[Finding]:
     """Yield findings about programs that take or disturb serial ports."""
     if running("brltty"):
-        mend = "sudo apt remove brltty, unless you read Braille: it takes CH340 and FTDI ports"
+        mend = (
+            "sudo apt remove brltty, unless you use a Braille display: it takes CH340 and "
+            "FTDI ports"
+        )
         yield Finding("brltty", "failure", "runs", mend)
     if running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
-        mend = "install deploy/udev/70-acsar.rules (`acsard service install` does)"
-        yield Finding("ModemManager", "warning", "runs, and talks to new serial ports", mend)
+        mend = "install deploy/udev/70-acsar.rules (`acsard service install` does that)"
+        yield Finding("ModemManager", "warning", "runs, and sends data to new serial ports", mend)
 
 
 def clock_set() -> Iterator[Finding]:
     """Yield a finding about the wall clock, which the stamps depend on."""
     year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
     if year < LEAST_YEAR:
-        mend = "set it (timedatectl), or let chrony do; odometry stamps are wall-clock times"
+        mend = "set it (timedatectl), or let chrony set it; odometry stamps are wall-clock times"
         yield Finding("clock", "warning", f"stands in {year}", mend)
     else:
         yield Finding("clock", "ok", f"stands in {year}")
@@ -98,15 +111,15 @@ def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
     """
     has = None if pid is None else real_time.has(pid)
     if not wanted:
-        yield Finding("real time", "ok", "is not asked for (control.real_time = false)")
+        yield Finding("real time", "ok", "is not requested (control.real_time = false)")
     elif has:
         yield Finding("real time", "ok", f"the daemon that runs (pid {pid}) has it")
     elif has is False:
         yield Finding("real time", "warning", f"the daemon that runs (pid {pid}) has none", REAL)
     elif real_time.allowed():
-        yield Finding("real time", "ok", "may be asked for")
+        yield Finding("real time", "ok", "is permitted")
     else:
-        yield Finding("real time", "warning", "is not allowed for you", REAL)
+        yield Finding("real time", "warning", "is not permitted for this user", REAL)
 
 
 def serial_port(config: Config) -> Iterator[Finding]:
@@ -117,18 +130,20 @@ def serial_port(config: Config) -> Iterator[Finding]:
         yield Finding("port", "warning", "the built-in simulator: no robot will move", mend)
         return
     if not os.path.exists(path):
-        seen = ", ".join(port.device for port in serial_devices()) or "none at all"
-        mend = "plug it in; by-id names outlive replugging (`acsard ports`)"
-        yield Finding("port", "failure", f"{path} is not there; there are: {seen}", mend)
+        seen = ", ".join(port.device for port in serial_devices()) or "none"
+        mend = (
+            "plug it in; names in by-id stay the same when it is plugged in again (`acsard ports`)"
+        )
+        yield Finding("port", "failure", f"{path} does not exist; the ports are: {seen}", mend)
         return
     if not stat.S_ISCHR(os.stat(path).st_mode):
-        yield Finding("port", "failure", f"{path} is no serial device", "see `acsard ports`")
+        yield Finding("port", "failure", f"{path} is not a serial device", "see `acsard ports`")
         return
     yield _permission(path)
     for holder in holders(path):
         level: Level = "ok" if holder.name == "acsard" else "failure"
-        mend = "" if level == "ok" else f"end it: kill {holder.pid}; or let it use another port"
-        text = f"{path} is held by {holder.name} (pid {holder.pid})"
+        mend = "" if level == "ok" else f"end it: kill {holder.pid}; or make it use another port"
+        text = f"{path} is in use by {holder.name} (pid {holder.pid})"
         yield Finding("port", level, text, mend)
     yield from _hardware(Path(os.path.realpath(path)).name)
 
@@ -138,11 +153,11 @@ def _hardware(name: str) -> Iterator[Finding]:
     usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
     if usb and usb[0].usb_id and not usb[0].board:
         known = ", ".join(sorted(BOARDS))
-        text = f"{usb[0].usb_id} is none of the usual boards ({known})"
+        text = f"{usb[0].usb_id} is not one of the common boards ({known})"
         yield Finding("port", "warning", text, "add it to 70-acsar.rules if it is your MCU")
     timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
     if timer.is_file() and timer.read_text().strip() != "1":
-        text = f"its FTDI chip holds bytes back for {timer.read_text().strip()} ms"
+        text = f"its FTDI chip delays bytes by {timer.read_text().strip()} ms"
         yield Finding("port", "warning", text, f"install 70-acsar.rules, or: echo 1 > {timer}")
 
 
@@ -150,8 +165,10 @@ def _permission(path: str) -> Finding:
     if os.access(path, os.R_OK | os.W_OK):
         return Finding("port", "ok", f"{path} may be read and written")
     group = _group_of(os.stat(path).st_gid)
-    mend = f"sudo usermod -aG {group} $USER, then log in anew (the service has the group itself)"
-    return Finding("port", "failure", f"{path} belongs to group {group}; you do not", mend)
+    mend = f"sudo usermod -aG {group} $USER, then log in again (the service has the group itself)"
+    return Finding(
+        "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
+    )
 
 
 def _group_of(number: int) -> str:
@@ -187,8 +204,10 @@ def examine(
     address, written = told(config), ""
     running = found(config, address)
     if isinstance(running, Running) and not running.here:
-        elsewhere = f"runs on another machine (its pid {running.info.pid} is none of acsard's here)"
-        yield Finding("daemon", "ok", f"{elsewhere}: its port, files and door are looked at there")
+        elsewhere = (
+            f"runs on another machine (its pid {running.info.pid} is not an acsard process here)"
+        )
+        yield Finding("daemon", "ok", f"{elsewhere}: check its port, files and TLS gateway there")
         yield from certificates(address.tls)
         yield from daemon(running)
         return

@@ -48,13 +48,14 @@ WAYS: tuple[tuple[Callable[[str], bool], Level, str, str], ...] = (
         lambda key: key not in OPTIONS and live(key) is None,
         "warning",
         "by its environment, or the file has changed since",
-        "what follows is of the daemon; write its values into the file, or start it anew",
+        "the following is about the running daemon; write its values into the file, or restart it",
     ),
     (
         lambda key: live(key) is not None,
         "warning",
         "set while it ran, or the file has changed since",
-        "its next start has the file's; `acsard set KEY VALUE --write` puts one into the file",
+        "its next start uses the file's values; `acsard set KEY VALUE --write` writes one into "
+        "the file",
     ),
 )
 """Reasons for a value that differs from the file's, by its key, and the remedy."""
@@ -137,14 +138,14 @@ def compared(running: Running, file: Config) -> Iterator[Finding]:
     info, others = running.info, differences(running.config, file)
     who = f"acsard {info.version}, pid {info.pid}"
     if not others:
-        yield Finding("configuration", "ok", f"the daemon that runs ({who}) has it")
+        yield Finding("configuration", "ok", f"the running daemon ({who}) has it")
         return
     for belongs, level, how, mend in WAYS:
         its = {key: one for key, one in others.items() if belongs(key)}
         if not its:
             continue
         told = [one.words(key) for key, one in its.items()]
-        text = f"the daemon that runs ({who}) has other values ({how}): "
+        text = f"the running daemon ({who}) has other values ({how}): "
         text += listed(told, SHOWN, "; ")
         mend = mend.format(which="them" if len(its) > 1 else "it", lines=_tables(its))
         yield Finding("configuration", level, text, mend)

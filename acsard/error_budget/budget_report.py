@@ -12,26 +12,26 @@ from acsard.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.terminal.tables import table
 
 MEANING: dict[Cause, str] = {
-    "time": "when each line was made",
-    "quantisation": "what a line rounds away",
-    "gaps": "driven while no lines came",
+    "time": "errors in the times of the lines",
+    "quantisation": "rounding of the values in a line",
+    "gaps": "distance driven while no lines came",
     "slip": "wheels that skid",
     "parameters": "wheel radii and track",
     "gyro": "bias, noise and scale of the gyro",
 }
 
 MENDS: dict[Cause, str] = {
-    "time": "lines are late by {late:.1f} ms: set the adapter's latency_timer to 1 (the udev rules "
-    "do), or let the lines carry the microcontroller's clock and counts (mcu.link_check, "
-    "mcu.encoder_counts)",
-    "gaps": "{missing} lines did not come and {unseen:.2f} s of driving were not seen: look for a "
-    "loose cable, noise on the wire or a busy machine (`acsard top`), or let the lines carry "
-    "counts, which lose no way (mcu.link_check, mcu.encoder_counts)",
-    "slip": "drive on other ground or turn less on the spot; a gyro sees what skidding wheels do "
-    "not ([odometry] gyro)",
+    "time": "lines are late by {late:.1f} ms: set the adapter's latency_timer to 1 (the udev "
+    "rules do that), or let the lines carry the microcontroller's clock and counts "
+    "(mcu.link_check, mcu.encoder_counts)",
+    "gaps": "{missing} lines were lost, so {unseen:.2f} s of driving were not measured: look "
+    "for a loose cable, noise on the wire or a busy machine (`acsard top`), or let the "
+    "lines carry counts, which lose no distance (mcu.link_check, mcu.encoder_counts)",
+    "slip": "drive on other ground or turn less on the spot; a gyro measures turns that "
+    "skidding wheels do not show ([odometry] gyro)",
     "parameters": "run `acsard calibrate`: it measures wheel radii and effective track",
     "gyro": "let the robot stand for a second now and then, so that it learns the gyro's bias",
-}  # fmt: skip
+}
 
 TOLD: dict[Basis, str] = {
     "measured": "what came",
@@ -40,8 +40,8 @@ TOLD: dict[Basis, str] = {
 }
 
 CALIBRATE = (
-    "how wrong wheel radii and track are is not known, and on wheels that skid it is mostly the "
-    "largest of all: run `acsard calibrate`"
+    "the error of wheel radii and track width is unknown, and on wheels that skid it is mostly "
+    "the largest: run `acsard calibrate`"
 )
 """Advice while the robot is not calibrated."""
 
@@ -61,11 +61,13 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 def advice(budget: Budget) -> str:
     """Return advice on the largest measured share, and on a declared one that is larger."""
     if budget.still:
-        return "drive it, also around curves, while this looks: most causes show only then"
+        return (
+            "drive the robot, also around curves, while this measures: most causes show only then"
+        )
     seen, all_ = budget.largest("measured"), budget.largest("measured", "settings")
     told = [] if seen is None else [f"the largest is {seen.cause}: {_mend(seen, budget)}"]
     if seen is not all_ and all_ is not None:
-        told = [f"of what was measured {one}" for one in told]
+        told = [f"of the measured causes {one}" for one in told]
         told.insert(0, f"[odometry] declares {all_.cause} the largest: {_mend(all_, budget)}")
     if any(one.cause == "parameters" and one.basis == "unknown" for one in budget.shares):
         told.insert(0, CALIBRATE)
@@ -76,15 +78,16 @@ def _driven(budget: Budget) -> str:
     missing = f" ({budget.missing} missing)" if budget.missing else ""
     return (
         f"{budget.seconds:.1f} s, {budget.metres:.2f} m, {budget.turned:.0f} deg turned, "
-        f"{budget.lines} lines{missing}; heading by the {'gyro' if budget.gyro else 'wheels'}. "
-        "If it is driven on like this, each cause alone makes:"
+        f"{budget.lines} lines{missing}; heading from the "
+        f"{('gyro' if budget.gyro else 'wheels')}. If the drive goes on like this, each cause "
+        "alone makes:"
     )
 
 
 def _table(budget: Budget) -> Table:
     known = [(s.cause, s.mm_per_100_m, s.deg_per_turn, MEANING[s.cause], TOLD[s.basis])
              for s in budget.shares]  # fmt: skip
-    total = ("all", *budget.total(), "the root of their squares", "")
+    total = ("all", *budget.total(), "root of the sum of their squares", "")
     rows = [
         (name, _number(mm, 0), _number(deg, 2), *told) for name, mm, deg, *told in [*known, total]
     ]
@@ -95,14 +98,15 @@ def _track(budget: Budget, learned: float) -> str:
     implied = f"{learned:.3f} (standard deviation {budget.learned_std:.3f})"
     if budget.learned_used:
         return (
-            f"By the gyro drive.wheel_separation_multiplier is {implied}, which is in use where "
-            f"the wheels alone tell the turn; configured is {budget.multiplier:.3f}."
+            f"By the gyro drive.wheel_separation_multiplier is {implied}. This value is used "
+            "while only the wheels measure the turn; the configured value is "
+            f"{budget.multiplier:.3f}."
         )
     return (
-        f"By the gyro drive.wheel_separation_multiplier would be {implied}; configured, and in "
-        f"use, is {budget.multiplier:.3f}. Where both differ on the ground that matters, `acsard "
-        "calibrate` measures it; [odometry] learned_track uses what is learned while the gyro is "
-        "silent."
+        f"By the gyro drive.wheel_separation_multiplier would be {implied}; the configured "
+        f"value, which is used, is {budget.multiplier:.3f}. If both differ on the ground that "
+        "matters, `acsard calibrate` measures it; [odometry] learned_track uses the learned "
+        "value while the gyro is silent."
     )
 
 
@@ -110,9 +114,9 @@ def _standing(budget: Budget) -> str:
     along, turning = budget.at_rest
     counts = budget.counts
     return (
-        f"it stands still ({budget.lines} lines in {budget.seconds:.1f} s): of errors of driving "
-        "nothing can be seen. By the settings two decimals of rad/s leave each line uncertain by "
-        f"{1e3 * along:.2f} mm/s and {1e3 * turning:.1f} mrad/s, "
+        f"the robot stands still ({budget.lines} lines in {budget.seconds:.1f} s), so errors of "
+        "driving cannot be measured. By the settings, two decimals of rad/s leave each line "
+        f"uncertain by {1000.0 * along:.2f} mm/s and {1000.0 * turning:.1f} mrad/s, "
         + (f"the encoders have {counts} counts" if counts else "the encoders' counts are not known")
         + f"; {_declared(budget)}"
     )
@@ -143,5 +147,7 @@ def _mend(share: Share, budget: Budget) -> str:
             late=1e3 * budget.lateness, missing=budget.missing, unseen=budget.unseen
         )
     if 0 < budget.counts <= COARSE_COUNTS:
-        return f"the encoders have {budget.counts} counts a turn: finer ones, on the motor's shaft"
-    return "two decimals are all a plain line has: let the lines carry counts (mcu.link_check)"
+        return (
+            f"the encoders have {budget.counts} counts a turn: use finer ones, on the motor's shaft"
+        )
+    return "a plain line has only two decimals: let the lines carry counts (mcu.link_check)"

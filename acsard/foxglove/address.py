@@ -20,13 +20,13 @@ def loopback(text: str) -> tuple[str, int]:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)
         port = int(digits)
     except ValueError:
-        raise UsageError(f"{text} is no address: write it like {DEFAULT}") from None
+        raise UsageError(f"{text} is not an address: write it like {DEFAULT}") from None
     if not 0 < port < 65536:
         raise UsageError(f"{text}: a port is a number from 1 to 65535")
     if not address.is_loopback:
         raise UsageError(
-            f"{text} would be reached from the network, and this protocol asks nobody who he is: "
-            f"whoever connects may drive. Listen on {DEFAULT} and, from the other machine, "
-            f"tunnel: ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
+            f"other machines could reach {text}, but this protocol has no authentication: every "
+            f"client that connects could drive. Listen on {DEFAULT} and, on the other machine, "
+            f"open a tunnel: ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
         )
     return str(address), port

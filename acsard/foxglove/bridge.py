@@ -131,7 +131,7 @@ class Bridge:
         self._notices.send(self._server, self._relay.log, newcomers=bool(fresh))
 
     def _went(self) -> bool:
-        words = f"the daemon of {self._id} is gone: it is waited for"
+        words = f"the daemon of {self._id} is gone; this bridge waits for it"
         self._notices.say("error", "daemon", words, stays=GONE)
         return True
 

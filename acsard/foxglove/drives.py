@@ -32,12 +32,12 @@ SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
 the commander, none longer than `SLOW_NS`."""
 
 TOO_SLOW = (
-    "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 Hz "
-    "or more"
+    "the panel publishes so seldom that the robot stops in between: set its publish rate to 10 "
+    "Hz or more"
 )
 
 
-LOST = "the bus takes no commands: what a panel publishes is lost until it does"
+LOST = "the bus accepts no commands: all commands of a panel are lost until it does"
 
 
 class Viewer:
@@ -82,7 +82,7 @@ class Drives:
         """Register a channel. If it cannot drive, the viewer learns why when it publishes."""
         found, problem = "", ""
         if topic != self.topic:
-            problem = f"nothing listens on {topic}: drive on {self.topic}"
+            problem = f"no program listens on {topic}: drive on {self.topic}"
         else:
             try:
                 found = encoding_of(encoding, schema_name)

@@ -14,8 +14,8 @@ from acsard.core.ros.transports import left_out
 from acsard.host.errors import ReplyError
 
 DEAF = (
-    "what the sources command (/cmd_vel_in/…) is told to nobody who comes by TLS: see it with "
-    "`acsard foxglove` at the robot, or later by `acsard log export`"
+    "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): see them with "
+    "`acsard foxglove` on the robot, or later with `acsard log export`"
 )
 
 
@@ -66,6 +66,6 @@ def learn(robot: Client, tls: str) -> Facts:
         config = Config() if tables is None else from_builtins(tables)
     except (DecodeError, msgspec.ValidationError) as error:
         raise ReplyError(
-            f"cannot read what the robot says ({error}); is the daemon of another version?"
+            f"cannot read the robot's state ({error}); does the daemon have another version?"
         ) from None
     return Facts(config, tables, sources, forbidden, deaf)

@@ -24,8 +24,8 @@ BACKLOG = 256
 """Maximum number of waiting messages for a slow viewer; the oldest are dropped."""
 
 REFUSED = (
-    "a viewer was turned away: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 does "
-    "not), or is none"
+    "a client was refused: it does not speak foxglove.sdk.v1 (Lichtblick before 2026 does not), "
+    "or is not a Foxglove viewer"
 )
 
 
@@ -143,8 +143,8 @@ def start(
                 f"you may not listen on {host}:{port}; take a port above 1023: {another}"
             ) from None
         raise InUseError(
-            f"cannot listen on {host}:{port}: {error}; stop who does (another acsard foxglove, or "
-            f"foxglove_bridge?), or give this one another port: {another}"
+            f"cannot listen on {host}:{port}: {error}; stop the program that uses it (another "
+            f"acsard foxglove, or foxglove_bridge?), or use another port: {another}"
         ) from None
 
 

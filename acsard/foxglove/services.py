@@ -56,7 +56,7 @@ def called(robot: Client, verb: str, payload: bytes) -> ServiceReply:
             fields = msgspec.structs.asdict(_poses.decode("application/json", payload))
         return robot.call(verb, **fields)
     except DecodeError as error:
-        return ServiceReply(False, f"{verb} wants {{x, y, yaw}}, m and rad: {error}")
+        return ServiceReply(False, f"{verb} needs {{x, y, yaw}}, m and rad: {error}")
     except AcsardError as error:
         return ServiceReply(False, str(error))
 

@@ -22,12 +22,12 @@ def encoding_of(encoding: str, schema_name: str) -> str:
     package, _, name = schema_name.partition("/")
     full = f"{package}/msg/{name.removeprefix('msg/')}"
     if full not in (TWISTS[0], STAMPED_TWISTS[0]):
-        raise DecodeError("wrong_type", f"{schema_name or 'no type'} where {TWISTS[0]} is wanted")
+        raise DecodeError("wrong_type", f"{schema_name or 'no type'}, but {TWISTS[0]} is needed")
     if encoding == "cdr":
         return f"{encoding_name('cdr')};{full}"
     if encoding == "json":
         return encoding_name("json")
-    raise DecodeError("unknown_encoding", f"{encoding} where json or cdr is wanted")
+    raise DecodeError("unknown_encoding", f"{encoding}, but json or cdr is needed")
 
 
 def wish(encoding: str, payload: bytes) -> Wish:

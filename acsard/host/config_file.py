@@ -46,9 +46,9 @@ def writable(path: str | None) -> Path:
     if not text and not Path(where).is_file():
         raise ExitError(
             Exit.FAILURE,
-            "--write has no configuration file to write to: on the robot, name it by --config, or "
-            "make an acsard.toml there (an empty one is valid); a file on another machine changes "
-            "nothing for the robot",
+            "--write has no configuration file to change: run it on the robot, and name the "
+            "file with --config or make an acsard.toml there (it may be empty); a file on "
+            "another machine changes nothing on the robot",
         )
     return Path(where)
 
@@ -107,4 +107,4 @@ def _changed(
 
 
 def _left(file: Path, error: Exception) -> ExitError:
-    return ExitError(Exit.FAILURE, f"{file} is left as it was: {error}; write the lines by hand")
+    return ExitError(Exit.FAILURE, f"{file} was not changed: {error}; write the lines by hand")

@@ -102,7 +102,7 @@ class RemoveAll(Struct, frozen=True):
     path: Path
 
     def __str__(self) -> str:
-        return f"remove  {self.path}" + ("/ and all in it" if self.path.is_dir() else "")
+        return f"remove  {self.path}" + ("/ and everything in it" if self.path.is_dir() else "")
 
     def do(self) -> None:
         """Remove the file or the directory."""
@@ -154,5 +154,5 @@ Step = Write | Remove | RemoveAll | Keep | Run
 
 def _unreadable(path: Path, error: OSError) -> MendableError:
     if isinstance(error, PermissionError):
-        return NotPermittedError(f"no permission to read {path}; run it by sudo")
-    return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; look what it is")
+        return NotPermittedError(f"no permission to read {path}; run it with sudo")
+    return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; check the file")

@@ -40,9 +40,9 @@ def ask() -> str:
     if not refused:
         return ""
     return (
-        f"no permission for {', '.join(refused)}: a period or a command can be late; the service "
-        "(acsard service install) has it, or give the user rtprio 10 and memlock unlimited in "
-        "/etc/security/limits.conf, or set control.real_time = false to do without"
+        f"no permission for {', '.join(refused)}, so a period or a command can be late; run the "
+        "service, which has it (acsard service install), or give the user rtprio 10 and memlock "
+        "unlimited in /etc/security/limits.conf, or set control.real_time = false"
     )
 
 

@@ -36,29 +36,31 @@ def misplaced(
     """Return why a service cannot run this installation, or "" if it can."""
     if prefix == base or _hidden(Path(prefix), hidden):
         return (
-            f"{prefix} is no place for a service, which cannot see homes and /tmp; install acsard "
-            f"in a venv at {HOME} (deploy/systemd/README.md)"
+            f"a service cannot run from {prefix}, because it cannot see homes and /tmp; install "
+            f"acsard in a venv at {HOME} (deploy/systemd/README.md)"
         )
     # A venv borrows its Python: its bin/python is a link to the one that it was made with.
     interpreter = Path(os.path.realpath(executable))
     for path in (Path(base), interpreter):
         if _hidden(path, hidden):
             return (
-                f"the venv {prefix} borrows the Python in {path}, where a service sees nothing; "
+                f"the venv {prefix} uses the Python in {path}, which a service cannot see; "
                 f"{_anew(prefix)}"
             )
     for path in (Path(prefix), interpreter):
         closed = _closed(path)
         if closed:
             return (
-                f"the service's user may not enter {closed}, and needs {path}; `chmod o+rx "
+                f"the service's user may not enter {closed}, but needs {path}; run `chmod o+rx "
                 f"{closed}`, or {_anew(prefix)}"
             )
     return ""
 
 
 def _anew(prefix: str) -> str:
-    return f"make it anew with the system's: /usr/bin/python3 -m venv --clear {prefix}"
+    return (
+        f"make the venv again with the system's Python: /usr/bin/python3 -m venv --clear {prefix}"
+    )
 
 
 def _hidden(path: Path, hidden: Sequence[str]) -> bool:
@@ -90,7 +92,7 @@ LAN = "lan.conf"
 TLS = "/etc/acsard/tls"
 """Directory in which `lan.conf` expects the certificates."""
 STATES = {
-    UNIT: (Path("/var/lib/acsard"), "its recordings, and the stop that it keeps"),
+    UNIT: (Path("/var/lib/acsard"), "its recordings, and the stop that survives a restart"),
     PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
 }
 """State directories of the units, each with a description of its content."""
@@ -233,7 +235,7 @@ def uninstalling(
         if file.kept:
             why[file.path] = "your configuration; --purge removes it"
         elif not force:
-            why[file.path] = "somebody has changed it; --force removes it"
+            why[file.path] = "it has been edited; --force removes it"
     if any(path.name == UNIT for path in why):
         # A unit that may start again needs the program that sends zeros after it.
         why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
@@ -241,7 +243,7 @@ def uninstalling(
         Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
     ]
     for path in others:
-        what = "certificates and their authority" if path == Path(TLS) else "not of the service"
+        what = "certificates and their authority" if path == Path(TLS) else "not the service's own"
         steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
         where, what = STATES[unit]
@@ -271,7 +273,7 @@ def source() -> Path:
         return inside
     clone = package.parent / "deploy"
     if not clone.is_dir():
-        raise ExitError(Exit.FAILURE, f"neither {inside} nor {clone} is there; install acsard anew")
+        raise ExitError(Exit.FAILURE, f"neither {inside} nor {clone} exists; install acsard again")
     return clone
 
 

@@ -57,7 +57,7 @@ async def in_thread(
     try:
         thread.start()
     except RuntimeError as error:
-        raise NoThreadError(f"this process has no room for another thread ({error})") from None
+        raise NoThreadError(f"this process cannot start another thread ({error})") from None
     try:
         # Before Python 3.12 wait_for swallows a cancellation that coincides with the result.
         async with asyncio.timeout(timeout):

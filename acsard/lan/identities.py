@@ -43,7 +43,8 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
         raise ExitError(
             Exit.FAILURE,
             f"{directory / CA} exists: `acsard lan add` makes one more certificate with it; "
-            "--force makes a new authority, and all certificates of the old one are refused then",
+            "--force makes a new authority, and then the daemon refuses all certificates of the "
+            "old one",
         )
     maker = _maker()
     _writable(directory)
@@ -110,7 +111,7 @@ def _load(directory: Path) -> Authority:
         return maker.load(directory, _password)
     except FileNotFoundError:
         raise ExitError(
-            Exit.FAILURE, f"no authority in {directory}: run `acsard lan init` first"
+            Exit.FAILURE, f"{directory} has no authority: run `acsard lan init` first"
         ) from None
     except (OSError, ValueError) as error:
         raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
@@ -121,7 +122,8 @@ def _password() -> str:
     if not sys.stdin.isatty():
         raise ExitError(
             Exit.USAGE,
-            "the authority's key is encrypted: run it in a terminal, it asks for the password",
+            "the authority's key is encrypted: run this in a terminal, where it asks for the "
+            "password",
         )
     return getpass(f"password of {CA_KEY}: ")
 
@@ -136,5 +138,5 @@ def _writable(directory: Path) -> None:
         raise ExitError(Exit.FAILURE, f"{there} is not a directory; use --directory")
     if not os.access(there, os.W_OK | os.X_OK):
         raise ExitError(
-            Exit.NO_PERMISSION, f"cannot write to {there}: run it by sudo, or use --directory"
+            Exit.NO_PERMISSION, f"cannot write to {there}: run it with sudo, or use --directory"
         )

@@ -76,22 +76,24 @@ def _require_free(new: Path, force: bool) -> None:
     if new.is_dir():
         _require_bag(new)
     elif new.exists() and not new.is_file():
-        raise FileExistsError(EEXIST, "it is no file but a device or a pipe; name a file")
+        raise FileExistsError(EEXIST, "it is a device or a pipe, not a file; name a file")
     elif new.is_file() and _is_recording(new):
         raise FileExistsError(EEXIST, "it is a recording; name another file")
     if not force:
-        raise FileExistsError(EEXIST, "it exists; --force writes it anew")
+        raise FileExistsError(EEXIST, "it exists; --force overwrites it")
 
 
 def _require_bag(directory: Path) -> None:
     if not (directory / METADATA).is_file():
-        raise FileExistsError(EEXIST, "it is a directory, and no bag")
+        raise FileExistsError(EEXIST, "it is a directory, but not a bag")
     for one in sorted(directory.iterdir()):
         ours = one.name == METADATA or one.suffix in OF_A_BAG
         if one.is_symlink() or not one.is_file() or not ours:
-            raise FileExistsError(EEXIST, f"it is a directory with {one.name}, not only a bag")
+            raise FileExistsError(EEXIST, f"it is a directory with {one.name}, and not only a bag")
         if one.suffix == ".mcap" and _is_recording(one):
-            raise FileExistsError(EEXIST, f"it has a recording, {one.name}; name another directory")
+            raise FileExistsError(
+                EEXIST, f"it contains a recording, {one.name}; name another directory"
+            )
 
 
 def _is_recording(path: Path) -> bool:

@@ -194,7 +194,7 @@ class Ring:
                 said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
             # Recording new steps is more important than finishing an old file.
             except OSError as error:
-                said = f"{part.name} cannot be made whole: {error.strerror}"
+                said = f"{part.name} cannot be completed: {error.strerror}"
             self.said += [said] if said else []
             if ours:
                 self._run.numbers.add(_number(part) or 0)

@@ -38,11 +38,11 @@ Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """Time in ns since 1970 that fits in a signed 64-bit integer."""
 
 CUTS = {
-    "bug": "cut: the daemon ended by a fault of its own",
-    "crash": "cut: the daemon or the computer ended without a word",
-    "disk": "cut: the disk took no more",
-    "late": "cut: the daemon was told to end, and the disk was too slow for the rest",
-    "open": "cut, or still being written, when it was recovered",
+    "bug": "cut: the daemon ended because of an error in the daemon",
+    "crash": "cut: the daemon or the computer ended without notice",
+    "disk": "cut: the disk accepted no more data",
+    "late": "cut: the daemon was asked to end, and the disk was too slow for the rest",
+    "open": "cut, or still being recorded, when it was recovered",
 }
 """Causes for a file that does not end with the daemon's ordinary end, each with its words.
 

@@ -156,7 +156,7 @@ def export(
         with course.living():
             _all(course, sink, span, progress)
         if not sink.count:
-            raise RecordingError(f"{recording.path} has nothing in that time")
+            raise RecordingError(f"{recording.path} has nothing in that span of time")
         sink.finish()
         synced(stream)
 
@@ -205,8 +205,8 @@ def measured(recording: Recording) -> bytes:
             turned = turned or bool(step.inputs.gyro)
     if not turned:
         raise RecordingError(
-            f"{recording.path} holds no gyro, so there is nothing to compare the wheels with: "
-            "record a drive with [odometry] gyro = true, or export it with --csv and add the "
-            "columns x and y of what measures positions"
+            f"{recording.path} has no gyro samples with which to compare the wheels: record a "
+            "drive with [odometry] gyro = true, or export it with --csv and add the columns x "
+            "and y of a sensor that measures positions"
         )
     return ("\n".join(lines) + "\n").encode()

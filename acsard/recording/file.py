@@ -362,14 +362,16 @@ class Recording:
                 break
         try:
             if config is None:
-                raise ValueError("its beginning is missing, or it is another program's MCAP")
+                raise ValueError(
+                    "its beginning is missing, or another program wrote this MCAP file"
+                )
             about = msgspec.convert({**found, "config": config}, About, strict=False)
         except (ValueError, msgspec.ValidationError) as error:
-            raise RecordingError(f"{self.path} is no recording of acsard: {error}") from None
+            raise RecordingError(f"{self.path} is not a recording of acsard: {error}") from None
         if about.format != FORMAT:
             raise RecordingError(
-                f"{self.path} has the format {about.format}, this acsard reads "
-                f"{FORMAT}: it was written by acsard {about.version}"
+                f"{self.path} has the format {about.format}, but this acsard reads {FORMAT}: it "
+                f"was written by acsard {about.version}"
             )
         return about
 
@@ -402,4 +404,6 @@ def event_of(recording: Recording, data: bytes) -> TimelineEntry:
     try:
         return msgspec.json.decode(data, type=TimelineEntry)
     except msgspec.MsgspecError as error:
-        raise RecordingError(f"{recording.path} has an event that is none: {error}") from None
+        raise RecordingError(
+            f"{recording.path} has an event that cannot be read: {error}"
+        ) from None

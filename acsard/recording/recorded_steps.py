@@ -129,7 +129,7 @@ def unfinished(data: bytes) -> Unfinished:
     try:
         return _unfinished.decode(data)
     except msgspec.MsgspecError as error:
-        raise UnfinishedError(f"not a step that was not finished: {error}") from None
+        raise UnfinishedError(f"not an unfinished step: {error}") from None
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:

@@ -103,7 +103,7 @@ class Recorder:
         """Status of the recording, for `state` and `diagnostics`."""
         trouble = "the disk is too slow" if self._full else self._disk.trouble
         if not self._thread.is_alive():
-            trouble = "the recorder has ended by a fault of its own; the log has it"
+            trouble = "the recorder has ended because of an error of its own, which is in the log"
         return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
 
     def close(self, error: BaseException | None = None) -> None:

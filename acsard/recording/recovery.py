@@ -42,13 +42,13 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
     try:
         if not _begins(part):
             if seen.st_size > NOTHING_BYTES or _has_chunks(part):
-                raise RecordingError(f"{part} has no beginning that can be read")
+                raise RecordingError(f"{part} has no readable beginning")
             part.unlink()
             return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
             if recording.damaged or seen.st_size > NOTHING_BYTES or _has_chunks(part):
-                raise RecordingError(f"{part} has nothing whole in it")
+                raise RecordingError(f"{part} has no intact data")
             part.unlink()
             return ""
         if room and _beside(recording, part, whole, cut):
@@ -57,11 +57,14 @@ def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
                 told = f"{lost} left out of {whole.name}"
         else:
             if not _in_place(recording, part, cut):
-                told = f"{whole.name} was cut and has no end, for want of room; all else is in it"
+                told = (
+                    f"{whole.name} was cut and gets no end record, because the disk is full; "
+                    "everything else is in it"
+                )
             part.rename(whole)
     except RecordingError as error:
         part.rename(whole)
-        return f"it was cut and stays so, as {whole.name}: {error}"
+        return f"it was cut and stays cut, as {whole.name}: {error}"
     # The file time must be the time of the recording's end, not of its recovery.
     os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))
     return told

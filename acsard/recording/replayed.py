@@ -60,7 +60,7 @@ def config_of(recording: Recording) -> Config:
         return parse(recording.about.config.encode())
     except ConfigError as error:
         raise RecordingError(
-            f"the configuration in {recording.path} is none for this version: {error}"
+            f"this version cannot use the configuration in {recording.path}: {error}"
         ) from None
 
 
@@ -128,7 +128,7 @@ class Course:
             self.number = step.number
             yield step
         if self.number is None:
-            raise RecordingError(f"{path} has no whole second of steps")
+            raise RecordingError(f"{path} has no complete second of steps")
 
 
 def live(recording: Recording, other: Config | None = None, progress: Progress = quietly) -> Lived:
@@ -160,7 +160,7 @@ def _again(recording: Recording, robot: Robot, last: int | None) -> str:
         return str(error)
     name = f"step {step.number}, which ended the daemon,"
     if last is None or step.number != last + 1:
-        return f"{name} does not follow on the last one"
+        return f"{name} does not follow the previous step"
     try:
         robot.step(step.inputs)
     except Exception as error:  # noqa: BLE001 - whatever a fault of our own may be
@@ -185,7 +185,10 @@ class Onlooker:
                 self.replay = Replay(self.config, *(self._began or ()))
         except RecordingError as error:
             self._began, self.replay = None, Replay(self.config)
-            self.notes.append(f"what is computed begins with a robot that knows nothing: {error}")
+            self.notes.append(
+                "the replay begins with a new robot, which knows nothing of the "
+                f"time before: {error}"
+            )
 
     @contextmanager
     def living(self) -> Iterator[None]:
@@ -204,7 +207,7 @@ class Onlooker:
         number = None
         for step in steps(self._recording):
             if number is None and self._began is None and step.number > 0 and not self.notes:
-                self.notes.append("its first steps are missing: the robot is begun without them")
+                self.notes.append("its first steps are missing: the replay begins without them")
             number = step.number
             with self.living():
                 self.replay.step(step)
@@ -251,7 +254,7 @@ def _foreign(recording: Recording, why: str) -> RecordingError:
 
 def verdict(tally: Comparison) -> str:
     """Return the result of a replay in one line."""
-    lines = f"{tally.lines_same:,} of {tally.lines:,} lines the same".replace(",", " ")
+    lines = f"{tally.lines_same:,} of {tally.lines:,} lines are the same".replace(",", " ")
     poses = f"{tally.poses_same:,} of {tally.poses:,} poses".replace(",", " ")
     modes = f"{tally.modes_same:,} of {tally.steps:,} modes".replace(",", " ")
     bits = "" if not tally.same or tally.exact else " (poses to the um, not to the last bit)"
@@ -262,8 +265,8 @@ def compared(other: bool) -> str:
     """Explain the figures of `verdict`; `other` is true for another configuration."""
     by = "that configuration" if other else "this version"
     return (
-        "(compared: every line to the board, every pose by odometry to the um, and the mode in "
-        f"every step, as recorded, with what {by} makes of the same inputs)"
+        "(compared with the recording: every line to the board, every pose by odometry to the "
+        f"um, and the mode in every step, as {by} computes them from the same inputs)"
     )
 
 
@@ -275,7 +278,7 @@ def differs(difference: Difference, began_ns: int) -> list[str]:
     seconds = (difference.at.mono_ns - began_ns) / 1e9
     what = ", ".join(difference.what)
     return [
-        f"the first that differs, by its {what}: step {difference.number}, {seconds:.3f} s after "
+        f"the first difference, in its {what}: step {difference.number}, {seconds:.3f} s after "
         "the beginning",
         *_side("then", difference.then),
         *_side("now", difference.now),
@@ -315,15 +318,17 @@ def because(then: Config, now: Config, tally: Comparison, began_ns: int) -> list
         shaping = [key for key in keys if key.startswith(SHAPE_LINES)]
         by = f": by {', '.join(shaping[:MOST_KEYS])}" if shaping else ""
         most, here = (fastest(one.line) / HUNDREDTHS for one in (first.then, first.now))
-        rows.append(f"there the fastest wheel was told {most:.2f} rad/s, now {here:.2f} rad/s{by}")
+        rows.append(
+            f"there the fastest wheel was commanded {most:.2f} rad/s, now {here:.2f} rad/s{by}"
+        )
     if first is not None and fault is not None:
         seconds = (fault.at.mono_ns - began_ns) / 1e9
-        rows.append(f"from {seconds:.3f} s on in fault: {printable(fault.now.status[1])}")
+        rows.append(f"in fault from {seconds:.3f} s on: {printable(fault.now.status[1])}")
         if first.number < fault.number:
             rows.append(
-                "  the wheels of the recording turned as they were told then, not as they are told "
-                "now: a robot with this configuration need not have had that fault. What is before "
-                "it counts"
+                "  the recorded wheels turned as they were commanded then, not as they are "
+                "commanded now: a robot with this configuration need not have had that fault. "
+                "Only the part before it counts"
             )
     return rows
 
@@ -336,8 +341,8 @@ def otherwise(tally: Comparison) -> list[str]:
     """Describe in lines how the robot would have behaved with other code or settings."""
     then_most, now_most = (speed / HUNDREDTHS for speed in tally.fastest)
     rows = [
-        f"{tally.lines - tally.lines_same} of {tally.lines} lines would be others, "
-        f"{tally.steps - tally.modes_same} of {tally.steps} steps in another mode",
+        f"{tally.lines - tally.lines_same} of {tally.lines} lines would differ, and "
+        f"{tally.steps - tally.modes_same} of {tally.steps} steps would have another mode",
         f"the fastest wheel: {then_most:.2f} rad/s then, {now_most:.2f} rad/s now",
     ]
     if tally.end is not None:

@@ -240,7 +240,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
         trouble = trouble if rare.trouble is None else rare.trouble
         status = rare.status or status
         if opened is None or trouble is None or status is None:
-            raise ValueError("its first step lacks what every first step has")
+            raise ValueError("its first step lacks a field that every first step has")
         now = _instant(batch, tick_ns + row.now * batch.unit, row.offset)
         received = []
         for read in row.reads:
@@ -303,7 +303,7 @@ def _require_finite(rare: Rare) -> None:
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):
-            raise ValueError("a pose that is no number")
+            raise ValueError("a pose that is not a number")
     for sample in rare.gyro:
         if not (math.isfinite(sample.rate) and math.isfinite(sample.variance)):
-            raise ValueError("a gyro sample that is no number")
+            raise ValueError("a gyro sample that is not a number")

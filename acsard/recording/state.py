@@ -81,7 +81,7 @@ def thaw(data: bytes) -> State:
     match made:
         case (Robot() as robot, Memory() as memory):
             return State(robot, memory)
-    raise StateError("the state at its start is not that of a robot")
+    raise StateError("the state at its start is not the state of a robot")
 
 
 def short(error: Exception) -> str:
@@ -101,5 +101,5 @@ def part(module: str, name: str) -> type:
     ours = module in ROOMS or any(r.endswith(".") and module.startswith(r) for r in ROOMS)
     found = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
     if not isinstance(found, type) or found.__module__ != module or found.__name__ != name:
-        raise ValueError(f"{module:.50}.{name:.50} is no part of a robot")
+        raise ValueError(f"{module:.50}.{name:.50} is not a part of a robot")
     return found

@@ -92,7 +92,7 @@ class TimelineWriter:
             one = told(event, step.inputs.now.wall_ns)
             yield replace(one, name="link_heard") if self._losses.again(one.name) else one
         if step.inputs.leaving and not self._leaving:
-            yield TimelineEntry(wall_s, "end", "the daemon is told to end")
+            yield TimelineEntry(wall_s, "end", "the daemon received the request to end")
         self._leaving = step.inputs.leaving
 
     def _drive(self, step: Step, wall_s: float) -> Iterator[TimelineEntry]:
@@ -119,7 +119,7 @@ NEWS = {
     "link_stale": "board silence",
     "link_late": "computer stall",
     "mcu_restarted": "board restart",
-    "commander": "change of who drives",
+    "commander": "change of commander",
     "command_refused": "refused command",
     "wheels_doubted": "doubted wheel",
     "link_up": "",

@@ -97,7 +97,7 @@ def unpickled(data: bytes, find: Find) -> object:
     except (LookupError, TypeError, ArithmeticError, msgspec.MsgspecError) as error:
         raise ValueError(f"it is damaged: {error}") from None
     if at + 1 != len(data):
-        raise ValueError("something follows its end")
+        raise ValueError("there is data after its end")
     return machine.result()
 
 
@@ -119,14 +119,14 @@ class _Entry:
         Raises `ValueError` if a bound is exceeded.
         """
         if self.closed:
-            raise ValueError("a part of it has itself in it, or grows when it is made")
+            raise ValueError("a part of it contains itself, or grows while it is built")
         for part in parts:
             if isinstance(part.value, type):
-                raise ValueError("it has a class in place of a value")
+                raise ValueError("it has a class where a value should be")
             self.depth = max(self.depth, 1 + part.depth)
             self.size += part.size
         if self.depth > DEEPEST:
-            raise ValueError(f"its parts are nested more than {DEEPEST} deep")
+            raise ValueError(f"its parts are nested deeper than {DEEPEST}")
         if self.size > MOST_PARTS:
             raise ValueError("it has more parts than any robot")
 
@@ -166,7 +166,7 @@ class _Machine:
             entry.closed = True
             self._stack.append(entry)
         else:
-            raise ValueError(f"it has the opcode {name}, which no robot is written with")
+            raise ValueError(f"it has the opcode {name}, which the state of a robot never contains")
 
     def _push(self, value: object) -> _Entry:
         entry = _Entry(value)
@@ -229,7 +229,7 @@ class _Machine:
     def _extend(self, parts: list[_Entry]) -> None:
         whole = self._stack[-1]
         if type(whole.value) not in (list, deque):
-            raise TypeError("what is no list is made longer")
+            raise TypeError("it appends to an object that is not a list")
         whole.holds(parts)
         whole.value.extend([part.value for part in parts])
 
@@ -242,7 +242,7 @@ class _Machine:
     def _update(self, parts: list[_Entry]) -> None:
         whole, keys, values = self._stack[-1], parts[::2], parts[1::2]
         if type(whole.value) is not dict:
-            raise TypeError("what is no dict gets keys")
+            raise TypeError("it sets keys of an object that is not a dict")
         _keys(keys)
         whole.holds(parts)
         whole.value.update({key.value: one.value for key, one in zip(keys, values, strict=True)})
@@ -251,7 +251,7 @@ class _Machine:
         parts = self._marked()
         whole = self._stack[-1]
         if not isinstance(whole.value, set):
-            raise TypeError("what is no set gets elements")
+            raise TypeError("it adds elements to an object that is not a set")
         _keys(parts)
         whole.holds(parts)
         whole.value.update([part.value for part in parts])
@@ -259,14 +259,14 @@ class _Machine:
     def found(self) -> None:
         module, name = [entry.value for entry in self._top(2)]
         if not isinstance(module, str) or not isinstance(name, str):
-            raise TypeError("a class whose name is no text")
+            raise TypeError("the name of a class is not a text")
         self._push(self._find(module, name))
 
     def reduced(self) -> None:
         """Make a value of a class from constructor arguments."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
-            raise TypeError("what is no class is called")
+            raise TypeError("it calls an object that is not a class")
         entry = _Entry(None)
         entry.holds([given])
         self._copies(given)
@@ -277,9 +277,11 @@ class _Machine:
         """Make a part without attributes, and without a call of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
-            raise TypeError("what is no class, or needs values, is made of none")
+            raise TypeError(
+                "it constructs an object that is not a class, or a class that needs values"
+            )
         if not _is_part(kind.value):
-            raise ValueError(f"{kind.value.__name__} is not made of nothing")
+            raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
         self._push(object.__new__(kind.value))
 
     def built(self) -> None:
@@ -287,10 +289,12 @@ class _Machine:
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
-            raise ValueError(f"a {type(whole.value).__name__} gets attributes")
+            raise ValueError(f"it sets attributes of a {type(whole.value).__name__}")
         for name in named:
             if not isinstance(name, str) or hasattr(type(whole.value), name):
-                raise ValueError(f"the attribute {name!r:.50} of a {type(whole.value).__name__}")
+                raise ValueError(
+                    f"it sets the attribute {name!r:.50} of a {type(whole.value).__name__}"
+                )
         whole.holds([state])
         self._copies(state)
         vars(whole.value).update(named)
@@ -322,9 +326,9 @@ def _keys(entries: Sequence[_Entry]) -> None:
         value = entry.value
         parts = value if type(value) is tuple and len(value) <= MOST_IN_KEY else (value,)
         if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
-            raise ValueError(f"a {type(value).__name__} is a key in it")
+            raise ValueError(f"it uses a {type(value).__name__} as a key")
         if any(type(part) is int and abs(part) >= HASHED for part in parts):
-            raise ValueError("a number of more than 60 bits is a key in it")
+            raise ValueError("it uses a number of more than 60 bits as a key")
 
 
 def _is_part(kind: Any) -> bool:
@@ -349,4 +353,4 @@ def _made(kind: type, given: tuple[Any, ...]) -> object:
             made = kind(*given)
             msgspec.convert({name: getattr(made, name) for name in kind.__struct_fields__}, kind)
             return made
-    raise ValueError(f"{kind.__name__} is not made of that")
+    raise ValueError(f"{kind.__name__} cannot be constructed from these values")

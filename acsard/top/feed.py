@@ -37,7 +37,7 @@ class Feed:
         except DecodeError as error:
             self._watch.unreadable += 1
             raise ReplyError(
-                f"cannot read the state ({error}); is the daemon of another version?"
+                f"cannot read the state ({error}); does the daemon have another version?"
             ) from None
         # A state that arrived before the answer is usually older than it, but not always.
         self.poll()

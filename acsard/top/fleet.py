@@ -102,11 +102,13 @@ class Fleet:
         """Note that some robots are left out, or ""."""
         if not self._left_out:
             return ""
-        return f"more than {MOST} robots: the others are left out; name yours, --id robot1,robot2"
+        return (
+            f"more than {MOST} robots: the others are left out; name yours with --id robot1,robot2"
+        )
 
     def hint(self) -> str:
         """Return the reason why there may be no robots to show."""
-        return nobody(self._endpoint) if ALL in self._ids else "none of these robots is there"
+        return nobody(self._endpoint) if ALL in self._ids else "none of these robots is present"
 
     def _of(self, sample: zenoh.Sample) -> _Known | None:
         name = robot_of(str(sample.key_expr))

@@ -109,7 +109,7 @@ def silence(seen: Teleop) -> str:
     """Return a message that the robot is silent, and for how long."""
     if seen.state is None and not seen.silent:
         return "waiting for the first state"
-    return f"no word from the daemon for {seen.age:.0f} s: is it running?"
+    return f"nothing received from the daemon for {seen.age:.0f} s: does it run?"
 
 
 def reason(state: RobotState) -> str:

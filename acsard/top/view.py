@@ -98,9 +98,9 @@ def _split(words: str, room: int) -> tuple[str, str]:
 def _no_news(seen: ScreenData, width: int) -> list[Text]:
     """Return a bar across the screen that marks the data below as old."""
     since = lasting(int(min(seen.age, 1e9)))
-    words = f"NO NEWS FOR {since}: is the daemon running?"
+    words = f"NOTHING RECEIVED FOR {since}: does the daemon run?"
     if seen.undecodable:
-        words = f"NOTHING READABLE FOR {since}: is the daemon of another version?"
+        words = f"NOTHING READABLE FOR {since}: does the daemon have another version?"
     told = Text(words.center(width), "bold white on red")
     blank = Text(" " * width, "on red")
     return [blank, told, blank.copy()]

@@ -48,7 +48,7 @@ REASONS: dict[int, Reason] = {404: "path", 405: "path", 413: "too_big"}
 `malformed`."""
 
 WORDS = {
-    404: "there is no such thing here; GET /api lists what there is",
+    404: "this address does not exist; GET /api lists all addresses",
     413: f"over {MAX_BYTES} bytes",
 }
 
@@ -90,7 +90,9 @@ class Admission:
         Raises `RefusedError`, and `TimeoutError` if the disk does not answer within `READ_S`.
         """
         if not any(shown):
-            raise RefusedError("no_token", "who are you? `acsard web --invite ROLE` at the robot")
+            raise RefusedError(
+                "no_token", "a token is missing: run `acsard web --invite ROLE` on the robot"
+            )
         who = await in_thread(lambda: next(filter(None, map(self._vault.who, shown)), None), READ_S)
         # A valid token is accepted even while guessing is throttled, so another client's wrong
         # guesses lock nobody out.
@@ -99,7 +101,8 @@ class Admission:
         if not self._guesses.take(peer, clock.mono_ns()):
             raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
         raise RefusedError(
-            "bad_token", "this token has ended, was revoked, is another robot's, or never was one"
+            "bad_token",
+            "this token is not valid: it has expired, was revoked, or is for another robot",
         )
 
     @web.middleware
@@ -124,7 +127,7 @@ class Admission:
                 raise
             self._counts.refuse(REASONS.get(error.status, "malformed"), _origin(request))
             if (methods := error.headers.get("Allow")) is not None:
-                answer = problem(error.status, f"this path takes {methods}")
+                answer = problem(error.status, f"this path accepts only {methods}")
                 answer.headers["Allow"] = methods
                 return answer
             return problem(error.status, WORDS.get(error.status, error.reason))
@@ -145,7 +148,7 @@ class Admission:
         # Clients on the robot itself have no token and no rate limit.
         paced = who.token and (row is None or row.paced)
         if paced and not self._paces.take(who.token, clock.mono_ns()):
-            text = f"over {REQUESTS.hz:g} requests a second: /ws tells what changes"
+            text = f"more than {REQUESTS.hz:g} requests a second: use /ws, which sends changes"
             raise RefusedError("too_fast", text)
         if row is not None and row.least is not None:
             who.require(row.least, f"{row.method} {row.path}")

@@ -56,7 +56,7 @@ SEND_BUFFER = 65536
 DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 503}
 """HTTP status for each state of a report."""
 
-NO_TOKEN = "a token is to be posted as a form, token=..., or as JSON, both in UTF-8"
+NO_TOKEN = "send the token as a form, token=..., or as JSON, both in UTF-8"
 
 
 class TokenForm(Struct, frozen=True):
@@ -70,7 +70,7 @@ class Caller(Struct, frozen=True):
 
     role: Role
     name: str
-    full: Annotated[str, Meta(description='why another WebSocket has no room, or ""')]
+    full: Annotated[str, Meta(description='reason to refuse another WebSocket, or ""')]
 
 
 class Page:
@@ -121,7 +121,7 @@ class Page:
             counting = frozenset()
         for viewer in list(self._viewers):
             if viewer.who.token and viewer.who.token not in counting:
-                viewer.end("your token has ended")
+                viewer.end("your token has expired")
 
     # The page and its files.
 
@@ -144,7 +144,7 @@ class Page:
         """Exchange a posted token for an `HttpOnly` cookie, which scripts cannot read."""
         text = await _token_posted(request)
         if not request.secure:
-            raise RefusedError("plain", "here you need no token")
+            raise RefusedError("plain", "no token is needed here")
         who = await self._admission.owner(peer_of(request), [text])
         left_s = await in_thread(lambda: self._vault.left_s(who.token), READ_S)
         response = web.Response(status=303, headers={"Location": "/"})
@@ -216,10 +216,10 @@ class Page:
         try:
             given = msgspec.json.decode(body, type=dict[str, Any]) if body.strip() else {}
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise RefusedError("malformed", f"the body is to be a JSON object: {error}") from None
+            raise RefusedError("malformed", f"the body must be a JSON object: {error}") from None
         robot = given.pop("robot", "")
         if not isinstance(robot, str):
-            text = "robot is to be the id of another robot, which may be stopped"
+            text = "robot must be the id of another robot, which may be stopped"
             raise RefusedError("malformed", text)
         verb = request.path.removeprefix("/api/srv/")
         told = await self._calls.call(request[WHO], verb, given, robot)
@@ -243,7 +243,7 @@ class Page:
         name = request.match_info["name"]
         body = self._reports.drawn(name)
         if body is None:
-            text = f"it is not drawn: POST /api/recordings/{name}/report first"
+            text = f"the report is not drawn yet: POST /api/recordings/{name}/report first"
             raise RefusedError("path", text)
         headers = {
             "Content-Type": "text/html; charset=utf-8",
@@ -270,7 +270,7 @@ async def _body_of(request: web.Request) -> bytes:
         async with asyncio.timeout(BODY_S):
             return await request.read()
     except TimeoutError:
-        raise web.HTTPRequestTimeout(reason=f"no body came within {BODY_S:g} s") from None
+        raise web.HTTPRequestTimeout(reason=f"no body arrived within {BODY_S:g} s") from None
 
 
 async def _token_posted(request: web.Request) -> str:
@@ -298,7 +298,7 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/favicon.ico", None, Page.icon),
     Route("GET", "/page/{name}", None, Page.file),
     Route("POST", "/token", None, Page.token,
-        "exchanges a token for a cookie that no script can read; by HTTPS only",
+        "exchanges a token for a cookie that no script can read; only over HTTPS",
         takes=TokenForm, forms=(JSON, FORM),
         gives={303: Body("The token is valid. `Location` is the page.", media="")}),
     Route("GET", "/ws", "viewer", Page.socket,
@@ -308,10 +308,10 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/api/whoami", "viewer", Page.whoami, "the caller's role and name",
         gives={200: Body("The caller.", Caller)}, paced=False),
     Route("GET", "/api/settings", least_role("config"), Page.settings,
-        "the settings that srv/set takes: values, ranges, when each may change",
+        "the settings that srv/set accepts, with values, ranges, and when each may change",
         gives={200: Body("A list.", list[Setting])}),
     Route("GET", "/api/guide", Begin.least, Page.guide,
-        "what `begin` on the WebSocket takes: ways to calibrate, ports to check",
+        "the values that `begin` on the WebSocket accepts: ways to calibrate, ports to check",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
@@ -322,8 +322,8 @@ ROUTES: tuple[Route, ...] = (
     Route("POST", "/api/recordings/{name}/report", "operator", Page.draw,
         "draws the report of a recording, or reports the progress; ask again until 200",
         gives={200: Body("It is drawn, and at `href`.", ReportState),
-               202: Body("It is being drawn, or another one is.", ReportState),
-               503: Body("It cannot be drawn, and why.", ReportState)}),
+               202: Body("This report or another one is being drawn.", ReportState),
+               503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),
     Route("GET", "/report/{name}", "operator", Page.report,
         "the report of a recording, once it is drawn",
         gives={200: Body("A page.", str, "text/html")}),

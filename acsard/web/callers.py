@@ -102,8 +102,8 @@ def place(asked: Asked, names: Collection[str]) -> Place:
     if asked.proxied:
         raise RefusedError(
             "proxy",
-            "through a proxy everybody would look as if he were at the machine: open this page "
-            "without one, from elsewhere by https",
+            "through a proxy every browser would seem to run on this machine: open this page "
+            "without a proxy, and from another machine by https",
         )
     host = host_name(asked.host)
     if is_loopback(asked.peer) and (host == "localhost" or is_loopback(host)):
@@ -111,11 +111,11 @@ def place(asked: Asked, names: Collection[str]) -> Place:
     if not asked.secure:
         raise RefusedError(
             "plain" if not is_loopback(asked.peer) else "host",
-            f"{host or 'no name'!r} is not a name of this machine for itself: "
-            "use http://localhost here, and https from elsewhere",
+            f"{host or 'no name'!r} is not a name by which this machine calls itself: use "
+            "http://localhost here, and https from another machine",
         )
     if host not in names:
-        raise RefusedError("host", f"{host or 'no name'!r} is not a name that this robot has")
+        raise RefusedError("host", f"{host or 'no name'!r} is not a name of this robot")
     return "away"
 
 
@@ -124,7 +124,7 @@ def require_own_origin(asked: Asked) -> None:
     own = f"{'https' if asked.secure else 'http'}://{asked.host}".lower()
     strange = asked.origin is not None and asked.origin.lower() != own
     if strange or asked.site not in (None, "same-origin", "none"):
-        raise RefusedError("origin", "a page of another origin may not do that")
+        raise RefusedError("origin", "a page from another origin may not do that")
 
 
 def cookie_name(robot: str, port: int) -> str:

@@ -33,7 +33,7 @@ ANSWER_S = 8.0
 """Longer than a client waits for its answer, so the client's own error message is what the caller
 gets."""
 
-BUSY = "busy: too many questions at once; ask again"
+BUSY = "busy: too many queries at once; ask again"
 
 T = TypeVar("T")
 
@@ -130,7 +130,7 @@ class Calls:
             ),
             ANSWER_S,
         )
-        return ServiceReply(False, f"{robot} was told to stop; look at it: {BUSY}")
+        return ServiceReply(False, f"{robot} was told to stop; check that it did: {BUSY}")
 
     async def _ask(self, call: Callable[[], T]) -> T:
         if self._running >= AT_ONCE:
@@ -188,8 +188,8 @@ def _require_stop(verb: str, robot: str) -> None:
     if verb != "stop":
         raise RefusedError(
             "role",
-            f"{robot} is not this page's robot: here it is seen and stopped; for {verb} open its "
-            "own page",
+            f"{robot} is not this page's robot: here you can see it and stop it; for {verb} open "
+            "its own page",
         )
 
 

@@ -33,16 +33,16 @@ ASK_NS = int(FLEET_ASK_S * NS_PER_S)
 """Interval between queries to a robot that has not reported its version."""
 
 UNROUTED = (
-    "seen by way of the daemon of {robot} alone, and daemons hand on nothing that others say: only "
-    "one that is connected to it is here too. For all robots of a router have this page's server "
-    "at the router: acsard web --connect ROUTER --id {robot}"
+    "this page sees only robots that are connected to the daemon of {robot}, because daemons "
+    "forward no messages. To see all robots of a router, connect this page's server to the "
+    "router: acsard web --connect ROUTER --id {robot}"
 )
 """Note for a server that is connected to a daemon instead of a router."""
 
 BY_NAME = (
-    "{endpoint} lets keys pass by their names alone, as all do by TLS: no other robot is seen. For "
-    "all of a router have this page's server at its own machine: acsard web --connect "
-    "tcp/127.0.0.1:7447 --id {robot}"
+    "{endpoint} passes only exact keys, as every TLS endpoint does, so no other robot is "
+    "visible. To see all robots of a router, run this page's server on the router's machine: "
+    "acsard web --connect tcp/127.0.0.1:7447 --id {robot}"
 )
 """Note for a server that is connected over TLS, which limits it to its own robot."""
 

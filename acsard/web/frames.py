@@ -166,6 +166,6 @@ def _require(frame: Frame) -> None:
         if not (math.isfinite(frame.cmd.linear_x) and math.isfinite(frame.cmd.angular_z)):
             raise FrameError("cmd", "linear_x and angular_z must be finite")
         if not 0.0 < frame.stamp < LATEST_STAMP_MS:
-            raise FrameError("cmd", "stamp is ms since 1970 by your own clock")
+            raise FrameError("cmd", "stamp must be ms since 1970 by your own clock")
     elif isinstance(frame, Subscribe) and not 0.0 < frame.rate <= MAX_RATE:
-        raise FrameError("subscribe", f"rate is above 0 and at most {MAX_RATE:g} a second")
+        raise FrameError("subscribe", f"rate must be above 0 and at most {MAX_RATE:g} a second")

@@ -26,9 +26,9 @@ browser opens six in addition to its WebSocket."""
 REQUEST_S = 10.0
 """Time limit for the head of the first request; the connection is cut after that."""
 
-NO_HOST = "there is no `Host` in it: which name of this robot do you ask?"
+NO_HOST = "the request has no `Host`, the name of the robot"
 
-NO_REQUEST = "that is no HTTP request"
+NO_REQUEST = "that is not an HTTP request"
 
 MISSING = "Missing 'Host'"
 """Start of aiohttp's message for a missing `Host` header."""

@@ -53,8 +53,9 @@ BOARDS_S = 5.0
 SIMULATOR = "sim"
 
 NO_DEVICE = (
-    "No serial port is seen from here. Is the board plugged in? As a service the page has no "
-    "device: then at the robot `sudo systemctl stop acsard`, and `acsard mcu check` in a terminal."
+    "No serial port is visible from here. Is the board plugged in? If the page runs as a "
+    "service, it has no access to devices: run `sudo systemctl stop acsard` and `acsard mcu "
+    "check` in a terminal on the robot."
 )
 
 
@@ -127,7 +128,10 @@ class Guide:
     def begin(self, viewer: object, by: str, asked: Begin) -> str:
         """Start a child. Return "" or the reason for a refusal."""
         if self._errand is not None:
-            return f"{self._errand.by} goes through a {self._errand.name} already; one at a time"
+            return (
+                f"{self._errand.by} is doing a {self._errand.name} already; only one can run "
+                "at a time"
+            )
         self._errand = _Errand(viewer, by, asked.begin, self._viewers[viewer])
         self._tell_all()
         self._task = asyncio.get_running_loop().create_task(self._live(self._errand, asked))
@@ -137,7 +141,7 @@ class Guide:
         """Pass an answer to the child. Return "" or the reason for a refusal."""
         errand = self._of(viewer)
         if errand is None or not errand.answer(reply):
-            return f"no question {reply.reply} is open"
+            return f"the question {reply.reply} is not open"
         return ""
 
     def press(self, viewer: object, press: Press) -> None:
@@ -190,7 +194,7 @@ class Guide:
         try:
             code, text = await errand.run(words(asked, self._reach, await self._ports(asked)))
         except (FrameError, OSError, TimeoutError) as error:
-            code, text = int(Exit.USAGE), str(error) or "the list of serial ports does not come"
+            code, text = int(Exit.USAGE), str(error) or "the list of serial ports does not arrive"
         finally:
             self._errand = None
         meaning = WORDS.get(code, "ended") if not errand.left else "stopped"
@@ -220,12 +224,12 @@ def boards(configured: str) -> list[Board]:
         name = device.names[0] if device.names else device.device
         own = configured in (device.device, *device.names)
         told = [device.board or device.description, "configured" if own else ""]
-        told += [f"held by {holder.name} (process {holder.pid})" for holder in device.holders]
+        told += [f"in use by {holder.name} (process {holder.pid})" for holder in device.holders]
         found[configured if own else name] = ", ".join(filter(None, told))
     if configured != SIMULATOR and configured not in found:
         there = "" if os.path.exists(configured) else ", not there now"
         found = {configured: f"configured{there}", **found}
-    found[SIMULATOR] = "the simulator: nothing real moves"
+    found[SIMULATOR] = "the simulator: no real robot moves"
     # The configured port comes first: a check that is started without looking at the list must run
     # on the robot that the operator sees, because wheels turn.
     ports = sorted(found, key=lambda port: port != configured)

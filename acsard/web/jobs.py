@@ -36,12 +36,12 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
         if begin.way or begin.positions:
-            raise FrameError("begin", "way and positions are for calibrate")
+            raise FrameError("begin", "way and positions are only for calibrate")
         if begin.port not in ports:
             raise FrameError("begin", f"port is one of {', '.join(sorted(ports))}")
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
     if begin.port:
-        raise FrameError("begin", "port is for check")
+        raise FrameError("begin", "port is only for check")
     given = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
     if reach.tls:
         given.append(f"--tls={reach.tls}")
@@ -52,8 +52,8 @@ def _way(begin: Begin) -> list[str]:
     if begin.way and begin.way not in NEEDS:
         raise FrameError("begin", f"way is one of {', '.join(NEEDS)}")
     if (begin.way == POSITIONS) != bool(begin.positions):
-        raise FrameError("begin", "positions is the key that they come on, with the way positions")
+        raise FrameError("begin", "positions is the key of the positions, for the way positions")
     if begin.positions and not KEY.match(begin.positions):
-        raise FrameError("begin", "positions is a key like sim/pose: letters, digits, _ / -")
+        raise FrameError("begin", "positions must be a key like sim/pose: letters, digits, _ / -")
     options = {"way": begin.way, "positions": begin.positions}
     return [f"--{name}={value}" for name, value in options.items() if value]

@@ -49,20 +49,24 @@ class Keys:
             self._out.refuse("subscribe", "malformed", str(error))
             return
         if key not in KEYS:
-            text = f"{key!r} is none of {', '.join(sorted(KEYS))}"
+            text = f"{key!r} is not one of {', '.join(sorted(KEYS))}"
             self._out.refuse("subscribe", "malformed", text)
             return
         known = self._out.following.get((robot, key))
         others = sum(1.0 / one.period for one in self._out.following.values() if one is not known)
         if others + frame.rate > FRAMES_HZ:
-            self._out.refuse("subscribe", "too_many", f"{FRAMES_HZ:g} messages a second in all")
+            self._out.refuse(
+                "subscribe", "too_many", f"at most {FRAMES_HZ:g} messages a second in all"
+            )
         elif known is not None:
             known.period, known.due = 1.0 / frame.rate, 0.0
             self._out.wake()
         elif len(self._out.following) >= MOST:
-            self._out.refuse("subscribe", "too_many", f"{MOST} keys at most")
+            self._out.refuse("subscribe", "too_many", f"at most {MOST} keys")
         elif robot != self._robots.id and not self._shares.enter(self._holder, (robot, key)):
-            text = f"{STREAMS_OF_ONE} keys of other robots for one token, {STREAMS} in all"
+            text = (
+                f"at most {STREAMS_OF_ONE} keys of other robots for one token, and {STREAMS} in all"
+            )
             self._out.refuse("subscribe", "too_many", f"no room: {text}; unsubscribe some")
         else:
             one = Following(robot, key, self._robots.id, 1.0 / frame.rate)
@@ -120,7 +124,7 @@ class Keys:
         try:
             return await self._robots.streams.follow(client, one.robot, one.name)
         except UNREADY:
-            self._out.refuse("subscribe", "stuck", "the bus is stuck; it is tried again")
+            self._out.refuse("subscribe", "stuck", "the bus is stuck; the page tries again")
             await asyncio.sleep(AGAIN_S)
             return None
 

@@ -164,15 +164,15 @@ class Seats:
     def _places(self, address: str, token: str) -> list[tuple[Places, str, str]]:
         """Return each limit for a connection, the name it counts under, and the refusal text."""
         if not token:
-            here = f"{CONNECTIONS_HERE} pages are open at the machine itself: close some"
+            here = f"{CONNECTIONS_HERE} pages are open on the robot itself: close some"
             return [(self._here, address, here)]
         alike = (
-            f"with this token {CONNECTIONS_ALIKE} pages are open at {address} already: close some, "
-            "or be invited by a token of your own"
+            f"with this token {CONNECTIONS_ALIKE} pages are open at {address} already: close "
+            "some, or ask for a token of your own"
         )
         spread = f"with this token {CONNECTIONS_OF_TOKEN} pages are open already: close some"
         full = (
-            f"there is room for {CONNECTIONS} pages, {CONNECTIONS_OF_ONE} of them from one "
+            f"only {CONNECTIONS} pages can be open, {CONNECTIONS_OF_ONE} of them from one "
             "address: close some"
         )
         return [

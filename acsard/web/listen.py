@@ -61,10 +61,10 @@ def listens(text: str) -> Listen:
     number = int(port) if port.isascii() and port.isdecimal() else 0
     if scheme not in ("http", "https") or not host or not 0 < number < 65536:
         raise UsageError(
-            f"{text} is no address; write it like http://127.0.0.1:8080 or https://0.0.0.0:8443"
+            f"{text} is not an address; write it like http://127.0.0.1:8080 or https://0.0.0.0:8443"
         )
     if scheme == "http" and not (host == "localhost" or is_loopback(host)):
-        raise UsageError(f"{text}: beyond this machine only https, with the robot's certificate")
+        raise UsageError(f"{text}: other machines may use only https, with the robot's certificate")
     return Listen(scheme == "https", host, number)
 
 
@@ -103,8 +103,8 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
-            f"{away[0].url} takes a certificate: `acsard lan init` makes one; then set bus.tls, or "
-            "--tls DIRECTORY"
+            f"{away[0].url} needs a certificate: `acsard lan init` makes one; then set bus.tls, "
+            "or --tls DIRECTORY"
         )
     if away:
         require_usable(tls)
@@ -144,6 +144,6 @@ def _bound(one: Listen, next_port: bool, both: bool) -> tuple[Listen, socket.soc
         opened.setblocking(False)
         return Listen(one.secure, one.host, port), opened
     raise InUseError(
-        f"cannot listen at {one.url}: {trouble}; stop what has it, or choose another "
-        "by --address (web.address)"
+        f"cannot listen at {one.url}: {trouble}; stop the program that uses it, or choose "
+        "another address with --address (web.address)"
     ) from None

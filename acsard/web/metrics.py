@@ -41,21 +41,31 @@ def text(
     def add(name: str, kind: Kind, what: str, samples: Iterable[Sample]) -> None:
         lines.extend(_family(f"acsard_{name}", kind, what, robot, samples))
 
-    add("up", "gauge", "1 while the daemon is heard", [({}, float(heard))])
+    add("up", "gauge", "1 while messages from the daemon arrive", [({}, float(heard))])
     if state is not None and heard:
         for name, kind, what, samples in _of_robot(state):
             add(name, kind, what, samples)
     add("page_viewers", "gauge", "pages and programs connected", [({}, viewers)])
-    add("page_total", "counter", "what the page's server did", _by("what", counts))
-    add("page_refused_total", "counter", "what it refused, by reason", _by("reason", refused))
+    add("page_total", "counter", "actions of the page's server, by kind", _by("what", counts))
+    add(
+        "page_refused_total",
+        "counter",
+        "requests that the page's server refused, by reason",
+        _by("reason", refused),
+    )
     return "\n".join(lines) + "\n"
 
 
 def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Sample]]]:
     modes = [({"mode": mode.value}, float(mode.value == state.mode)) for mode in Mode]
-    yield "mode", "gauge", "1 for the mode it is in", modes
+    yield "mode", "gauge", "1 for the robot's present mode, else 0", modes
     links = [({"state": link}, float(link == state.link)) for link in get_args(State)]
-    yield "link", "gauge", "1 for the state of the link to the microcontroller", links
+    yield (
+        "link",
+        "gauge",
+        "1 for the present state of the link to the microcontroller, else 0",
+        links,
+    )
     if state.linear is not None and state.angular is not None:
         yield "linear_speed_mps", "gauge", "measured, forward", [({}, state.linear)]
         yield "angular_speed_radps", "gauge", "measured, to the left", [({}, state.angular)]

@@ -63,7 +63,7 @@ def _value(key: str, kind: str) -> type[Struct]:
         [
             ("value", _raw({"anyOf": [_ref(kind), {"type": "null"}]})),
             ("age", Annotated[float, Meta(ge=0, description="ms")]),
-            ("robot", Annotated[str, Meta(description="only of another robot")], ""),
+            ("robot", Annotated[str, Meta(description="only for another robot")], ""),
         ],
         namespace={"__doc__": "The newest message of this key; null if it is not readable."},
         tag_field="key",
@@ -76,7 +76,7 @@ VALUES = tuple(_value(key, kind) for key, kind in KEYS.items())
 ERRORS = {
     "401": "The token is missing or not valid.",
     "403": "The role is too low, or the request came through a proxy or from another web page.",
-    "429": "Too many requests, or wrong tokens.",
+    "429": "Too many requests, or too many wrong tokens.",
     "default": "Any other failure.",
 }
 """Errors of every path. The body says why, in words."""
@@ -101,9 +101,9 @@ def document(version: str, routes: Sequence[Route]) -> Described:
         "info": {
             "title": "acsard",
             "version": version,
-            "description": "The robot's page, for programs. On the robot itself no token is needed."
-            " From elsewhere the header `Authorization: Bearer ...` has one. `security` names the "
-            "least role of the token.",
+            "description": "The robot's page, for programs. On the robot itself no token is "
+            "needed. From other machines the header `Authorization: Bearer ...` "
+            "carries the token. `security` names the least role of the token.",
         },
         "paths": paths,
         "components": {

@@ -62,16 +62,19 @@ class BlackBox:
         except (OSError, TimeoutError) as error:
             raise _unread(place, error) from None
         if found is None:
-            text = "there is no such recording; GET /api/recordings lists them"
+            text = "this recording does not exist; GET /api/recordings lists them"
             raise RefusedError("path", text)
         return found
 
     def _place(self) -> Path:
         host = self._robots.endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
         if not (is_loopback(host) or host == "localhost"):
-            raise TroubleError(404, "the recordings are on the robot; this page's server is not")
+            raise TroubleError(
+                404,
+                "the recordings are on the robot, but this page's server runs on another machine",
+            )
         if not self._robots.about.recordings:
-            raise TroubleError(404, "nothing is recorded: record.directory is empty")
+            raise TroubleError(404, "nothing is recorded, because record.directory is empty")
         return Path(self._robots.about.recordings)
 
 
@@ -83,7 +86,7 @@ def rows(directory: Path) -> list[Recording]:
 def _row(path: Path) -> Recording:
     size = path.stat().st_size
     if path.name.endswith(PART):
-        return Recording(path.name, _begun(path), None, size, "being written, or cut")
+        return Recording(path.name, _begun(path), None, size, "being recorded, or cut off")
     try:
         last = closing(path)
     except RecordingError as error:

@@ -72,16 +72,16 @@ SAID = 2000
 
 TOO_LONG = (
     f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
-    "faster machine by acsard log report"
+    "faster machine with acsard log report"
 )
 TOO_MUCH = (
-    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, by acsard log report"
+    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, with acsard log report"
 )
 KILLED = (
-    "it was ended from outside, for want of memory most likely: draw it on another machine, by "
+    "the system ended it, most likely because memory ran out: draw it on another machine, with "
     "acsard log report"
 )
-TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, by acsard log report --from --to"
+TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, with acsard log report --from --to"
 
 State = Literal["drawing", "ready", "failed", "busy"]
 
@@ -90,7 +90,7 @@ class ReportState(Struct, frozen=True, omit_defaults=True):
     """ReportState of a report."""
 
     report: State
-    text: Annotated[str, Meta(description="why it failed, or what this request waits for")] = ""
+    text: Annotated[str, Meta(description="why it failed, or the reason to wait")] = ""
     percent: int = 0
     seconds: Annotated[float, Meta(description="since the drawing began")] = 0.0
     href: Annotated[str, Meta(description="the finished report, relative to the page")] = ""
@@ -198,7 +198,7 @@ class Reports:
         if code == -signal.SIGKILL:
             raise _FailedError(KILLED)
         if code:
-            raise _FailedError(_why(said) or f"the program that draws it ended with {code}")
+            raise _FailedError(_why(said) or f"the drawing program ended with {code}")
         return body
 
 

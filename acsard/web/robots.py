@@ -143,7 +143,7 @@ class Robots:
             try:
                 return await self.streams.follow(self.client, self.id, key)
             except UNREADY:
-                self.gone = "the bus is stuck; it is tried again"
+                self.gone = "the bus is stuck; the page tries again"
                 await asyncio.sleep(AGAIN_S)
 
     async def _watch(self, states: Stream) -> None:
@@ -162,9 +162,11 @@ class Robots:
                 asking = asyncio.create_task(self._ask_state())
             quiet = follower.silent(now)
             if quiet and follower.unreadable:
-                self.gone = "the daemon's state cannot be read: is it of another version?"
+                self.gone = (
+                    "the daemon's state cannot be read: does the daemon have another version?"
+                )
             elif quiet and (follower.heard or not self.gone):
-                self.gone = f"nothing is heard of the daemon at {self.endpoint}: does it run?"
+                self.gone = f"nothing is received from the daemon at {self.endpoint}: does it run?"
             elif follower.heard and not quiet and self.gone:
                 self.gone = ""
                 self.ask_anew()

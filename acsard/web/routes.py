@@ -118,7 +118,7 @@ def services(handler: Handler) -> Iterator[Route]:
     for key, verb in VERBS.items():
         gives = {
             200: Body("It was done.", "ServiceReply"),
-            409: Body("It was not done, and why.", "ServiceReply"),
+            409: Body("It was not done; the reason is in the answer.", "ServiceReply"),
         }
         yield Route(
             "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],

@@ -107,8 +107,8 @@ class Vault:
         if self.path.parent == service or not os.path.lexists(service):
             return ""
         return (
-            f"kept in {self.path}, which the service on this machine does not read: for its page "
-            "do the same with sudo"
+            f"written to {self.path}, which the service on this machine does not read: for the "
+            "page of the service use sudo"
         )
 
     def invite(self, role: Role, name: str, days: int, hours: int = 0) -> tuple[str, Token]:
@@ -121,7 +121,9 @@ class Vault:
             tokens[:] = [one for one in tokens if one.ends > now_s]
             ours = [one for one in tokens if one.robot == self.robot]
             if any(one.name == name for one in ours):
-                raise UsageError(f"there is a token {name} already: another --name, or --revoke it")
+                raise UsageError(
+                    f"a token {name} exists already: choose another --name, or --revoke it"
+                )
             if len(ours) >= MOST:
                 raise UsageError(f"there are {MOST} tokens already: --revoke some")
             text = secrets.token_urlsafe(32)
@@ -166,8 +168,8 @@ class Vault:
             return []
         except msgspec.MsgspecError as error:
             raise UsageError(
-                f"{self.path} cannot be read as tokens ({error}): mend it, or move it away and "
-                "invite all anew"
+                f"{self.path} cannot be read as tokens ({error}): correct it, or move it away "
+                "and invite all users again"
             ) from None
 
     def _write(self, tokens: list[Token]) -> None:

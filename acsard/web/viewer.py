@@ -129,7 +129,7 @@ class Viewer:
             self._counts.refuse("too_big", self.who.origin)
             return
         if message.type != aiohttp.WSMsgType.TEXT:
-            self._out.refuse("message", "malformed", "messages are JSON as text")
+            self._out.refuse("message", "malformed", "messages must be JSON as text")
             return
         room = self._bucket.take(clock.mono_ns())
         if not room:
@@ -143,7 +143,9 @@ class Viewer:
             if room or urgent:
                 self._obey(frame)
             else:
-                self._out.refuse("message", "too_fast", f"over {MESSAGES.hz:g} messages a second")
+                self._out.refuse(
+                    "message", "too_fast", f"more than {MESSAGES.hz:g} messages a second"
+                )
         if self._overruns >= OVERRUNS:
             self.end("too many messages")
 
@@ -183,7 +185,7 @@ class Viewer:
             stamp_ns += 1
         if stamp_ns <= self._stamp_ns:
             self._out.refuse(
-                "cmd", "replayed", "stamp must be later than that of the command before"
+                "cmd", "replayed", "stamp must be later than that of the previous command"
             )
             return
         self._stamp_ns = stamp_ns
@@ -204,7 +206,7 @@ class Viewer:
             self._start(self._answer(frame), self._stops)
         else:
             if self._calling >= CALLS_AT_ONCE:
-                self._out.refuse("call", "too_fast", f"{CALLS_AT_ONCE} calls are under way")
+                self._out.refuse("call", "too_fast", f"{CALLS_AT_ONCE} calls are running already")
                 return
             self._calling += 1
             self._start(self._answer(frame))

@@ -83,7 +83,7 @@ def says_what_it_could_not_see(result: dict[str, Any]) -> None:
 def test_a_port_that_is_not_there_is_66(tmp_path: Path) -> None:
     done = finish(acsard("bench", "--port", str(tmp_path / "nothing")), tmp_path)
     assert (done.code, done.out) == (66, "")
-    assert "is not there" in done.err
+    assert "does not exist" in done.err
 
 
 @pytest.mark.parametrize("what", ["/tmp", "/etc/passwd"])

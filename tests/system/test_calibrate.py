@@ -318,7 +318,7 @@ def test_space_while_it_drives_stops_within_the_ramp_and_writes_nothing(tmp_path
             assert took < 0.3 + 0.4 + lost(pressed, pressed + took)
             assert program.ended(5.0) == 1
             assert "a key was pressed" in terminal.screen
-            assert "nothing is written" in terminal.screen
+            assert "writes nothing" in terminal.screen
         assert daemon.config.read_bytes() == before
 
 
@@ -352,7 +352,7 @@ def test_a_daemon_that_dies_ends_the_leg(tmp_path: Path) -> None:
             begun(terminal, program, bus)
             daemon.process.kill()
             assert program.ended(10.0) == 1
-            assert "no word from the daemon" in terminal.screen
+            assert "nothing received from the daemon" in terminal.screen
 
 
 @pytest.mark.soak
@@ -404,7 +404,7 @@ def test_what_is_no_position_and_what_does_not_come_is_told(
     monkeypatch.setattr(legs, "FIRST_S", 0.2)
     with router(free) as said, client_session(free, "") as heard:
         sensor = Sensor(heard, "slam/pose", POSITIONS)
-        with pytest.raises(GuideError, match="does not come on slam/pose"):
+        with pytest.raises(GuideError, match="does not arrive on slam/pose"):
             sensor.await_first("a position")
 
         def came() -> int:

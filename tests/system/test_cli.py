@@ -219,10 +219,13 @@ def test_echo_of_silence_ends_with_1_after_its_timeout(shared: Daemon) -> None:
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (["echo", "state", "--short", "--id", "acsra"], "no robot acsra is there; there is acsar"),
-        (["hz", "odom", "--id", "acsra"], "no robot acsra is there; there is acsar"),
-        (["echo", "imu", "--csv", "--id", "acsra"], "no robot acsra is there; there is acsar"),
-        (["echo", "cmd/nobody"], "robot acsar is there, but nobody sends on cmd/nobody now"),
+        (
+            ["echo", "state", "--short", "--id", "acsra"],
+            "there is no robot acsra, but there is acsar",
+        ),
+        (["hz", "odom", "--id", "acsra"], "there is no robot acsra, but there is acsar"),
+        (["echo", "imu", "--csv", "--id", "acsra"], "there is no robot acsra, but there is acsar"),
+        (["echo", "cmd/nobody"], "robot acsar is there, but no program sends on cmd/nobody now"),
     ],
 )
 def test_who_waits_for_what_does_not_come_is_told_why_once_and_goes_on_waiting(

@@ -411,7 +411,7 @@ def test_a_drive_without_its_daemon_raises(tmp_path: Path) -> None:
 
         with ThreadPoolExecutor(1) as other:
             killing = other.submit(kill)
-            with pytest.raises(NoAnswerError, match="no word from the daemon"):
+            with pytest.raises(NoAnswerError, match="nothing received from the daemon"):
                 robot.drive(0.3, seconds=30.0)
             killing.result()
 
@@ -442,7 +442,7 @@ def test_a_drive_of_a_robot_that_dies_behind_a_router_with_storages_raises(tmp_p
             daemon.signal(signal.SIGKILL)
 
         killing = stack.enter_context(ThreadPoolExecutor(1)).submit(kill)
-        with pytest.raises(NoAnswerError, match="no word from the daemon"):
+        with pytest.raises(NoAnswerError, match="nothing received from the daemon"):
             robot.drive(0.3, seconds=4.0)
         killing.result()
         assert answered

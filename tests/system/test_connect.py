@@ -55,7 +55,7 @@ def test_a_peer_says_that_its_router_is_missing_and_that_it_came_and_went(tmp_pa
         toml = f'[bus]\nlisten = ["{daemon.endpoint}"]\nconnect = ["{meeting}"]\n'
         _, found = examined(tmp_path, toml)
         says = [(one["level"], one["text"]) for one in found["router"]]
-        assert ("warning", f"nobody listens at {meeting}") in says
+        assert ("warning", f"no program listens at {meeting}") in says
         assert ("warning", f"the daemon is not connected to {meeting}") in says
         with router(tmp_path, meeting) as there:
             assert told(daemon, "router_found", 1) == f"connected to {meeting}"
@@ -76,7 +76,7 @@ def test_a_client_says_that_its_router_went_and_came_back(tmp_path: Path) -> Non
     with Daemon(tmp_path, config=config, ready=False) as daemon:
         until(lambda: daemon.events("connecting"), 20.0, "it waits for its router")
         _, found = examined(tmp_path, toml)
-        assert found["router"][0]["text"] == f"nobody listens at {meeting}"
+        assert found["router"][0]["text"] == f"no program listens at {meeting}"
         assert "the router" in found["daemon"][0]["text"]
         with router(tmp_path, meeting):
             told(daemon, "router_found", 1)
@@ -108,10 +108,10 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
         toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
         _, found = examined(tmp_path, toml + f'connect = ["{one.endpoint}"]\n')
         (mend,) = (each["mend"] for each in found["router"] if "not a router" in each["text"])
-        assert "a router that all connect to" in mend
+        assert "a router between all of them" in mend
         stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
         assert stopped.out.startswith("one: stopped")
-        assert f"all seen at {one.endpoint}: 1 robot" in stopped.err
+        assert f"all robots visible at {one.endpoint}: 1 robot" in stopped.err
         assert one.events("no_router") == []  # `one` has no router to connect to
         with Bus(two.endpoint, robot_id="two") as bus:
             assert bus.state()["mode"] != "stopped"

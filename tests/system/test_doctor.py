@@ -79,7 +79,7 @@ def test_every_mistake_in_the_configuration_is_a_failure(tmp_path: Path) -> None
 def test_a_port_that_is_not_there_is_a_failure_with_what_there_is(tmp_path: Path) -> None:
     code, found = examined(tmp_path, toml("/dev/acsar_that_is_not"))
     assert code == 1
-    assert "is not there" in worst(found["port"])["text"]
+    assert "does not exist" in worst(found["port"])["text"]
     assert "acsard ports" in worst(found["port"])["mend"]
 
 
@@ -88,7 +88,7 @@ def test_a_port_that_is_a_file_is_a_failure(tmp_path: Path) -> None:
     file.touch()
     code, found = examined(tmp_path, toml(str(file)))
     assert code == 1
-    assert "no serial device" in worst(found["port"])["text"]
+    assert "not a serial device" in worst(found["port"])["text"]
 
 
 def test_who_holds_the_port_is_named_with_the_pid(tmp_path: Path, terminal: str) -> None:
@@ -144,7 +144,7 @@ def test_a_daemon_that_was_started_with_listen_and_id_is_asked_by_them(tmp_path:
         _, blind = examined(tmp_path, file)
         _, nameless = examined(tmp_path, file, "--connect", where)
         _, found = examined(tmp_path, file, "--connect", where, "--id", "other")
-    assert blind["daemon"][-1]["text"] == f"nobody listens at {daemon.endpoint}"
+    assert blind["daemon"][-1]["text"] == f"no program listens at {daemon.endpoint}"
     assert "--connect" in blind["daemon"][-1]["mend"]
     assert nameless["daemon"][-1]["level"] == "failure"
     assert "--id" in nameless["daemon"][-1]["mend"]
@@ -277,7 +277,7 @@ def test_certificates_that_are_missing_are_named(tmp_path: Path) -> None:
 
 def test_a_router_on_a_plain_endpoint_is_a_warning(tmp_path: Path) -> None:
     _, found = examined(tmp_path, toml(more='connect = ["tcp/127.0.0.1:7447"]\n'))
-    assert "everyone behind that router" in worst(found["bus"])["text"]
+    assert "every program behind that router" in worst(found["bus"])["text"]
 
 
 def test_for_people_each_finding_is_a_line_and_its_mend_another(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_a_door_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
     assert robot.lets_in()
     assert gone(first)
     (line,) = robot.daemon.events("door_ended")
-    assert "stopped, or hung" in line["text"]
+    assert "stopped or hung" in line["text"]
 
 
 def test_a_machine_that_stood_still_opens_no_door_anew(robot: Open) -> None:

@@ -546,7 +546,7 @@ def test_a_page_by_tls_has_a_card_of_its_own_robot_and_says_why_of_no_other(
             await ours.say(subscribe="fleet")
             seen = await ours.find(lambda said: said.get("fleet"))
             assert [(one["robot"], one["mode"]) for one in seen["fleet"]] == [("robot1", "ready")]
-            assert "keys pass by their names alone" in seen["note"]
+            assert "passes only exact keys" in seen["note"]
 
     by_tls = ["--connect", fleet.endpoint, "--tls", str(fleet.where / name), "--id", "robot1"]
     with Page(fleet.daemons[0], tmp_path, *by_tls) as page:

@@ -353,7 +353,7 @@ def test_the_bus_is_followed_for_what_is_shown_only(viewer: Viewer, bus: Bus) ->
     def listened() -> bool:
         return bool(publisher.matching_status.matching)
 
-    until(lambda: not listened(), 5.0, "nobody listens at first")
+    until(lambda: not listened(), 5.0, "no program listens at first")
     looked = viewer.show("/tf")
     until(listened, 5.0, "somebody listens")
     looked.hide()
@@ -397,7 +397,7 @@ def test_services_answer_in_the_daemon_s_words(viewer: Viewer, bus: Bus) -> None
     assert bus.state()["y"] == 2.0
     refused = viewer.call("/acsard/set_pose", {"x": "here"})
     assert not refused["success"]
-    assert "set_pose wants {x, y, yaw}" in refused["message"]
+    assert "set_pose needs {x, y, yaw}" in refused["message"]
     assert viewer.call("/acsard/deactivate", {})["success"]
     assert bus.state()["mode"] == "inactive"
     assert viewer.call("/acsard/activate", {})["success"]
@@ -571,7 +571,7 @@ def test_a_daemon_that_is_gone_is_told_and_waited_for(tmp_path: Path) -> None:
         looked = viewer.show("/odom")
         looked.first()
         daemon.signal(signal.SIGKILL)
-        gone = viewer.status("the daemon of acsar is gone: it is waited for")
+        gone = viewer.status("the daemon of acsar is gone; this bridge waits for it")
         with Viewer(own.port) as late:
             late.show("/odom")
             late.status("is gone")

@@ -156,7 +156,10 @@ def test_a_stop_to_all_reaches_each_without_anybody_having_been_found(robots: Ro
 
 def test_fleet_is_a_line_for_each_robot_with_what_it_does_and_why(robots: Robots) -> None:
     ended = robots.tool("fleet", "--once")
-    assert (ended.code, ended.err) == (0, f"acsard: all seen at {robots.endpoint}: 2 robots")
+    assert (ended.code, ended.err) == (
+        0,
+        f"acsard: all robots visible at {robots.endpoint}: 2 robots",
+    )
     head, *rows = ended.out.splitlines()
     assert head.split() == ["ROBOT", "MODE", "M/S", "LINK", "VERSION", "HEARD", "WHY"]
     assert [row.split()[0] for row in rows] == [ONE, TWO]
@@ -234,7 +237,10 @@ def test_a_named_robot_that_is_not_there_is_said(robots: Robots) -> None:
 
 def test_stop_of_all_stops_each_and_says_who_answered(robots: Robots) -> None:
     ended = robots.tool("call", "stop")
-    assert (ended.code, ended.err) == (0, f"acsard: all seen at {robots.endpoint}: 2 robots")
+    assert (ended.code, ended.err) == (
+        0,
+        f"acsard: all robots visible at {robots.endpoint}: 2 robots",
+    )
     assert [line.partition(":")[0] for line in ended.out.splitlines()] == [ONE, TWO]
     modes = {}
     for name in (ONE, TWO):
@@ -290,7 +296,7 @@ def test_nobody_there_is_said_with_69(tmp_path: Path) -> None:
         for words in (("fleet", "--once"), ("call", "stop"), ("get", "info")):
             ended = nobody.tool(*words)
             assert (ended.code, ended.out) == (69, "")
-            assert "no robot is seen" in ended.err
+            assert "no robot is visible" in ended.err
 
 
 @pytest.mark.slow

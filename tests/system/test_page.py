@@ -446,7 +446,7 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     try:
         page.shows("age", "STALE")
         page.shows("mode", "NOT HEARD")  # the page cannot know whether it still drives
-        page.shows("reason", "nothing is heard of the daemon")
+        page.shows("reason", "nothing is received from the daemon")
         assert page.browser.js("document.body.classList.contains('stale')")
     finally:
         page.daemon.signal(signal.SIGCONT)
@@ -467,9 +467,9 @@ def test_a_page_that_comes_when_nothing_is_heard_waits_and_shows_nothing_as_meas
     browser = page.browser
     page.daemon.signal(signal.SIGSTOP)
     try:
-        page.shows("reason", "nothing is heard of the daemon")
+        page.shows("reason", "nothing is received from the daemon")
         browser.open(page.server.here)
-        page.shows("reason", "nothing is heard of the daemon")
+        page.shows("reason", "nothing is received from the daemon")
         browser.js("new Promise(done => setTimeout(done, 500))")  # more than one poll
         said = [browser.text(one) for one in ("mode", "age", "speed", "turn", "who")]
         assert said == ["WAITING", "waiting", "–", "–", "–"]
@@ -650,7 +650,7 @@ def test_a_page_that_has_no_place_says_why_and_stops(page: Phone) -> None:
 
     def look() -> None:
         page.browser.open(page.server.here)
-        page.shows("reason", f"{CONNECTIONS_HERE} pages are open at the machine itself")
+        page.shows("reason", f"{CONNECTIONS_HERE} pages are open on the robot itself")
         page.browser.tap("stop")
         until(lambda: page.bus.state()["mode"] == "stopped", 5.0, "it stops all the same")
 

@@ -123,7 +123,7 @@ def test_a_port_for_which_there_was_no_thread_is_opened_by_the_next_try() -> Non
         tty.setraw(master)
         path = os.ttyname(slave)
         assert asyncio.run(opened())
-        assert "no room for another thread" in told[0].text
+        assert "cannot start another thread" in told[0].text
     finally:
         os.close(master)
         os.close(slave)

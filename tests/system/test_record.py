@@ -43,7 +43,7 @@ def replayed(where: Path, path: Path) -> int:
     """Return the number of lines, and check that all of them replay the same."""
     ended = finish(acsard("log", "replay", str(path)), where)
     assert ended.code == 0, ended
-    found = re.match(r"([\d ]+) of ([\d ]+) lines the same", ended.out)
+    found = re.match(r"([\d ]+) of ([\d ]+) lines are the same", ended.out)
     assert found, ended
     assert found[1] == found[2]
     return int(found[1].replace(" ", ""))
@@ -86,7 +86,7 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
     assert replayed(tmp_path, whole) == lines
     listed = finish(acsard("log", "--directory", str(tmp_path / "record")), tmp_path)
     assert whole.name in listed.out.splitlines()[0]
-    assert "[cut: the daemon or the computer ended without a word]" in listed.out.splitlines()[0]
+    assert "[cut: the daemon or the computer ended without notice]" in listed.out.splitlines()[0]
 
 
 BUG = """\
@@ -116,7 +116,7 @@ def test_a_fault_of_the_daemons_own_is_told_and_what_came_into_that_step_is_in_t
     assert path.name.endswith(".kept.mcap")
     for words in ((), ("show",)):
         said = finish(acsard("log", *words, "--directory", str(path.parent)), tmp_path).out
-        assert "the daemon ended by a fault of its own: in step " in said
+        assert "the daemon ended because of an error in the daemon: in step " in said
         assert "ZeroDivisionError: a fault of our own" in said
     assert replayed(tmp_path, path) > 3
     again = finish(acsard("log", "replay", str(path)), tmp_path)

@@ -262,7 +262,7 @@ def test_a_second_daemon_of_the_same_robot_on_another_bus_ends_with_75(
         path = write_config(tmp_path / "second.toml", tables)
         second = finish(acsard("run", "--config", str(path)), tmp_path)
     assert second.code == 75
-    assert "another daemon keeps the stop of robot acsar" in second.err
+    assert "another daemon stores the stop of robot acsar" in second.err
 
 
 def test_the_built_in_simulator_keeps_nothing(tmp_path: Path) -> None:

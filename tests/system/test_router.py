@@ -57,7 +57,7 @@ def test_one_that_is_stopped_is_ended_and_there_again(where: Path) -> None:
         os.kill(first, signal.SIGSTOP)
         listens(router, 2)
         assert gone(first)
-        assert "stopped, or hung" in router.stderr
+        assert "stopped or hung" in router.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])

@@ -97,8 +97,8 @@ def test_the_directory_is_looked_at_before_the_network(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("robot_has", "sentence"),
     [
-        ("robot ended", "the certificate of 127.0.0.1 has ended, by this machine's clock"),
-        ("robot later", "does not count yet by this machine's clock"),
+        ("robot ended", "the certificate of 127.0.0.1 has expired, by this machine's clock"),
+        ("robot later", "is not valid yet, by this machine's clock"),
         ("robot elsewhere", "lan renew --address 127.0.0.1"),
     ],
 )
@@ -115,9 +115,9 @@ def test_what_is_wrong_with_the_robot_s_certificate(
 @pytest.mark.parametrize(
     ("shown", "sentence"),
     [
-        ("stranger", "is of another authority than"),
-        ("mixed", "it is of another authority than the robot's"),
-        ("ended", "has ended or does not count yet"),
+        ("stranger", "comes from another authority than"),
+        ("mixed", "it comes from another authority than the robot's"),
+        ("ended", "has expired or is not valid yet"),
     ],
 )
 def test_what_is_wrong_with_ours(tls: Path, robot: str, shown: str, sentence: str) -> None:
@@ -131,7 +131,7 @@ def test_a_name_that_does_not_resolve(tls: Path) -> None:
 
 def test_a_port_where_nobody_listens(tls: Path) -> None:
     endpoint = free_endpoint().replace("tcp/", "tls/")
-    assert "nobody listens on port" in str(told(endpoint, str(tls / "client")))
+    assert "no program listens on port" in str(told(endpoint, str(tls / "client")))
 
 
 def test_one_that_speaks_no_tls(tls: Path) -> None:

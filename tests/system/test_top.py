@@ -75,7 +75,7 @@ def test_top_shows_the_robot_in_a_pipe_and_at_a_terminal_and_outlives_its_daemon
 
         daemon.signal(signal.SIGKILL)
         daemon.ended(5.0)
-        told = shows(terminal, "s: is the daemon running?", 5.0)
+        told = shows(terminal, "s: does the daemon run?", 5.0)
         assert len(told) == SIZE[1]
         with Daemon(tmp_path, endpoint=daemon.endpoint, name="again"):
             shows(terminal, " READY ", 5.0)
@@ -97,5 +97,5 @@ def test_once_shows_the_state_of_this_moment_however_seldom_it_is_published(tmp_
         done = finish(acsard("top", "--once", "--config", str(daemon.config)), tmp_path)
     assert (done.code, done.err) == (0, "")
     assert re.search(r"^ [A-Z]+  ", done.out, re.M)
-    assert "NO NEWS" not in done.out
+    assert "NOTHING RECEIVED" not in done.out
     assert re.search(r"lines +in +[\d.]+/s of [\d,]+ +out", done.out)

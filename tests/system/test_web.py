@@ -226,7 +226,7 @@ def test_a_path_with_another_method_says_which_it_takes(page: Page) -> None:
         async with aiohttp.ClientSession(page.here) as session:
             async with session.get("/api/srv/stop") as answer:
                 assert (answer.status, answer.headers["Allow"]) == (405, "POST")
-                assert (await answer.json())["error"] == "this path takes POST"
+                assert (await answer.json())["error"] == "this path accepts only POST"
             async with session.post("/api/nothing") as answer:
                 assert answer.status == 404
 

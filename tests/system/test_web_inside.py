@@ -91,7 +91,7 @@ def test_who_is_told_to_go_drives_no_more_though_he_does_not_read(inside: Inside
             wire = cast(Any, ours.socket)._response.connection.transport
             wire.pause_reading()
             viewer._out.say({"more than a kernel holds": "x" * 20_000_000})
-            inside.page.end_all("your token has ended")
+            inside.page.end_all("your token has expired")
             before = inside.counts.all()
             for _ in range(20):
                 await ours.drive(0.5)

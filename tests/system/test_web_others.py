@@ -111,7 +111,7 @@ def test_beside_a_daemon_it_says_why_it_sees_no_others(two: Two, tmp_path: Path)
             await ours.say(subscribe="fleet")
             seen = await ours.find(lambda said: said.get("fleet"))
             assert [one["robot"] for one in seen["fleet"]] == [OURS]
-            assert "daemons hand on nothing" in seen["note"]
+            assert "daemons forward no messages" in seen["note"]
             assert f"acsard web --connect ROUTER --id {OURS}" in seen["note"]
 
     with Page(two.daemon, tmp_path) as beside:

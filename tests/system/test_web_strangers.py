@@ -163,7 +163,7 @@ def test_who_drives_and_is_revoked_is_sent_away_within_a_second_and_the_robot_st
             ended = time.monotonic()
             assert (message.type, message.extra) == (
                 aiohttp.WSMsgType.CLOSE,
-                "your token has ended",
+                "your token has expired",
             )
             # The server looks it up that often, and may wait for a core as this process does.
             assert ended - begun < TIDY_S + PASSES_S + 4 * lost(begun, ended)
@@ -259,7 +259,7 @@ def test_what_is_no_request_is_refused_in_words_like_the_rest(page: Page, bus: B
     port = int(page.here.rpartition(":")[2])
     for said, reason, words in [
         (b"GET /api/state HTTP/1.1\r\n\r\n", "host", "no `Host`"),
-        (b"\x16\x03\x01\x00\x00 hello\r\n\r\n", "malformed", "no HTTP request"),
+        (b"\x16\x03\x01\x00\x00 hello\r\n\r\n", "malformed", "not an HTTP request"),
     ]:
         with socket.create_connection(("127.0.0.1", port), 30.0) as held:
             held.sendall(said)
@@ -361,6 +361,6 @@ def test_any_program_that_drives_is_told_in_words_why_it_is_sent_away(page: Page
 
     async def story() -> None:
         told = await asyncio.gather(plain("trusted2"), other("trusted3"))
-        assert set(told) == {(1008, "your token has ended")}
+        assert set(told) == {(1008, "your token has expired")}
 
     run(story)

@@ -32,7 +32,7 @@ from tests.system.viewer import Viewer
 pytestmark = pytest.mark.network
 
 
-SILENCE = "gets no answer either; yours is unlisted"
+SILENCE = "your certificate, unlisted, may be missing from every role"
 """The last part of the message for a silence that may have any cause."""
 
 
@@ -147,7 +147,7 @@ def test_a_wrong_id_is_asked_about_before_any_list(
     ended = robot.tool("operator", *words, "--id", "robot1")
     told = ended.out + ended.err
     assert ended.code != 0
-    assert f"nobody answers as 'robot1' at {robot.tls}" in told
+    assert f"no daemon answers as 'robot1' at {robot.tls}" in told
     assert f"acsard/robot1/{key}" in told
     assert told.index("is --id right") < told.index("role's list")
     assert "add that name" not in told
@@ -213,7 +213,7 @@ def test_a_viewer_s_foxglove_is_told_what_he_may(robot: Robot) -> None:
             assert viewer.call("/acsard/stop", {})["success"]
             for source in ("nav", "app"):
                 viewer.show(f"/cmd_vel_in/{source}")
-            deaf = "what the sources command (/cmd_vel_in/…) is told to nobody who comes by TLS"
+            deaf = "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…)"
             viewer.status(deaf)
         with Viewer(port) as late:
             late.show("/odom").first()

@@ -49,7 +49,7 @@ SERVICE_ROLES: dict[Verb, Role] = {
 MAY: dict[Role, str] = {
     "viewer": "it may follow and stop, not drive",
     "operator": "it may drive by the listed sources, stop and clear",
-    "maintainer": "it may do all",
+    "maintainer": "it has every permission",
 }
 """What each role may do, for the message of a tool that was refused."""
 

@@ -72,11 +72,11 @@ def _named_by_environment() -> Config:
         return parse(Path(named).read_bytes() if named else b"", given)
     except OSError as error:
         raise UsageError(
-            f"cannot read {named}, which ACSARD_CONFIG names: {error.strerror}; name a file that "
-            "is there, or unset it"
+            f"cannot read {named}, the file in ACSARD_CONFIG: {error.strerror}; name an existing "
+            "file, or unset ACSARD_CONFIG"
         ) from None
     except ConfigError as error:
-        where = f"{named}, which ACSARD_CONFIG names" if named else "the environment"
+        where = f"{named}, the file in ACSARD_CONFIG" if named else "the environment"
         raise UsageError(f"{where}: {'; '.join(error.problems)}") from None
 
 
@@ -86,7 +86,7 @@ def require_id(robot_id: str) -> None:
         convert(robot_id, Name)
     except ValidationError:
         raise UsageError(
-            f"{robot_id!r} is not a robot's id: write 1 to 32 of A-Z a-z 0-9 _ -, as robot.id "
+            f"{robot_id!r} is not a robot's id: write 1 to 32 of A-Z a-z 0-9 _ -, like robot.id "
             "in its acsard.toml"
         ) from None
 

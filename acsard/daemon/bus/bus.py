@@ -247,8 +247,8 @@ class ZenohBus:
         """Return the error if another daemon has this robot's id or ROS names, else ""."""
         if self._alive in seen:
             return (
-                f"another daemon on this bus already is {self._id}; "
-                "give this robot its own robot.id"
+                f"another daemon on this bus already has the id {self._id}; give this robot its "
+                "own robot.id"
             )
         ways = [way for way in ("bridge", "rmw") if any(f"/@ros/{way}/" in one for one in seen)]
         if ways:
@@ -256,7 +256,8 @@ class ZenohBus:
             return (
                 f'another robot on this bus already has ros.namespace = "{self._ros.namespace}": '
                 f"one cmd_vel of ROS, by {' or '.join(ways)}, would drive both; give this robot "
-                f"its own, in [ros] namespace or by `acsard run --namespace NAME`, or {off}"
+                "its own namespace, in [ros] namespace or by `acsard run --namespace NAME`, or "
+                f"{off}"
             )
         return ""
 

@@ -66,19 +66,22 @@ class Identity(Struct, frozen=True):
         where = f" at {self.endpoint}" if self.endpoint else ""
         asked = full_key(self.robot, whoami_key(ROLES[0])) if self.robot else ""
         who = f" as '{self.robot}'{where} (asked: {asked})" if asked else where
-        told = f"nobody answers{who}: is --id right, and does that robot's daemon run, unstuck?"
+        told = (
+            f"no daemon answers{who}: is --id right, and does that robot's daemon run and answer?"
+        )
         if not self.certificate:
             return told
         return (
-            f"{told} If so: a certificate in no role's list ([access] in the robot's acsard.toml; "
-            f"behind a router the router's) gets no answer either; yours is {self.certificate}"
+            f"{told} If so, your certificate, {self.certificate}, may be missing from every "
+            "role's list ([access] in the robot's acsard.toml; behind a router, the router's "
+            "list). The robot answers only certificates in a list"
         )
 
     def words(self) -> str:
         """Return the role and the certificate in a sentence."""
         if self.role:
             whose = f"your certificate {self.certificate}" if self.certificate else "you, without"
-            whose += "" if self.certificate else " a certificate here, by this link"
+            whose += "" if self.certificate else " a certificate that is valid here, over this link"
             return f"{whose} is {self.role}: {MAY[self.role]}"
         return self._nobody()
 

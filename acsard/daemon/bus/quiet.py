@@ -31,8 +31,8 @@ def why(key: str, robot_id: str, endpoint: str, around: Around) -> str:
     """Return why no sample arrives on a key of a robot, and how to fix it."""
     if not around.linked:
         return (
-            f"nobody is connected at {endpoint} any more: the daemon or router there has ended "
-            "(`acsard run` starts a daemon), or the way to it is cut"
+            f"the endpoint {endpoint} has no connection any more: the daemon or router there has "
+            "ended (`acsard run` starts a daemon), or the network is interrupted"
         )
     if around.here:
         return f"robot {robot_id} is there, but {_silent(key)}"
@@ -42,21 +42,21 @@ def why(key: str, robot_id: str, endpoint: str, around: Around) -> str:
         near = get_close_matches(robot_id, around.others, MOST, 0.0)
         more = len(around.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")
-        return f"no robot {robot_id} is there; there is {named}: --id {near[0]}"
+        return f"there is no robot {robot_id}, but there is {named}: --id {near[0]}"
     if endpoint.startswith(TLS):
         return (
-            f"no robot {robot_id} is seen: none has this robot.id there, or your certificate may "
-            f"not see it: `acsard whoami --id {robot_id}` tells"
+            f"robot {robot_id} is not visible: no robot there has this robot.id, or your "
+            f"certificate does not permit it: `acsard whoami --id {robot_id}` tells which"
         )
-    return f"no robot is seen at {endpoint}: no daemon runs there, or behind that router"
+    return f"no robot is visible at {endpoint}: no daemon runs there, or behind that router"
 
 
 def _silent(key: str) -> str:
     row = row_of(key.removeprefix(JSON_TREE))
     if row is None:
-        return f"has no such key ({key_hint(key)})"
+        return f"it has no such key ({key_hint(key)})"
     if row.direction == "in":
-        return f"nobody sends on {key} now"
+        return f"no program sends on {key} now"
     if row.simulated:
         return f"only the simulator publishes {key}"
     return _late(key, row)
@@ -65,13 +65,16 @@ def _silent(key: str) -> str:
 def _late(key: str, row: Topic) -> str:
     match row.rate:
         case "on change":
-            return f"{key} comes on change only: `acsard get {row.key}` prints the last"
+            return (
+                f"{key} is published only when it changes: `acsard get {row.key}` prints its "
+                "last value"
+            )
         case "every feedback" | "with odom":
             return (
-                f"{key} comes with the answers of its microcontroller: `acsard echo state -n 1 "
-                "--short` says what is heard of it"
+                f"{key} is published only with answers of the microcontroller: `acsard echo "
+                "state -n 1 --short` says whether they come"
             )
     return (
-        f"{key} does not come: may you follow it (`acsard whoami`)? `acsard doctor` on the robot "
-        "looks at the daemon"
+        f"{key} does not arrive: may you follow it (`acsard whoami`)? On the robot, `acsard "
+        "doctor` checks the daemon"
     )

@@ -40,7 +40,7 @@ def named(text: str) -> tuple[str, ...]:
             require_id(one)
     except UsageError:
         raise UsageError(
-            f"--id {text}: write ids with a comma between, or '*' for all robots"
+            f"--id {text}: separate the ids by commas, or write '*' for all robots"
         ) from None
     return ids
 
@@ -87,18 +87,18 @@ def stop(session: zenoh.Session, ids: Sequence[str], sender: str) -> None:
 
 def seen(endpoint: str, robots: int) -> str:
     """Return how many robots a wildcard found and where. Elsewhere others may be visible."""
-    return f"all seen at {endpoint}: {many(robots, 'robot')}"
+    return f"all robots visible at {endpoint}: {many(robots, 'robot')}"
 
 
 def nobody(endpoint: str) -> str:
     """Return why a wildcard found no robot, as a message."""
     if endpoint.startswith(TLS):
         return (
-            "no robot is seen: over TLS only exact keys pass, so name them, --id robot1,robot2 "
-            "(or [access] wildcards = true at the robot); or your certificate may see none: "
-            "`acsard whoami --id robot1` tells"
+            "no robot is visible: over TLS only exact keys pass, so name the robots, --id "
+            "robot1,robot2 (or set [access] wildcards = true on the robot); or your certificate "
+            "permits none: `acsard whoami --id robot1` tells"
         )
-    return f"no robot is seen at {endpoint}; does a daemon run there, or behind that router?"
+    return f"no robot is visible at {endpoint}; does a daemon run there, or behind that router?"
 
 
 def follow(session: zenoh.Session, ids: Sequence[str], name: str) -> Subscription:

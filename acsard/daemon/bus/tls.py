@@ -33,8 +33,8 @@ def require_usable(directory: str) -> None:
     """
     if not Path(directory).is_dir():
         raise CertificateError(
-            f"there is no directory {directory}: name the one with {CA}, {CERTIFICATE} and {KEY} "
-            "that `acsard lan init` or `lan add` made"
+            f"there is no directory {directory}: name the directory with {CA}, {CERTIFICATE} and "
+            f"{KEY} that `acsard lan init` or `lan add` made"
         )
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
@@ -42,8 +42,8 @@ def require_usable(directory: str) -> None:
             file.read_bytes()
         except PermissionError:
             raise NotPermittedError(
-                f"no permission to read {file}: sudo, or copies of your own; a service gets its "
-                "copies by the drop-in deploy/systemd/lan.conf",
+                f"no permission to read {file}: use sudo, or make your own copies; a service "
+                "gets its copies by the drop-in deploy/systemd/lan.conf",
             ) from None
         except OSError as error:
             raise CertificateError(
@@ -57,8 +57,9 @@ def require_usable(directory: str) -> None:
         context.load_cert_chain(f"{directory}/{CERTIFICATE}", f"{directory}/{KEY}", password="")
     except (ssl.SSLError, ValueError) as error:
         raise CertificateError(
-            f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
-            "another certificate or has a password; `acsard lan init` or `lan add` makes them",
+            f"the certificates in {directory} cannot be used ({error}): they are not PEM, or the "
+            "key belongs to another certificate or has a password; `acsard lan init` or `lan "
+            "add` makes new ones",
         ) from None
 
 
@@ -158,17 +159,24 @@ def trouble(endpoint: str, directory: str) -> str:
     except socket.gaierror:
         return (
             f"the name {host} does not resolve on this machine; write the robot's IP address "
-            "(`hostname -I` there; its certificate must have it), or mend DNS, mDNS or /etc/hosts"
+            "(`hostname -I` prints it there; its certificate must contain it), or fix DNS, mDNS "
+            "or /etc/hosts"
         )
     except TimeoutError:
-        return f"{host} is silent on port {port}: is it on, and does a firewall drop connections?"
+        return (
+            f"{host} does not answer on port {port}: is it switched on, and does a firewall "
+            "drop connections?"
+        )
     except (OSError, ValueError) as error:
         if isinstance(error, OSError) and error.errno in AWAY:
             return (
-                f"{host} is not there ({error.strerror}): is it on, is it in this network, is the "
-                "address its own?"
+                f"{host} cannot be reached ({error.strerror}): is it switched on, is it in this "
+                "network, is the address right?"
             )
-        return f"nobody listens on port {port} of {host} ({error}); is the robot's bus.listen this?"
+        return (
+            f"no program listens on port {port} of {host} ({error}); does the robot's "
+            "bus.listen have this address?"
+        )
     with plain:
         return _tls_trouble(plain, host, directory)
 
@@ -188,7 +196,7 @@ def _tls_trouble(plain: socket.socket, host: str, directory: str) -> str:
     except TimeoutError:
         return ""  # the server waits for data, so both certificates are accepted
     except OSError:
-        return f"{host} ends the connection at once: is a TLS endpoint of acsard there?"
+        return f"{host} closes the connection at once: does a TLS endpoint of acsard listen there?"
     return ""
 
 
@@ -198,22 +206,25 @@ def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -
     match error.verify_code:
         case code if code == EXPIRED:
             return (
-                f"the certificate of {host} has ended, by this machine's clock ({now}); if that is "
-                "right: `acsard lan renew` where ca-key.pem is, and restart the daemon"
+                f"the certificate of {host} has expired, by this machine's clock ({now}); if the "
+                "clock is right, run `acsard lan renew` where ca-key.pem is, and restart the "
+                "daemon"
             )
         case code if code == NOT_YET:
             return (
-                f"the certificate of {host} does not count yet by this machine's clock ({now}); "
-                "set this clock (`timedatectl`), or that of the machine that made it and renew"
+                f"the certificate of {host} is not valid yet, by this machine's clock ({now}); "
+                "set this clock (`timedatectl`), or set the clock of the machine that made the "
+                "certificate and renew it"
             )
         case code if code in (WRONG_NAME, WRONG_ADDRESS):
             return (
-                f"the certificate there is not for {host}; connect by a name or address it has, or "
-                f"on the robot: `acsard lan renew --address {host}`, and restart the daemon"
+                f"the certificate there is not for {host}; connect by a name or address that it "
+                f"contains, or run on the robot: `acsard lan renew --address {host}`, and "
+                "restart the daemon"
             )
     return (
-        f"the certificate of {host} is of another authority than {directory}/{CA} "
-        f"({error.verify_message}); get a directory made by `acsard lan` for this robot"
+        f"the certificate of {host} comes from another authority than {directory}/{CA} "
+        f"({error.verify_message}); get a directory that `acsard lan` made for this robot"
     )
 
 
@@ -225,12 +236,13 @@ def _of_ours(reason: str, host: str, directory: str) -> str:
     mine = f"{directory}/{CERTIFICATE}"
     if "CERTIFICATE_EXPIRED" in reason:
         return (
-            f"{host} says that {mine} has ended or does not count yet: make a new one with `acsard "
-            "lan add` where ca-key.pem is, or set the clocks of both (`timedatectl`)"
+            f"{host} says that {mine} has expired or is not valid yet: make a new one with "
+            "`acsard lan add` where ca-key.pem is, or set the clocks of both machines "
+            "(`timedatectl`)"
         )
     if "UNKNOWN_CA" in reason or "CERTIFICATE" in reason or "DECRYPT" in reason:
         return (
-            f"{host} does not take {mine}: it is of another authority than the robot's; get one "
-            "made by `acsard lan add` there"
+            f"{host} does not accept {mine}: it comes from another authority than the robot's; "
+            "get one that `acsard lan add` made there"
         )
-    return f"{host} does not speak TLS with us ({reason}); a plain endpoint begins with tcp/"
+    return f"{host} does not speak TLS here ({reason}); a plain endpoint begins with tcp/"

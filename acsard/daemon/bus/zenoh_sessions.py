@@ -140,7 +140,7 @@ def _opened(settings: dict[str, object], where: tuple[str, ...]) -> zenoh.Sessio
     except zenoh.ZError as error:
         raise InUseError(
             f"cannot listen on {', '.join(where)}: {first_line(error)}; another daemon or router "
-            "may have it: stop that, or give this one an address of its own, by --listen or in "
+            "may use it: stop that one, or give this one another address with --listen or in "
             "bus.listen",
         ) from error
 
@@ -169,8 +169,8 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     secured = endpoint.startswith(TLS)
     if secured and not tls:
         raise CertificateError(
-            f"{endpoint} wants a certificate: add --tls DIRECTORY (tls= in Python), the directory "
-            "that `acsard lan init` or `lan add` made for you"
+            f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "
+            "directory that `acsard lan init` or `lan add` made for you"
         )
     if secured:
         # Zenoh reports unusable certificates as if the daemon were absent.
@@ -184,8 +184,8 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
             f"no daemon answers at {endpoint}: "
             + (
                 seen
-                or f"is `acsard run` running, is this its bus.listen, has it room (at most "
-                f"{MAX_SESSIONS} connections)? ({first_line(error)})"
+                or "does `acsard run` run, does its bus.listen have this address, are fewer "
+                f"than {MAX_SESSIONS} clients connected? ({first_line(error)})"
             )
         ) from None  # Zenoh's message names its own source files
 

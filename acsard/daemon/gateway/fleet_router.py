@@ -52,8 +52,8 @@ def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequ
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise UsageError(
-            f"{', '.join(twice)}: there twice; a certificate is one robot's, or in the list of one "
-            f"role, and {', '.join(ROLES)} are in theirs"
+            f"{', '.join(twice)}: named twice; a certificate belongs to one robot, or to the "
+            f"list of one role, and {', '.join(ROLES)} are in their own lists"
         )
     # The replacement is a function, since an id or a name may look like a reference to a group.
     text = _BLOCK.sub(lambda block: "".join(_for(one, block[1]) for one in robots), template)
@@ -126,15 +126,15 @@ class Router:
             self._config.insert_json5("plugins_loading/enabled", "false")
         except zenoh.ZError as error:
             raise RouterFileError(
-                f"{file} is no configuration of Zenoh's: {why(error)}; correct it"
+                f"{file} is not a Zenoh configuration: {why(error)}; correct it"
             ) from error
         # Zenoh's default is a table by mode: every address, without encryption.
         if isinstance(endpoints, dict):
             endpoints = []
         if mode != "router" or not endpoints:
             raise RouterFileError(
-                f'{file}: not a router\'s; it needs mode: "router" and listen: {{ endpoints: '
-                '["tls/..."] }'
+                f'{file} is not the configuration of a router: it needs mode: "router" and '
+                'listen: { endpoints: ["tls/..."] }'
             )
         self._endpoints: list[str] = endpoints
         self.where = ", ".join(endpoints)
@@ -150,12 +150,12 @@ class Router:
         except zenoh.ZError as error:
             if not self._opens_elsewhere():
                 raise RouterFileError(
-                    f"{self._file} cannot be used: {why(error)}; correct it, or put the files it "
-                    "names in place, ours to read"
+                    f"{self._file} cannot be used: {why(error)}; correct it, or provide the "
+                    "files that it names, readable for this user"
                 ) from error
             raise InUseError(
-                f"cannot listen on {self.where}: {why(error)}; are the addresses free, and of "
-                "this machine?"
+                f"cannot listen on {self.where}: {why(error)}; are the addresses free, and do "
+                "they belong to this machine?"
             ) from error
 
     def _opens_elsewhere(self) -> bool:

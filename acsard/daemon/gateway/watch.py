@@ -74,7 +74,7 @@ class Watch:
             return None
         self._told_ns = look.at_ns
         text = f"all {self._most} connections are taken, {crowd(look.holders)}"
-        return Event(self._events["crowded"], f"{text}: nobody else is let in", "warning")
+        return Event(self._events["crowded"], f"{text}: no other client is admitted", "warning")
 
     def reopen(self, look: Look, passed_ns: int) -> Event | None:
         """Return why the session must be opened again, `passed_ns` after the last call, or None."""
@@ -83,13 +83,13 @@ class Watch:
         if look.linked:
             self._linked_ns, self._patience_ns = look.at_ns, ALONE_NS
         if stuck:
-            text = "stuck: somebody connected takes all its time; all are sent away"
+            text = "stuck: a client takes all its time; all clients are disconnected"
             return Event(self._events["stuck"], text, "error")
         if look.at_ns - self._linked_ns > self._patience_ns:
-            text = "nothing is heard of the daemon any more"
+            text = "nothing is received from the daemon any more"
             return Event(self._events["alone"], text, "warning")
         if look.unanswered >= UNANSWERED:
-            text = f"the daemon, though connected, has left {look.unanswered} questions unanswered"
+            text = f"the daemon is connected, but has left {look.unanswered} queries unanswered"
             return Event(self._events["alone"], text, "warning")
         return None
 

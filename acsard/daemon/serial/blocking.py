@@ -92,7 +92,7 @@ class BlockingPort:
             except BlockingIOError:
                 left_s = (deadline_ns - clock.mono_ns()) / NS_PER_S
                 if left_s <= 0:
-                    raise WireLostError(f"{self._path} takes no more bytes") from None
+                    raise WireLostError(f"{self._path} accepts no more bytes") from None
                 select.select([], [fd], [], left_s)
             except OSError as error:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
@@ -113,7 +113,7 @@ class BlockingPort:
             except OSError as error:
                 raise WireLostError(f"{self._path} was lost: {error.strerror}") from error
             if not data:
-                raise WireLostError(f"{self._path} was lost: unplugged")
+                raise WireLostError(f"{self._path} was unplugged")
             pieces.append((clock.mono_ns(), data))
             if left_s == 0.0:
                 return pieces

@@ -166,7 +166,9 @@ def refusal(path: str, error: OSError) -> MendableError:
     """
     match error.errno:
         case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.ENOTDIR:
-            return NoPortError(f"{path} is not there; plug it in, or name another ({_LISTED})")
+            return NoPortError(
+                f"{path} does not exist; plug the device in, or name another ({_LISTED})"
+            )
         case errno.ENOTTY | errno.EISDIR:
             return NoPortError(f"{path} is not a serial port; name another ({_LISTED})")
         case errno.EACCES | errno.EPERM:
@@ -179,12 +181,12 @@ def refusal(path: str, error: OSError) -> MendableError:
             return ExitError(Exit.FAILURE, f"cannot open {path}: {error}")
 
 
-_LISTED = "`acsard ports` lists what there is"
-_FREE = "stop it first (`systemctl stop acsard` if that is it)"
+_LISTED = "`acsard ports` lists the serial ports"
+_FREE = "stop it first (`systemctl stop acsard` if it is the service)"
 _JOIN = (
     "add the user to the device's group (`sudo usermod -aG dialout $USER`, then log in again; a "
-    "service has dialout already: is the device in another group, or of a kind its unit does not "
-    "allow?)"
+    "service is in dialout already: does the device have another group, or a type that the unit "
+    "does not allow?)"
 )
 
 
@@ -195,6 +197,6 @@ def require(path: str) -> None:
     """
     try:
         if not stat.S_ISCHR(os.stat(path).st_mode):
-            raise OSError(errno.ENOTTY, "no character device")
+            raise OSError(errno.ENOTTY, "not a character device")
     except OSError as error:
         raise refusal(path, error) from None

@@ -221,7 +221,7 @@ class SerialPort:
             close(transport.serial, lost=error is not None)
             transport.abort()
         if error is not None:
-            self.trouble = f"the serial port {self._path} was lost ({error}); reopening it"
+            self.trouble = f"the serial port {self._path} was lost ({error}); the daemon reopens it"
             self._log(Event("port_lost", self.trouble, "warning"))
         self._lost.set()
         self._wake()

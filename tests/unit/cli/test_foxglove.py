@@ -26,5 +26,5 @@ def test_without_its_library_it_says_which_extra_to_install(
 
 
 def test_beyond_this_machine_it_does_not_listen() -> None:
-    with pytest.raises(UsageError, match="asks nobody who he is"):
+    with pytest.raises(UsageError, match="has no authentication"):
         foxglove.main(argparse.Namespace(address="0.0.0.0:8765"))

@@ -469,7 +469,7 @@ def test_init_leaves_a_configuration_that_is_wrong_as_it_was(
         file.write_text(text)
         words = ("--directory", str(tmp_path / "tls"), "--force", "--write", str(file))
         assert lan("init", *words) == Exit.FAILURE
-        assert "left as it was" in capsys.readouterr().err
+        assert "was not changed" in capsys.readouterr().err
         assert file.read_text() == text
 
 

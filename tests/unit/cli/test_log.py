@@ -63,9 +63,9 @@ def test_the_list_has_a_line_each_and_says_what_happened(
     first, second = out.splitlines()
     assert code == 0
     assert "000001-20270115T080000Z.mcap" in first
-    assert first.endswith("start, 1 change of who drives, 1 stop (stopped by unnamed (native))")
+    assert first.endswith("start, 1 change of commander, 1 stop (stopped by unnamed (native))")
     assert second.endswith(
-        "start, 1 change of who drives  [no end: cut off, or still being recorded]"
+        "start, 1 change of commander  [no end: cut off, or still being recorded]"
     )
 
 
@@ -90,7 +90,7 @@ def test_the_list_tells_a_start_from_a_file_that_goes_on(
     assert len(rows) == 8
     for row in rows:
         starts = row.partition("-")[0].endswith("0")
-        assert ("  start, 1 change of who drives" in row) is starts
+        assert ("  start, 1 change of commander" in row) is starts
         assert ("start" in row) is starts
 
 
@@ -213,7 +213,7 @@ def test_what_a_kill_has_cut_says_so_once_it_is_whole(
         part.unlink()
         (tmp_path / part.stem).write_bytes(data)
     Ring(RecordConfig(str(tmp_path))).close()
-    told = "cut: the daemon or the computer ended without a word"
+    told = "cut: the daemon or the computer ended without notice"
     _, out, _ = log(capsys, tmp_path)
     assert (told in out) is cut
     _, out, err = log(capsys, tmp_path, "show")
@@ -261,7 +261,7 @@ def test_a_replay_says_that_all_is_the_same(
 ) -> None:
     code, out, err = log(capsys, where, "replay", "1")
     assert (code, err) == (0, "")
-    same, _, rest = out.partition(" lines the same, ")
+    same, _, rest = out.partition(" lines are the same, ")
     now, _, then = same.partition(" of ")
     assert now == then
     assert " poses, " in rest
@@ -272,7 +272,12 @@ def test_a_replay_says_what_it_has_compared(
 ) -> None:
     _, out, _ = log(capsys, where, "replay", "1")
     _, told = out.splitlines()
-    for word in ("every line to the board", "every pose", "the mode in every step", "as recorded"):
+    for word in (
+        "every line to the board",
+        "every pose",
+        "the mode in every step",
+        "the recording",
+    ):
         assert word in told
 
 
@@ -289,7 +294,7 @@ def test_with_another_configuration_it_tells_what_would_have_been(
     other.write_text("[limits]\nlinear_speed = 0.3\n")
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
     assert code == 0
-    assert "the first that differs, by its line, left: step " in out
+    assert "the first difference, in its line, left: step " in out
     assert "  then  ap" in out
     assert "the fastest wheel: 10.00 rad/s then, 6.00 rad/s now" in out
 
@@ -308,7 +313,7 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     assert told.endswith(": by limits.linear_speed, limits.linear_acceleration")
     then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
     assert then > now
-    (fault,) = [line for line in out.splitlines() if " s on in fault: " in line]
+    (fault,) = [line for line in out.splitlines() if "in fault from " in line]
     assert "wheel" in fault
     assert "a robot with this configuration need not have had that fault" in out
 
@@ -320,7 +325,7 @@ def test_settings_that_change_no_line_are_told_all_the_same(
     same.write_text("[rates]\nstate = 5.0\n")
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
-    assert "with what that configuration makes of the same inputs" in out
+    assert "as that configuration computes them from the same inputs" in out
     assert out.splitlines()[-1].startswith("set otherwise: rates.state 10.0 then, 5.0 now")
 
 
@@ -333,7 +338,7 @@ def test_what_was_cut_is_written_as_a_finished_file(
     assert code == 0
     assert f"messages in {new}" in out
     assert main(["log", "replay", str(new)]) == 0
-    assert "cut, or still being written, when it was recovered" in capsys.readouterr().err
+    assert "cut, or still being recorded, when it was recovered" in capsys.readouterr().err
     assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
 
 
@@ -420,7 +425,7 @@ def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (code, "--directory" in err) == (1, True)
     (tmp_path / "x").write_bytes(b"x")
     assert main(["log", "replay", str(tmp_path / "x")]) == 1
-    assert "no recording of acsard" in capsys.readouterr().err
+    assert "not a recording of acsard" in capsys.readouterr().err
 
 
 def test_it_looks_where_the_service_records() -> None:

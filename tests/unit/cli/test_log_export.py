@@ -61,7 +61,7 @@ def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
     before = (here / "mine.mcap").read_bytes()
     assert export(where, "7", "mine.mcap") == 1
     assert capsys.readouterr().err == (
-        "acsard: cannot write mine.mcap: it exists; --force writes it anew\n"
+        "acsard: cannot write mine.mcap: it exists; --force overwrites it\n"
     )
     assert (here / "mine.mcap").read_bytes() == before
     assert export(where, "7", "mine.mcap", "--csv", "--force") == 0
@@ -118,7 +118,7 @@ def test_what_is_no_recording_is_refused(
 ) -> None:
     assert export(where, "7", "new.mcap") == 0
     assert export(where, "new.mcap", "again.mcap") == 1
-    assert "new.mcap is no recording of acsard" in capsys.readouterr().err
+    assert "new.mcap is not a recording of acsard" in capsys.readouterr().err
     assert not (here / "again.mcap").exists()
 
 
@@ -160,4 +160,4 @@ def test_calibrate_says_what_a_recording_lacks(
     where: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["calibrate", "--log", str(where / RECORDED)]) == 1
-    assert "holds no gyro" in capsys.readouterr().err
+    assert "has no gyro samples" in capsys.readouterr().err

@@ -67,7 +67,7 @@ def test_nothing_is_overwritten_without_force(
     new.write_text("mine")
     code, _, err = report(capsys, QUIET, new)
     assert code == 1
-    assert f"cannot write {new}: it exists; --force writes it anew" in err
+    assert f"cannot write {new}: it exists; --force overwrites it" in err
     assert new.read_text() == "mine"
     assert report(capsys, QUIET, new, "--force")[0] == 0
     assert new.stat().st_size > 1e6

@@ -96,7 +96,7 @@ STOPS: dict[str, Late] = {
         sources=[SourceState("app", 50, 0.01, "1 more of its senders")]
     ),
     "it waits for a command|a command": changed(sources=[SourceState("app", 50, 3.0, "")]),
-    "where 0.30 are commanded": changed(wheels=[0.0] * 4),
+    "although 0.30 is commanded": changed(wheels=[0.0] * 4),
     "sends no feedback": changed(wheels=[]),
 }
 
@@ -155,7 +155,7 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
-    assert world.riding.halted == "no word from the daemon"
+    assert world.riding.halted == "nothing received from the daemon"
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:

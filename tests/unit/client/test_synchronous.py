@@ -114,6 +114,6 @@ def test_a_key_that_there_is_not_is_the_one_reason_that_is_told(
 def test_a_drive_of_which_nothing_arrives_ends_with_an_error_that_the_docs_name(
     session: Session,
 ) -> None:
-    found = client_of(session).unheard(UnheardError("the daemon hears no command of source app"))
+    found = client_of(session).unheard(UnheardError("the daemon receives no command of source app"))
     assert type(found).__name__ in client.__doc__.split()
     assert isinstance(found, client.NotDrivenError)

@@ -112,7 +112,9 @@ def test_commands_have_no_effect_on_a_daemon_that_is_silent_or_objects() -> None
     robot.queue.append(sample_of(STATE))
     watch.look(0.0)
     assert watch.objection("app", STATE.sender, 0.0) == ""
-    assert "no word from the daemon" in watch.objection("app", STATE.sender, SILENT_S + 0.01)
+    assert "nothing received from the daemon" in watch.objection(
+        "app", STATE.sender, SILENT_S + 0.01
+    )
     stopped = replace(STATE, mode="stopped", reason="stopped by request")
     robot.queue.append(sample_of(stopped))
     watch.look(5.0)

@@ -103,7 +103,7 @@ def test_a_number_has_its_sign_and_its_place(value: float, text: str) -> None:
 
 def test_a_count_agrees_with_its_noun() -> None:
     assert [many(count, "line") for count in (0, 1, 2)] == ["no lines", "1 line", "2 lines"]
-    assert many(2, "change of who drives") == "2 changes of who drives"
+    assert many(2, "change of commander") == "2 changes of commander"
     assert (many(1, "loss", "losses"), many(2, "loss", "losses")) == ("1 loss", "2 losses")
 
 

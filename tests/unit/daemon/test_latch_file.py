@@ -220,13 +220,13 @@ def test_a_file_that_another_daemon_keeps_is_not_overwritten_after_a_slow_start(
     second, latches = started(tmp_path)
     assert latches.stop
     goes.set()
-    until(lambda: "another daemon keeps the stop" in second.trouble)
+    until(lambda: "another daemon stores the stop" in second.trouble)
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
 
 
 def test_a_second_daemon_of_the_same_robot_does_not_start(tmp_path: Path, started: Started) -> None:
     started(tmp_path)
-    with pytest.raises(InUseError, match=r"another daemon keeps the stop of robot acsar in .*id"):
+    with pytest.raises(InUseError, match=r"another daemon stores the stop of robot acsar in .*id"):
         started(tmp_path)
 
 
@@ -468,8 +468,8 @@ def test_a_process_without_room_for_a_thread_starts_the_robot_stopped(
     monkeypatch.setattr(threading.Thread, "start", start)
     file, latches = started(tmp_path)
     assert latches.stop
-    assert "no room for another thread" in latches.stop.why
-    assert "no room for another thread" in file.trouble
+    assert "cannot start another thread" in latches.stop.why
+    assert "cannot start another thread" in file.trouble
 
 
 def test_a_thread_that_has_ended_is_told(tmp_path: Path, started: Started) -> None:
@@ -605,7 +605,7 @@ def test_a_disk_that_fills_up_is_reported_once_and_tried_until_it_takes(
     path = tmp_path / NAME
     said = f"a stop cannot be kept over a restart: {path}: No space left on device"
     assert file.trouble == said
-    again = f"{said}; it is tried again every {module.RETRY_S:g} s"
+    again = f"{said}; the daemon tries again every {module.RETRY_S:g} s"
     assert news == [Event("latch_file", again, "warning")]
     monkeypatch.setattr(module, "replace", replace_file)
     until(lambda: file.trouble == "")

@@ -138,7 +138,7 @@ def test_a_port_that_is_closed_is_mended_at_the_port() -> None:
 def test_lines_that_are_not_answered_are_a_warning() -> None:
     (finding,) = found({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
     assert finding.level == "warning"
-    assert "of 100 lines that were sent in a second 80 were answered" in finding.text
+    assert "only 80 of 100 lines that were sent in a second were answered" in finding.text
     assert "mcu check" in finding.mend
 
 

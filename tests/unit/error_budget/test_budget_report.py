@@ -35,7 +35,7 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
     [
         ("time", "latency_timer"),
         ("quantisation", "link_check"),
-        ("gaps", "3 lines did not come and 0.25 s"),
+        ("gaps", "3 lines were lost, so 0.25 s"),
         ("slip", "gyro"),
         ("gyro", "stand"),
         ("parameters", "acsard calibrate"),
@@ -56,12 +56,12 @@ def test_coarse_encoders_are_named() -> None:
 def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
     told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
     assert told.startswith("[odometry] declares slip the largest")
-    assert "of what was measured the largest is time" in told
+    assert "of the measured causes the largest is time" in told
 
 
 def test_who_never_calibrated_is_told_so_first() -> None:
     told = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
-    assert told.startswith("how wrong wheel radii and track are is not known")
+    assert told.startswith("the error of wheel radii and track width is unknown")
     assert "the largest is time" in told
 
 
@@ -87,12 +87,15 @@ def test_what_this_driving_does_not_tell_is_a_dash_and_what_is_tiny_no_zero() ->
 def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: bool) -> None:
     found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
     told = " ".join(text(found).split())
-    assert "multiplier would be 1.700 (standard deviation 0.050); configured, and in" in told
-    assert "in use, is 1.500. Where both differ" in told
+    assert (
+        "multiplier would be 1.700 (standard deviation 0.050); the configured value, which is used"
+        in told
+    )
+    assert "which is used, is 1.500. If both differ" in told
     assert "would be" not in text(of(KNOWN, still=still))
     told = " ".join(text(replace(found, learned_used=True)).split())
-    assert "multiplier is 1.700 (standard deviation 0.050), which is in use" in told
-    assert "configured is 1.500." in told
+    assert "multiplier is 1.700 (standard deviation 0.050). This value is used" in told
+    assert "the configured value is 1.500." in told
 
 
 def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:
@@ -100,5 +103,5 @@ def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:
     assert "stands still" in told
     assert "0.10 mm/s" in told
     assert "7.20 deg a turn" in told
-    assert "Drive it" in told
+    assert "Drive the robot" in told
     assert "never calibrated" in text(of(("parameters", None, "unknown"), still=True))

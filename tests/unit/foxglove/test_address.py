@@ -23,7 +23,7 @@ def test_an_address_of_this_machine_is_taken(text: str, address: tuple[str, int]
 
 @pytest.mark.parametrize("text", ["0.0.0.0:8765", "192.168.1.5:8765", "8.8.8.8:80"])
 def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str) -> None:
-    with pytest.raises(UsageError, match=r"asks nobody who he is.*ssh -N -L \d+:127\.0\.0\.1:\d+"):
+    with pytest.raises(UsageError, match=r"has no authentication.*ssh -N -L \d+:127\.0\.0\.1:\d+"):
         loopback(text)
 
 

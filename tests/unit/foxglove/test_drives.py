@@ -165,7 +165,7 @@ def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers
     viewers.sessions[1].broken = True
     viewers.publish(1, AHEAD)
     until(lambda: said(viewers.notices), HOLD_S, "that the bus takes nothing")
-    assert "the bus takes no commands" in said(viewers.notices)[0]
+    assert "the bus accepts no commands" in said(viewers.notices)[0]
     viewers.publish(2, AHEAD)
     assert [one.twist.linear for one in viewers.heard(2, 2)] == [0.0, 0.3]
     viewers.sessions[1].broken = False

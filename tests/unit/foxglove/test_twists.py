@@ -41,7 +41,7 @@ def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
     ],
 )
 def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> None:
-    with pytest.raises(DecodeError, match="wanted"):
+    with pytest.raises(DecodeError, match="needed"):
         encoding_of(form, name)
 
 

@@ -172,11 +172,11 @@ def test_each_that_stays_says_why_and_what_removes_it() -> None:
     found = there(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, found, [tls, own], force=False)
     assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
-        UNIT_FILE.path: "somebody has changed it; --force removes it",
+        UNIT_FILE.path: "it has been edited; --force removes it",
         STOP_FILE.path: f"{UNIT} stays and needs it",
         OWN.path: "your configuration; --purge removes it",
         tls: "certificates and their authority; --purge removes it",
-        own: "not of the service; --purge removes it",
+        own: "not the service's own; --purge removes it",
     }
 
 

@@ -132,7 +132,7 @@ BODIES: dict[str, bytes] = {
     "a class that is changed": ROBOT + pickle.NONE
     + pickle.EMPTY_DICT + text("step") + ONE + pickle.SETITEM + pickle.TUPLE2 + pickle.BUILD,
     "a class that gets attributes": ROBOT + attributes((text("step"), ONE)),
-    "a class in place of a value": ROBOT + pickle.TUPLE1,
+    "a class where a value should be": ROBOT + pickle.TUPLE1,
     "a class alone": ROBOT,
     "a robot that is run": ROBOT + ONE + pickle.TUPLE1 + pickle.REDUCE,
     "a robot of something": ROBOT + ONE + pickle.TUPLE1 + pickle.NEWOBJ,

@@ -352,7 +352,7 @@ def test_what_was_cut_and_cannot_be_read_here_stays_and_is_told(
     assert path.name.endswith(KEPT)
     (said,) = one.said
     assert path.name in said
-    assert ("acsard/99" if not event else "an event that is none") in said
+    assert ("acsard/99" if not event else "an event that cannot be read") in said
 
 
 def test_a_copy_that_did_not_become_whole_goes(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def test_only_what_was_in_a_time_is_written(path: Path, tmp_path: Path) -> None:
 
 
 def test_a_time_with_nothing_in_it_writes_nothing(path: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="nothing in that time"):
+    with pytest.raises(RecordingError, match="nothing in that span of time"):
         export(Recording(path), tmp_path / "new.mcap", "mcap", span=Span(1000.0))
     assert not [*tmp_path.iterdir()]
 
@@ -168,7 +168,7 @@ def test_a_directory_that_is_no_bag_never_goes(path: Path, tmp_path: Path) -> No
     new.mkdir()
     (new / "chapter").write_text("1")
     for kind in ("mcap", "rosbag2"):
-        with pytest.raises(FileExistsError, match="no bag"):
+        with pytest.raises(FileExistsError, match="not a bag"):
             export(Recording(path), new, kind, force=True)
     assert (new / "chapter").read_text() == "1"
     assert [*tmp_path.iterdir()] == [new]
@@ -217,7 +217,7 @@ def test_what_is_no_file_never_goes(path: Path, tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for kind in KINDS:
-        with pytest.raises(FileExistsError, match="it is no file"):
+        with pytest.raises(FileExistsError, match="it is a device or a pipe"):
             export(Recording(path), pipe, kind, force=True)
     assert pipe.is_fifo()
 

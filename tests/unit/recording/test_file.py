@@ -225,7 +225,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
         told = str(refused.value)
         assert (str(path) in told, told.isprintable()) == (True, True)
         if not tail:
-            lacks = "whole second" if size > config_end else "its beginning is missing"
+            lacks = "complete second" if size > config_end else "its beginning is missing"
             assert lacks in told
 
 
@@ -325,7 +325,7 @@ def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_p
 def test_another_file_is_refused_in_words(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "other"
     path.write_bytes(data)
-    with pytest.raises(RecordingError, match="no recording of acsard"):
+    with pytest.raises(RecordingError, match="not a recording of acsard"):
         Recording(path)
     with pytest.raises(RecordingError, match="cannot read"):
         Recording(tmp_path / "none")
@@ -348,7 +348,7 @@ def test_an_event_of_no_time_is_none(tape: Tape, tmp_path: Path) -> None:
     writing = Writing(tmp_path / "new.mcap", recording.about)
     writing.add("events", 1, far)
     writing.finish()
-    with pytest.raises(RecordingError, match="an event that is none"):
+    with pytest.raises(RecordingError, match="an event that cannot be read"):
         rewrite(Recording(tmp_path / "new.mcap"), tmp_path / "other.mcap")
 
 
@@ -382,7 +382,7 @@ def test_a_finished_file_says_at_its_end_what_happened(
     assert said is not None
     assert (said.wall_ns, said.said) == (
         first.wall_ns,
-        "start, 1 change of who drives, 1 stop (stopped by unnamed (native))",
+        "start, 1 change of commander, 1 stop (stopped by unnamed (native))",
     )
     assert 0 <= last.wall_ns - said.last_ns < 2e9
     cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"

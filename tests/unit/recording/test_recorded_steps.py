@@ -48,5 +48,5 @@ def test_what_came_into_a_step_that_did_not_end_comes_back_whole() -> None:
         step = Unfinished(number, taken.inputs)
         assert unfinished(step.encode()) == step
     for data in (b"", b"none", Unfinished(1, taken.inputs).encode()[:-1]):
-        with pytest.raises(UnfinishedError, match="not a step"):
+        with pytest.raises(UnfinishedError, match="not an unfinished step"):
             unfinished(data)

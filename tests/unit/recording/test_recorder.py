@@ -329,7 +329,10 @@ def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_i
     assert path.name.endswith(KEPT)
     assert last is not None
     assert (last.cut, last.why) == ("bug", why)
-    assert how_it_ends(last.cut, last.why) == f"cut: the daemon ended by a fault of its own: {why}"
+    assert (
+        how_it_ends(last.cut, last.why)
+        == f"cut: the daemon ended because of an error in the daemon: {why}"
+    )
     recording = Recording(path)
     lived = live(recording)
     assert (lived.tally.same, lived.tally.steps, lived.trouble) == (True, number, "")
@@ -353,7 +356,7 @@ def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
     last = closing(path)
     assert last is not None
     told = how_it_ends(last.cut, last.why)
-    assert told.startswith("cut: the daemon ended by a fault of its own: ValueError: ")
+    assert told.startswith("cut: the daemon ended because of an error in the daemon: ValueError: ")
     assert (told.isprintable(), len(told) < 300) == (True, True)
 
 
@@ -597,7 +600,7 @@ def test_what_a_crash_has_cut_stays_a_crash_s_however_late_it_is_made_whole(
         patched.setattr(os, "fsync", no_copies)
         rounds(again)
     refuse(again)
-    assert any("cannot be made whole" in event.text for event in again.said)
+    assert any("cannot be completed" in event.text for event in again.said)
     assert cuts(again.end()) == [("kept.mcap", "crash"), ("mcap", "disk"), ("mcap", "")]
 
 

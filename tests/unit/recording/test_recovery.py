@@ -96,7 +96,7 @@ def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
     monkeypatch.setattr(os, "fsync", full)
     told = recover(part, whole, "crash", room=False)
     assert whole.read_bytes() == cut
-    assert "a.mcap was cut and has no end, for want of room" in told
+    assert "a.mcap was cut and gets no end record, because the disk is full" in told
     assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
@@ -109,7 +109,7 @@ def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
     last = closing(whole)
     assert last is not None
     assert last.cut == "crash"
-    assert last.said == "start, 1 change of who drives, 1 stop (stopped by unnamed (native))"
+    assert last.said == "start, 1 change of commander, 1 stop (stopped by unnamed (native))"
 
 
 def test_a_chunk_that_is_torn_at_the_end_goes_and_one_between_others_stays(
@@ -162,7 +162,7 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
     (begin, end), *_ = chunks(data)
     part.write_bytes(data[:8] + bytes(begin - 8) + data[begin:end])
     assert part.stat().st_size < NOTHING_BYTES
-    assert "stays so" in recover(part, whole, "crash", room=True)
+    assert "stays cut" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]
 
 
@@ -179,7 +179,7 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
         before = messages(part)
         said = recover(part, whole, "crash", room)
         counts.add(len(before))
-        assert bool(before) != ("nothing whole in it" in said)
+        assert bool(before) != ("no intact data" in said)
         if before:
             recording, last = Recording(whole), closing(whole)
             assert list(recording.messages()) == before
@@ -203,7 +203,7 @@ def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
     bad[begin : begin + 512] = bytes(512)
     assert len(bad) < NOTHING_BYTES
     part.write_bytes(bad)
-    assert "stays so, as a.mcap" in recover(part, whole, "crash", room)
+    assert "stays cut, as a.mcap" in recover(part, whole, "crash", room)
     assert whole.read_bytes() == bad
     assert not part.exists()
 
@@ -304,5 +304,5 @@ def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: 
         assert bool(said) == bool(told)
         assert list(tmp_path.iterdir()) == []
     part.write_bytes(b"\x89MC" + bytes(NOTHING_BYTES))
-    assert "stays so" in recover(part, whole, "crash", room=True)
+    assert "stays cut" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]

@@ -190,7 +190,7 @@ def test_a_read_of_an_age_that_no_clock_shows_is_refused(batch: Batch) -> None:
     ids=["pose", "rate", "variance"],
 )
 def test_a_number_that_no_step_gets_is_refused(rare: Rare, batch: Batch) -> None:
-    with pytest.raises(BatchError, match="no number"):
+    with pytest.raises(BatchError, match="not a number"):
         steps_of(with_rare(batch, rare))
 
 

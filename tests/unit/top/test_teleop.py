@@ -76,8 +76,8 @@ def test_keys_that_do_not_drive_are_told() -> None:
 def test_a_silence_is_told_with_its_length() -> None:
     silent = replace(SEEN, age=7.0, silent=True)
     for seen in (silent, replace(silent, state=None)):
-        assert "no word from the daemon for 7 s" in " ".join(texts(seen, 80))
-        assert "no word from the daemon for 7 s" in told(news(seen, 80))
+        assert "nothing received from the daemon for 7 s" in " ".join(texts(seen, 80))
+        assert "nothing received from the daemon for 7 s" in told(news(seen, 80))
     assert "first state" in texts(replace(SEEN, state=None), 80)[1]
 
 
@@ -107,7 +107,7 @@ def test_the_last_word_says_whether_the_robot_stands_and_where() -> None:
     assert "forward - m/s" in told(parting(unknown, 80))
     assert "yaw +57.3°" in told(parting(of(**still), 40))
     assert told(parting(replace(SEEN, age=7.0, silent=True), 80)).startswith(
-        "left: no word from the daemon"
+        "left: nothing received from the daemon"
     )
 
 

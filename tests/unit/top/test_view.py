@@ -73,19 +73,19 @@ def test_before_the_first_state_it_says_what_it_waits_for() -> None:
 @pytest.mark.parametrize("state", [STATE, None])
 def test_silence_is_said_big(state: RobotState | None) -> None:
     seen = replace(SEEN, state=state, age=3.4, silent=True)
-    assert "NO NEWS FOR 3 s: is the daemon running?" in lines_of(seen)[2]
+    assert "NOTHING RECEIVED FOR 3 s: does the daemon run?" in lines_of(seen)[2]
     assert painted(seen).count("41m") == 3  # three lines in red
     assert not any("DRIVING" in line for line in lines_of(seen))
 
 
 def test_a_slow_state_is_not_silent_before_its_time() -> None:
-    assert "NO NEWS" not in "".join(lines_of(replace(SEEN, age=9.0)))
-    assert "NO NEWS FOR 30 s" in lines_of(replace(SEEN, age=30.0, silent=True))[2]
+    assert "NOTHING RECEIVED" not in "".join(lines_of(replace(SEEN, age=9.0)))
+    assert "NOTHING RECEIVED FOR 30 s" in lines_of(replace(SEEN, age=30.0, silent=True))[2]
 
 
 def test_what_was_known_before_the_silence_stays_dimmed() -> None:
     seen = replace(SEEN, age=100.0, silent=True)
-    assert "NO NEWS FOR 1 min 40 s" in lines_of(seen)[2]
+    assert "NOTHING RECEIVED FOR 1 min 40 s" in lines_of(seen)[2]
     assert "+1.250 m" in line_with("yaw", seen)
     assert len(lines_of(seen)) == 24
     assert re.search(r"\x1b\[2mx   \+1.250", painted(seen))

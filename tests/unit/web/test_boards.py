@@ -22,8 +22,8 @@ def test_the_configured_one_stands_under_its_configured_name(
     found = {one.port: one.what for one in boards(configured)}
     assert found == {
         configured: "Arduino Mega 2560 R3, configured",
-        "/dev/ttyUSB0": "USB Serial, held by acsard (process 7)",
-        "sim": "the simulator: nothing real moves",
+        "/dev/ttyUSB0": "USB Serial, in use by acsard (process 7)",
+        "sim": "the simulator: no real robot moves",
     }
 
 

@@ -131,7 +131,7 @@ def test_who_is_at_the_machine_has_places_that_nobody_else_takes() -> None:
     assert seats.missing("127.0.0.1", "another")
     told = [seats.enter("127.0.0.1", "") for _ in range(CONNECTIONS_HERE + 1)]
     assert told[:-1] == [""] * CONNECTIONS_HERE
-    assert "at the machine itself" in told[-1]
+    assert "on the robot itself" in told[-1]
     seats.leave("127.0.0.1", "")
     assert not seats.enter("::1", "")
 

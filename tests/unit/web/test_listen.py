@@ -54,7 +54,7 @@ def test_an_address_is_read_and_beyond_this_machine_only_https() -> None:
     assert listens("https://[::]:8443/") == Listen(True, "::", 8443)
     assert listens("https://[::]:8443").url == f"https://{own_name()}:8443/"
     for wrong in ("127.0.0.1:8080", "http://:80", "http://127.0.0.1:0", "ftp://a:1", "https://a:x"):
-        with pytest.raises(UsageError, match="is no address"):
+        with pytest.raises(UsageError, match="is not an address"):
             listens(wrong)
     with pytest.raises(UsageError, match="only https"):
         listens("http://0.0.0.0:8080")

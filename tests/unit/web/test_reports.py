@@ -91,7 +91,7 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
         ("import sys; sys.exit('acsard: needs the library plotly; run: pip')", "needs the library"),
         ("raise MemoryError", "memory: draw it on another machine"),
         ("{}['x']", "KeyError: 'x'"),
-        ("import os; os.kill(os.getpid(), 9)", "want of memory most likely"),
+        ("import os; os.kill(os.getpid(), 9)", "most likely because memory ran out"),
         ("import os; os.kill(os.getpid(), 15)", "ended with -15"),
         (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of it"),
     ],

@@ -100,7 +100,7 @@ def test_a_robot_that_falls_silent_is_told_within_its_time(world: World) -> None
     found = world.told(10.0, lambda t: world.state() if t < 5.0 else None)
     (_, here), (at, gone) = found
     assert here == ""
-    assert "nothing is heard of the daemon at tcp/x:1" in gone
+    assert "nothing is received from the daemon at tcp/x:1" in gone
     assert 4.9 + SILENT_S - LOOK_S <= at <= 5.0 + SILENT_S + 2 * LOOK_S
 
 

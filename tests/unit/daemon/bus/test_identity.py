@@ -57,13 +57,13 @@ def test_what_a_role_lacks_is_told_with_the_role_it_takes_and_else_nothing() -> 
 def test_a_silence_is_first_a_question_about_the_id_and_no_claim_about_a_list() -> None:
     nobody = Identity("", "anna", "joe/1/aa", "robot1", "tls/a.local:7449")
     for told in (nobody.words(), nobody.lacks("state"), nobody.lacks("srv/stop")):
-        assert told.startswith("nobody answers as 'robot1' at tls/a.local:7449")
+        assert told.startswith("no daemon answers as 'robot1' at tls/a.local:7449")
         assert "asked: acsard/robot1/whoami/viewer" in told
         assert told.index("is --id right") < told.index("daemon run") < told.index("role's list")
-        assert "yours is anna" in told
+        assert "your certificate, anna," in told
         assert "add" not in told
     stranger = Identity("", "", "joe/1/aa", "robot1", "tcp/127.0.0.1:7448")
-    assert stranger.words().startswith("nobody answers as 'robot1' at tcp/127.0.0.1:7448")
+    assert stranger.words().startswith("no daemon answers as 'robot1' at tcp/127.0.0.1:7448")
     assert "certificate" not in stranger.words()
     assert Identity("viewer", "anna", "x").silence == stranger.silence == ""
 

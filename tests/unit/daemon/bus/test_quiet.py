@@ -16,7 +16,7 @@ def absent(*others: str) -> Around:
 
 def test_of_a_robot_that_is_not_there_the_one_most_like_it_is_told_first() -> None:
     told = why("state", "rob1t1", PLAIN, absent("acsar", "robot2", "robot1"))
-    assert "no robot rob1t1 is there; there is robot1, robot2, acsar: --id robot1" in told
+    assert "there is no robot rob1t1, but there is robot1, robot2, acsar: --id robot1" in told
 
 
 def test_of_a_large_fleet_a_few_are_told() -> None:
@@ -26,26 +26,26 @@ def test_of_a_large_fleet_a_few_are_told() -> None:
 
 
 def test_where_nobody_is_seen_the_place_is_told() -> None:
-    assert f"no robot is seen at {PLAIN}" in why("state", "acsar", PLAIN, absent())
+    assert f"no robot is visible at {PLAIN}" in why("state", "acsar", PLAIN, absent())
     assert "`acsard whoami --id robot1`" in why("state", "robot1", TLS, absent())
 
 
 def test_a_daemon_that_is_gone_is_told_before_all_else() -> None:
     told = why("oddom", "acsar", PLAIN, Around(linked=False, here=False))
-    assert f"nobody is connected at {PLAIN} any more" in told
+    assert f"{PLAIN} has no connection any more" in told
 
 
 @pytest.mark.parametrize(
     ("key", "words"),
     [
         ("oddom", "did you mean odom?"),
-        ("cmd/app", "nobody sends on cmd/app now"),
-        ("imu", "nobody sends on imu now"),
+        ("cmd/app", "no program sends on cmd/app now"),
+        ("imu", "no program sends on imu now"),
         ("sim/pose", "only the simulator publishes sim/pose"),
         ("json/sim/pose", "only the simulator"),
-        ("events", "`acsard get events` prints the last"),
-        ("odom", "comes with the answers of its microcontroller"),
-        ("json/tf", "comes with the answers of its microcontroller"),
+        ("events", "`acsard get events` prints its last value"),
+        ("odom", "is published only with answers of the microcontroller"),
+        ("json/tf", "is published only with answers of the microcontroller"),
         ("diagnostics", "may you follow it"),
     ],
 )

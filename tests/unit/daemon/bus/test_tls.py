@@ -99,9 +99,9 @@ def test_files_that_are_none_end_at_no_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("number", "told", "untold"),
     [
-        (errno.EHOSTUNREACH, "robot.local is not there (No route to host)", "listens"),
-        (errno.ENETUNREACH, "robot.local is not there (Network is unreachable)", "listens"),
-        (errno.ECONNREFUSED, "nobody listens on port 7449 of robot.local", "not there"),
+        (errno.EHOSTUNREACH, "robot.local cannot be reached (No route to host)", "listens"),
+        (errno.ENETUNREACH, "robot.local cannot be reached (Network is unreachable)", "listens"),
+        (errno.ECONNREFUSED, "no program listens on port 7449 of robot.local", "not there"),
     ],
 )
 def test_a_host_that_is_not_there_is_not_one_on_which_nobody_listens(
@@ -128,6 +128,7 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
 
     monkeypatch.setattr(socket, "create_connection", connection)
     assert trouble(f"tls/robot.local:7449{options}", "") == (
-        "robot.local is silent on port 7449: is it on, and does a firewall drop connections?"
+        "robot.local does not answer on port 7449: is it switched on, "
+        "and does a firewall drop connections?"
     )
     assert asked == [("robot.local", 7449)]

@@ -39,8 +39,11 @@ def test_it_takes_the_fleets_file_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }', "not a router's"),
-        ('{ mode: "router", listen: { endpoints: [] } }', "not a router's"),
+        (
+            '{ mode: "peer", listen: { endpoints: ["tcp/127.0.0.1:0"] } }',
+            "not the configuration of a router",
+        ),
+        ('{ mode: "router", listen: { endpoints: [] } }', "not the configuration of a router"),
         # Zenoh would listen on every address without encryption
         ('{ mode: "router" }', "needs mode"),
         ('{ mode: "ruter" }', "; correct it"),
@@ -227,7 +230,7 @@ def test_each_certificate_that_commands_has_keys_of_its_own_on_each_robot(
     ],
 )
 def test_a_name_has_one_place(robots: list[str], people: Mapping[Role, Sequence[str]]) -> None:
-    with pytest.raises(UsageError, match="there twice"):
+    with pytest.raises(UsageError, match="named twice"):
         router_file(TEMPLATE, robots, people)
 
 

@@ -74,7 +74,7 @@ def test_a_daemon_that_is_connected_and_answers_nothing_is_none() -> None:
     over = watch.reopen(Look(S, linked=True, unanswered=UNANSWERED), 0)
     assert over is not None
     assert (over.name, over.level) == ("door_alone", "warning")
-    assert "4 questions unanswered" in over.text
+    assert "4 queries unanswered" in over.text
 
 
 def test_without_the_daemon_it_closes() -> None:

@@ -32,8 +32,8 @@ def path() -> Iterator[str]:
 @pytest.mark.parametrize(
     ("number", "code", "words"),
     [
-        (errno.ENOENT, Exit.NO_PORT, "is not there"),
-        (errno.ENXIO, Exit.NO_PORT, "is not there"),
+        (errno.ENOENT, Exit.NO_PORT, "does not exist"),
+        (errno.ENXIO, Exit.NO_PORT, "does not exist"),
         (errno.ENOTTY, Exit.NO_PORT, "is not a serial port"),
         (errno.EACCES, Exit.NO_PERMISSION, "dialout"),
         (errno.EPERM, Exit.NO_PERMISSION, "dialout"),
