@@ -290,7 +290,7 @@ COMMANDS: dict[str, How] = {
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
         SIMULATED, "test_a_drive_is_recorded_as_calibrate_reads_it"
     ),
-    "acsard odom": Run("told by|stands still"),
+    "acsard odom": Run("based on|stands still"),
     "acsard calibrate": Elsewhere(
         GUIDED, "test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file"
     ),

@@ -16,14 +16,14 @@ from acsard.bench.matching import Summary
 from acsard.terminal.tables import table
 
 POINTS = {
-    "command_to_wire": "put() of a command here -> first byte of its line at the port's far end",
+    "command_to_wire": "put() here -> first byte of the line at the port's far end",
     "feedback_to_odometry": "last byte of a feedback line written -> its odometry here",
     "read_to_odometry": "feedback sampled by the microcontroller (its stamp) -> its odometry here",
 }
 """The figures measured from outside, and their points; "here" is the benchmark's own process."""
 
 OWN = {
-    "period_lateness": "period due (the first one, if several were missed) -> its step",
+    "period_lateness": "period due (the first of several missed) -> its step",
     "step_time": "start of a step -> end of its work",
     "command_age": "command arrived -> each line that follows it",
     "command_to_wire": "command arrived in its source's turn -> first line after it",
@@ -178,7 +178,7 @@ def _counts(result: Result) -> list[tuple[str, str]]:
     rows = [
         ("commands", f"{r.commands_sent} sent{seen}"),
         ("feedback lines", f"{r.lines_told}{said} became odometry here{waiting}"),
-        ("periods missed", f"{r.missed_periods}, beside {r.lines_sent} lines sent"),
+        ("periods missed", f"{r.missed_periods}; {r.lines_sent} lines were sent"),
         ("processor", f"{r.cpu_percent_following:.1f} % of a core with one subscriber"),
         ("", f"{r.cpu_percent_commanded:.1f} % with 25 commands a second as well"),
         ("memory", f"{r.resident_mb:.0f} MB resident"),

@@ -34,7 +34,7 @@ MENDS: dict[Cause, str] = {
 }
 
 TOLD: dict[Basis, str] = {
-    "measured": "what came",
+    "measured": "measurements",
     "settings": "[odometry]",
     "unknown": "nothing",
 }
@@ -91,7 +91,7 @@ def _table(budget: Budget) -> Table:
     rows = [
         (name, _number(mm, 0), _number(deg, 2), *told) for name, mm, deg, *told in [*known, total]
     ]
-    return table(rows, ("", "mm in 100 m", "deg a turn", "", "told by"), right={1, 2})
+    return table(rows, ("", "mm in 100 m", "deg a turn", "", "based on"), right={1, 2})
 
 
 def _track(budget: Budget, learned: float) -> str:

@@ -312,7 +312,7 @@ def because(then: Config, now: Config, tally: Comparison, began_ns: int) -> list
     before, after = (dict(flat(effective(config))) for config in (then, now))
     keys = [key for key in before | after if before.get(key) != after.get(key)]
     told = [f"{key} {_set(key, before)} then, {_set(key, after)} now" for key in keys]
-    rows = [f"set otherwise: {listed(told, MOST_KEYS, '; ') or 'nothing'}"]
+    rows = [f"changed settings: {listed(told, MOST_KEYS, '; ') or 'nothing'}"]
     first, fault = tally.first, tally.fault
     if first is not None and "line" in first.what:
         shaping = [key for key in keys if key.startswith(SHAPE_LINES)]

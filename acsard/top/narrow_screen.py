@@ -59,7 +59,7 @@ def motion(state: RobotState, width: int) -> list[Text]:
 
 def sources(state: RobotState, room: int, width: int) -> list[Text]:
     """Return priority and age of each source, with its reason below, in about `room` lines."""
-    lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "heard")])]
+    lines = [rule(width, [(0, "sources"), (16, "priority"), (26, "seen")])]
     left = list(state.sources)
     while left:
         one = left[0]

@@ -63,7 +63,7 @@ def _header(seen: ScreenData, width: int) -> Text:
     left = Text.assemble((clean(seen.robot_id), "bold"), "  ", clean(seen.endpoint))
     if seen.info is not None:
         left.append(f"  acsard {clean(seen.info.version)}", "dim")
-    right = Text(f"heard {rough(seen.age)} ago" if seen.state is not None else "", "dim")
+    right = Text(f"seen {rough(seen.age)} ago" if seen.state is not None else "", "dim")
     if seen.hint:
         right.append(f"   {seen.hint}")
     return ends(left, right, width)

@@ -36,7 +36,10 @@ FIGURES = {
     "period_lateness": ("period due → step", "from a period due (the first missed) to its step"),
     "step_time": ("work of one step", "from the start of a step to the end of its work"),
     "command_age": ("arrival → each line", "from a command's arrival to each line that follows it"),
-    "command_to_wire": ("arrival → first line", "from arrival in its turn to the first such line"),
+    "command_to_wire": (
+        "arrival → first line",
+        "from arrival in the source's turn to the first line",
+    ),
     "feedback_to_bus": ("line read → published", "from the read of a line to its last message"),
     "mcu_round_trip": ("line out → answer in", "from a line to its answer; checked link"),
 }
@@ -84,7 +87,7 @@ def sources(state: RobotState, room: int, width: int) -> list[Text]:
     """Return a line for each command source, in at most `room` lines."""
     room_name = 13 + max(0, width - 80) // 2
     start = room_name + 3
-    at = ((0, "sources"), (start, "priority"), (start + 10, "heard"), (start + 17, "waits for"))
+    at = ((0, "sources"), (start, "priority"), (start + 10, "seen"), (start + 17, "waits for"))
     lines = [rule(width, at)]
     shown = state.sources[: room if len(state.sources) <= room else room - 1]
     lines += [_source(source, state, room_name) for source in shown]

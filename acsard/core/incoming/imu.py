@@ -79,7 +79,9 @@ class ImuTold:
         """Follow this sender; return whether another one was followed before."""
         other = who != self._followed
         if other and (self._own or now_ns - self._heard_ns < FOLLOWED_NS):
-            raise DecodeError("second_sender", f"{who[:MOST_WHO]} sends beside {self._followed}")
+            raise DecodeError(
+                "second_sender", f"{who[:MOST_WHO]} sends as well, but the gyro is {self._followed}"
+            )
         before, self._followed, self._heard_ns = self._followed, who, now_ns
         return other and before != ""
 

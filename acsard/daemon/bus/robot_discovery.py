@@ -96,7 +96,7 @@ def nobody(endpoint: str) -> str:
         return (
             "no robot is visible: over TLS only exact keys pass, so name the robots, --id "
             "robot1,robot2 (or set [access] wildcards = true on the robot); or your certificate "
-            "permits none: `acsard whoami --id robot1` tells"
+            "permits none: `acsard whoami --id robot1` says so"
         )
     return f"no robot is visible at {endpoint}; does a daemon run there, or behind that router?"
 

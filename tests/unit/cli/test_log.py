@@ -306,7 +306,7 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     other.write_text("[limits]\nlinear_speed = 0.1\nlinear_acceleration = 0.5\n")
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
     assert code == 0
-    (keys,) = [line for line in out.splitlines() if line.startswith("set otherwise: ")]
+    (keys,) = [line for line in out.splitlines() if line.startswith("changed settings: ")]
     assert "limits.linear_speed 1.0 then, 0.1 now" in keys
     assert "limits.linear_acceleration 1.0 then, 0.5 now" in keys
     (told,) = [line for line in out.splitlines() if line.startswith("there the fastest wheel")]
@@ -326,7 +326,7 @@ def test_settings_that_change_no_line_are_told_all_the_same(
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
     assert "as that configuration computes them from the same inputs" in out
-    assert out.splitlines()[-1].startswith("set otherwise: rates.state 10.0 then, 5.0 now")
+    assert out.splitlines()[-1].startswith("changed settings: rates.state 10.0 then, 5.0 now")
 
 
 def test_what_was_cut_is_written_as_a_finished_file(

@@ -28,7 +28,7 @@ It clears the screen, sets the title, is markup, reverses direction, colours and
 
 def test_the_head_says_who_where_and_how_fresh() -> None:
     head = lines_of(SEEN)[0]
-    for told in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "heard 0.1 s ago", "q leaves"):
+    for told in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q leaves"):
         assert told in head
 
 

@@ -48,5 +48,5 @@ def test_where_wildcards_do_not_pass_names_are_asked_for() -> None:
 
 
 def test_where_certificates_decide_who_sees_nobody_is_told_how_to_find_out() -> None:
-    assert "`acsard whoami --id robot1` tells" in nobody("tls/router.local:7447")
+    assert "`acsard whoami --id robot1` says so" in nobody("tls/router.local:7447")
     assert "whoami" not in nobody("tcp/127.0.0.1:7448")
