@@ -81,7 +81,7 @@ def decode(robot: str, data: bytes) -> Latches:
 
 def at_start(why: str) -> str:
     """Return the reason of a stop that the daemon itself sets at its start."""
-    return f"stopped at the start, because {why}"
+    return f"stopped when the daemon started, because {why}"
 
 
 def unreadable(where: str, reason: str) -> str:

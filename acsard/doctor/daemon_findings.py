@@ -265,7 +265,7 @@ def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
     if refused:
         most = sorted(refused.items(), key=lambda one: -one[1])
         told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
-        mend = "the log says by whom (imu_refused); one gyro, rad/s, z up, finite values"
+        mend = "the log names the sender (imu_refused); send finite rad/s of one gyro, z up"
         yield Finding("gyro", "warning", f"samples on imu that were rejected: {told}", mend)
 
 

@@ -38,7 +38,7 @@ Ns = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 """Time in ns since 1970 that fits in a signed 64-bit integer."""
 
 CUTS = {
-    "bug": "cut: the daemon ended because of an error in the daemon",
+    "bug": "cut: an internal error ended the daemon",
     "crash": "cut: the daemon or the computer ended without notice",
     "disk": "cut: the disk accepted no more data",
     "late": "cut: the daemon was asked to end, and the disk was too slow for the rest",

@@ -257,7 +257,9 @@ def verdict(tally: Comparison) -> str:
     lines = f"{tally.lines_same:,} of {tally.lines:,} lines are the same".replace(",", " ")
     poses = f"{tally.poses_same:,} of {tally.poses:,} poses".replace(",", " ")
     modes = f"{tally.modes_same:,} of {tally.steps:,} modes".replace(",", " ")
-    bits = "" if not tally.same or tally.exact else " (poses to the um, not to the last bit)"
+    bits = (
+        "" if not tally.same or tally.exact else " (poses agree to 1 um, but not to the last bit)"
+    )
     return f"{lines}, {poses}, {modes}{bits}"
 
 
@@ -348,7 +350,7 @@ def otherwise(tally: Comparison) -> list[str]:
     if tally.end is not None:
         (x, y, _), (here_x, here_y, _) = tally.end
         rows.append(
-            f"the end by odometry: x {x / MICRO:.3f} y {y / MICRO:.3f} then, "
+            f"the last pose by odometry: x {x / MICRO:.3f} y {y / MICRO:.3f} then, "
             f"x {here_x / MICRO:.3f} y {here_y / MICRO:.3f} now; at most {tally.apart:.3f} m apart"
         )
     return rows

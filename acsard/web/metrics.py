@@ -80,7 +80,7 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         spread = figure.last_minute
         for at, value in (("p50", spread.p50), ("p99", spread.p99), ("max", spread.max)):
             figures.append(({"figure": name, "at": at}, value * US))
-    yield "figure_seconds", "gauge", "how fast it is, over the last minute", figures
+    yield "figure_seconds", "gauge", "latencies of the daemon, over the last minute", figures
 
 
 def _by(label: str, counts: Mapping[str, int]) -> list[Sample]:

@@ -116,7 +116,7 @@ def test_a_fault_of_the_daemons_own_is_told_and_what_came_into_that_step_is_in_t
     assert path.name.endswith(".kept.mcap")
     for words in ((), ("show",)):
         said = finish(acsard("log", *words, "--directory", str(path.parent)), tmp_path).out
-        assert "the daemon ended because of an error in the daemon: in step " in said
+        assert "an internal error ended the daemon: in step " in said
         assert "ZeroDivisionError: a fault of our own" in said
     assert replayed(tmp_path, path) > 3
     again = finish(acsard("log", "replay", str(path)), tmp_path)

@@ -57,7 +57,7 @@ LIVE: dict[str, Live] = {
     "limits.angular_jerk": Live("always", "how fast the acceleration of a turn may grow"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
     "commands.pause": Live(
-        "rest", "after a zero of a shared sender identity, time in which no speed may follow"
+        "rest", "time without a speed that must follow a zero of a shared sender identity"
     ),
     "commands.sources.*.timeout": Live("rest", "silence after which the source is stale"),
     "odometry.covariance": Live(

@@ -77,7 +77,7 @@ def named(text: str) -> NamedFault:
         raise ValueError("the seconds between resets must be above 0")
     if name == "stalls" and not fault.values[0] > fault.values[1] >= SHORTEST_S:
         raise ValueError(
-            "needs the seconds from one stall to the next, and fewer seconds for each stall; "
+            "give the seconds from one stall to the next, then fewer seconds for each stall; "
             f"both at least {SHORTEST_S}"
         )
     if name == "other_baud" and fault.values[0] not in get_args(Baud):

@@ -127,7 +127,7 @@ def test_a_file_that_cannot_be_read_starts_the_robot_stopped(
     _, latches = started(tmp_path)
     assert latches.stop
     assert latches.stop.by == "acsard"
-    begins = f"stopped at the start, because {path} cannot be read: "
+    begins = f"stopped when the daemon started, because {path} cannot be read: "
     assert latches.stop.why.startswith(begins)
     assert reason in latches.stop.why
     assert latches.stop.why.endswith("; a stop may have been lost")
@@ -146,7 +146,7 @@ def test_a_directory_that_cannot_be_written_starts_the_robot_stopped(
     (tmp_path / "file").touch()
     file, latches = started(tmp_path / "file")
     assert latches.stop
-    assert latches.stop.why.startswith("stopped at the start, because ")
+    assert latches.stop.why.startswith("stopped when the daemon started, because ")
     assert file.trouble.startswith("a stop cannot be kept over a restart: ")
 
 

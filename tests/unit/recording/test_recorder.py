@@ -329,10 +329,7 @@ def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_i
     assert path.name.endswith(KEPT)
     assert last is not None
     assert (last.cut, last.why) == ("bug", why)
-    assert (
-        how_it_ends(last.cut, last.why)
-        == f"cut: the daemon ended because of an error in the daemon: {why}"
-    )
+    assert how_it_ends(last.cut, last.why) == f"cut: an internal error ended the daemon: {why}"
     recording = Recording(path)
     lived = live(recording)
     assert (lived.tally.same, lived.tally.steps, lived.trouble) == (True, number, "")
@@ -356,7 +353,7 @@ def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
     last = closing(path)
     assert last is not None
     told = how_it_ends(last.cut, last.why)
-    assert told.startswith("cut: the daemon ended because of an error in the daemon: ValueError: ")
+    assert told.startswith("cut: an internal error ended the daemon: ValueError: ")
     assert (told.isprintable(), len(told) < 300) == (True, True)
 
 
