@@ -35,7 +35,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "speeds, gyro and position as one file for `acsard calibrate --log`: acsard "
         "echo wheel_states imu --csv > drive.csv. --short prints pose and speeds as "
         "text: acsard echo odom -n 1 --short. If --id names several robots, each "
-        "line begins with its robot.",
+        "line names its robot.",
     )
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"

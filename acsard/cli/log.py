@@ -37,8 +37,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     _directory(parser, None)
     parser.set_defaults(main=list_all)
     inner = parser.add_subparsers(title="verbs", metavar="VERB")
-    show = inner.add_parser("show", help="print the events of a recording as text")
-    show.add_argument("file", nargs="?", metavar="FILE")
+    show = inner.add_parser(
+        "show",
+        help="print the events of a recording as text",
+        description="Print the events of a recording as text, one line per event.",
+    )
+    show.add_argument("file", nargs="?", metavar="FILE", help=log_span.FILE_HELP)
     log_span.add(show)
     show.add_argument("--json", action="store_true", help="print one JSON object a line")
     show.set_defaults(main=show_one)
@@ -49,7 +53,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "mode and pose with the recorded ones. With --config, show what another "
         "configuration would have changed.",
     )
-    replay.add_argument("file", nargs="?", metavar="FILE")
+    replay.add_argument("file", nargs="?", metavar="FILE", help=log_span.FILE_HELP)
     replay.add_argument(
         "--config",
         metavar="FILE",
@@ -59,8 +63,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     recover = inner.add_parser(
         "recover",
         help="write the intact part of an unfinished or damaged recording as a finished file",
+        description="Write the intact part of an unfinished or damaged recording as a finished "
+        "file. The recording itself is not changed.",
     )
-    recover.add_argument("file", metavar="FILE")
+    recover.add_argument("file", metavar="FILE", help="the recording, or its number in the list")
     recover.add_argument("new", metavar="NEW", help="the file to write")
     recover.add_argument("--force", action="store_true", help="overwrite an existing file")
     recover.set_defaults(main=recover_one)

@@ -30,7 +30,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
         help="write a recording as a file for Foxglove, PlotJuggler, ros2 bag, or as a table",
         description=DESCRIPTION,
     )
-    parser.add_argument("file", nargs="?", metavar="FILE")
+    parser.add_argument("file", nargs="?", metavar="FILE", help=log_span.FILE_HELP)
     parser.add_argument(
         "new",
         nargs="?",

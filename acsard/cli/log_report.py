@@ -41,7 +41,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
         help="draw a recording as one HTML file with path, speeds, sources, link and events",
         description=DESCRIPTION,
     )
-    parser.add_argument("file", nargs="?", metavar="FILE")
+    parser.add_argument("file", nargs="?", metavar="FILE", help=log_span.FILE_HELP)
     parser.add_argument(
         "new",
         nargs="?",

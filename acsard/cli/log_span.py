@@ -19,6 +19,9 @@ from acsard.core.values import NS_PER_S, Instant
 if TYPE_CHECKING:
     from acsard.recording.file import Recording
 
+FILE_HELP = "a recording, or its number in the list of `acsard log` (default: the newest)"
+"""The help text of the recording that most actions of `acsard log` take."""
+
 SET_NS = 5 * NS_PER_S
 """Difference between wall clock and monotonic clock that counts as a clock step, ns."""
 

@@ -44,7 +44,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--write",
         action="store_true",
-        help="also write it into the local configuration file and keep its comments (needs an "
+        help="also write them into the local configuration file and keep its comments (needs an "
         f"extra: {install('mcu')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
