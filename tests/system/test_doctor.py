@@ -202,8 +202,8 @@ def test_a_poor_board_behind_a_daemon_is_named(
         port = sim.says("acsard run --port").split()[-1]
         with Daemon(tmp_path, words=("--port", port)) as daemon, Bus(daemon.endpoint) as bus:
             linked = fault.startswith("lost")
-            until(lambda: bus.state()["mode"] == "ready" if linked else "heard" in
-                  bus.state()["reason"], 10.0, "what is heard")  # fmt: skip
+            until(lambda: bus.state()["mode"] == "ready" if linked else "received" in
+                  bus.state()["reason"], 10.0, "the diagnosis")  # fmt: skip
             code, found = examined(tmp_path, f'[bus]\nlisten = ["{daemon.endpoint}"]\n')
     finding = worst(found[subject])
     assert words in finding["text"]
@@ -236,7 +236,7 @@ def with_certificates(where: Path, days: float) -> str:
     [
         (400, "ok", "valid for"),
         (10, "warning", "valid for 10 days"),
-        (-3, "failure", "ended 3 days ago"),
+        (-3, "failure", "expired 3 days ago"),
     ],
 )
 def test_certificates_are_told_by_how_long_they_last(

@@ -169,7 +169,7 @@ def followed_to_its_end(robot: Robot, own: Path, lasts: float) -> str | None:
         for thread in (patience, Thread(target=one.stdout.read, daemon=True)):
             thread.start()
         try:
-            return next((line for line in one.stderr if "has ended" in line), "")
+            return next((line for line in one.stderr if "has expired" in line), "")
         finally:
             patience.cancel()
             one.kill()
