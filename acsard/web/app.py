@@ -20,8 +20,8 @@ from msgspec import Meta, Struct
 
 from acsard import __version__
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
-from acsard.daemon.bus.access import least_role
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi

@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.core.messages.permissions import COMMAND_ROLE
 from acsard.core.messages.signature import MOST
 from acsard.core.values import AcsardError, Role
 
@@ -78,7 +79,7 @@ class Command(_Frame, frozen=True):
     `stamp` is the time of the command in ms by the sender's own clock.
     """
 
-    least: ClassVar[Role] = "operator"
+    least: ClassVar[Role] = COMMAND_ROLE
     cmd: Wish
     stamp: float
     steady: bool = False

@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import IMU, PUBLISHED
+from acsard.core.messages.topics import FOLLOWED
 from acsard.web import job_lines, socket_messages
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route
@@ -43,7 +43,7 @@ LINES = (
 )  # fmt: skip
 """Types of the content of `guide`."""
 
-KEYS = {topic.key: topic.type for topic in PUBLISHED} | {IMU: "Imu"}
+KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Type of each key that can be subscribed to."""
 
 

@@ -26,16 +26,11 @@ from acsard.core.config.settings import (
     RosConfig,
     Source,
 )
+from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, full_key, whoami_key
 from acsard.core.ros.transports import PARAMETERS, claims, endpoints
 from acsard.core.values import Role
-from acsard.daemon.bus.access import (
-    GRANTS,
-    SERVICE_ROLES,
-    access_control,
-    door_access,
-    least_role,
-)
+from acsard.daemon.bus.access import GRANTS, access_control, door_access
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 EVERYBODY = ("local", *ROLES)
