@@ -28,7 +28,7 @@ this order as contracts, and `lint-imports` checks them.
     client/          follow and drive a robot from Python, synchronous or with asyncio; the
                      follower and the commander hold the rules and time limits of all tools
     daemon/          the process: control loop, latch file, ways down
-    daemon/gateway/  `acsard door`: the process in which TLS ends
+    daemon/gateway/  `acsard gateway`: the process in which TLS ends
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay

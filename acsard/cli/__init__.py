@@ -48,7 +48,7 @@ VERBS = (
     "calibrate",
     "log",
     "lan",
-    "door",
+    "gateway",
     "router",
     "service",
     "completion",

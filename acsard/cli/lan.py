@@ -222,7 +222,7 @@ def _admit_service(directory: Path) -> None:
     if step is None:
         return
     step.do()
-    print(f"{step}\nFor the service's door; look at the networks in it, then:")
+    print(f"{step}\nFor the service's gateway; look at the networks in it, then:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 

@@ -44,7 +44,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
     parser.add_argument("file", nargs="?", metavar="FILE")
     parser.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
     parser.add_argument("--force", action="store_true", help="write over what is there")
-    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     return parser
 
 
@@ -68,7 +68,7 @@ def report_one(
     """Write the report, print a summary, and return notes about the recording."""
     from acsard.recording.atomic_output import beside
 
-    if args.held:
+    if args.supervised:
         return _held(recording, args, plotly, words)
     new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
     try:

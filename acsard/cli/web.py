@@ -63,7 +63,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     lasting.add_argument(
         "--hours", type=_hours, metavar="N", help=f"the same, for a visitor: 1 to {MOST_HOURS}"
     )
-    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
 
 
@@ -113,8 +113,8 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         tls,
         tokens.place(),
         args.config or "",
-        next_port=args.held,
-        held=args.held,
+        next_port=args.supervised,
+        held=args.supervised,
     )
     log = Log(config.log)
     try:

@@ -177,9 +177,9 @@ EventName = Literal[
     "gyro", "track", "imu_refused",
     "bus_stuck", "router_missing", "router_found", "no_router",
     "missed_periods", "recording", "latch_file",
-    "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
+    "gateway_open", "gateway_full", "gateway_stuck", "gateway_lost_daemon", "gateway_ended",
     "page_ended", "page_refused",
-    "router_open", "router_crowded", "router_stuck", "router_ended",
+    "router_open", "router_full", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
     "mode", "commander", "kept_waiting", "first_contact", "command_refused", "fault",
 ]  # fmt: skip

@@ -190,9 +190,11 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from clocks(running)
     yield from gyro(state.gyro, state.counters)
     yield from linked({row.name: row for row in running.rows})
-    if state.counters.get("door_crowded"):
+    if state.counters.get("gateway_full"):
         text = "all connections from the network were taken at times: the log says by whom"
-        yield Finding("door", "warning", text, "take his certificate from [access], or his program")
+        yield Finding(
+            "gateway", "warning", text, "take his certificate from [access], or his program"
+        )
     yield from latch_file(state.latch_file)
     yield from late(running)
 
@@ -261,11 +263,11 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 
-def door(config: Config) -> Iterator[Finding]:
+def gateway(config: Config) -> Iterator[Finding]:
     """Yield a finding for each endpoint of the TLS gateway."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
-            yield Finding("door", "ok", f"open at {endpoint}")
+            yield Finding("gateway", "ok", f"open at {endpoint}")
         else:
-            mend = "systemctl status acsard-door; `acsard run` opens one by itself"
-            yield Finding("door", "warning", f"nobody listens at {endpoint}", mend)
+            mend = "systemctl status acsard-gateway; `acsard run` opens one by itself"
+            yield Finding("gateway", "warning", f"nobody listens at {endpoint}", mend)

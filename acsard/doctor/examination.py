@@ -23,7 +23,7 @@ from acsard.core.messages.expiry import expiry
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
-from acsard.doctor.daemon_findings import daemon, door, found, routers
+from acsard.doctor.daemon_findings import daemon, found, gateway, routers
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, compared
 from acsard.host import clock, real_time
@@ -188,7 +188,9 @@ def examine(
     running = found(config, address)
     if isinstance(running, Running) and not running.here:
         elsewhere = f"runs on another machine (its pid {running.info.pid} is none of acsard's here)"
-        yield Finding("daemon", "ok", f"{elsewhere}: its port, files and door are looked at there")
+        yield Finding(
+            "daemon", "ok", f"{elsewhere}: its port, files and gateway are looked at there"
+        )
         yield from certificates(address.tls)
         yield from daemon(running)
         return
@@ -212,4 +214,4 @@ def examine(
         yield from daemon(running)
     else:
         yield running
-    yield from door(config)
+    yield from gateway(config)

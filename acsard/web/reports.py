@@ -32,7 +32,7 @@ from acsard.host import clock
 from acsard.host.threads import in_thread
 
 # -P runs the installed package, not files in the current directory.
-COMMAND = (sys.executable, "-P", "-m", "acsard", "log", "report", "--held")
+COMMAND = (sys.executable, "-P", "-m", "acsard", "log", "report", "--supervised")
 
 POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src "

@@ -153,7 +153,7 @@ TOPICS: tuple[Topic, ...] = (
     ),
     Topic("stop", "in", "anything", "any", "any PUT stops, as srv/stop does", publish="viewer"),
     Topic(
-        "door", "in", "DoorState", "4 Hz", "from the door to the network, at the machine only",
+        "gateway", "in", "GatewayState", "4 Hz", "from the TLS gateway, at the machine only",
         publish="maintainer", local=True,
     ),
     *(_service(verb) for verb in SERVICES),

@@ -189,7 +189,7 @@ def access_control(config: Config) -> dict[str, object]:
     return _access(config, LOCAL, gateway=False)
 
 
-def door_access(config: Config) -> dict[str, object]:
+def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of `access_control` for the TLS gateway's session.
 
     Its only link without a certificate is that to the daemon. Each certificate that may command has

@@ -68,7 +68,7 @@ def daemon_session(
     return _opened(settings, bus.plain)
 
 
-def door_session(
+def gateway_session(
     bus: BusConfig,
     robot_id: str,
     sources: tuple[str, ...],

@@ -11,7 +11,7 @@ from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.schema import DiagnosticStatus, Time
 from acsard.doctor.daemon_findings import (
     clocks,
-    door,
+    gateway,
     gone,
     gyro,
     latch_file,
@@ -72,10 +72,10 @@ def test_periods_that_are_missed_now_are_told_after_months_without() -> None:
     assert "600 of 6000" in finding.text
 
 
-def test_a_door_is_told_where_it_listens() -> None:
-    with socket.create_server(("0.0.0.0", 0)) as door_of_ours:
-        endpoint = f"tls/0.0.0.0:{door_of_ours.getsockname()[1]}"
-        (finding,) = door(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
+def test_a_gateway_is_told_where_it_listens() -> None:
+    with socket.create_server(("0.0.0.0", 0)) as gateway_of_ours:
+        endpoint = f"tls/0.0.0.0:{gateway_of_ours.getsockname()[1]}"
+        (finding,) = gateway(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
     assert (finding.level, finding.text) == ("ok", f"open at {endpoint}")
 
 

@@ -40,7 +40,7 @@ def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
     assert problems(bus=BusConfig(connect=(endpoint,), tls="/etc/acsard/tls")) == []
 
 
-def test_the_door_needs_a_way_to_the_daemon() -> None:
+def test_the_gateway_needs_a_way_to_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
         'bus.listen = ["tls/0.0.0.0:7449"]: who comes by TLS reaches the daemon through its '

@@ -41,7 +41,7 @@ def test_each_row_names_a_role_for_the_uses_of_its_direction_and_no_other() -> N
 
 def test_a_key_of_the_robot_s_own_machine_is_granted_to_no_role() -> None:
     granted = {key for role in ROLES for use in USES for key in keys_for(role, use, TOPICS)}
-    assert "door" not in granted
+    assert "gateway" not in granted
     assert not any(key.startswith(("cmd/", "wheel_cmd/")) for key in granted)
 
 

@@ -23,7 +23,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.messages.topics import source_keys
 from acsard.core.values import ROLES, Role
-from acsard.daemon.bus.access import door_access
+from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.gateway.fleet_router import Router, router_file
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 
@@ -138,7 +138,7 @@ def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
 def test_each_role_may_use_the_keys_that_the_gateway_of_a_robot_lets_it(
     role: Role, message: str
 ) -> None:
-    gateway = door_access(
+    gateway = gateway_access(
         Config(
             robot=RobotConfig(id="robot1"),
             ros=RosConfig(bridge=False, rmw=False),
