@@ -45,7 +45,7 @@ def main(args: argparse.Namespace) -> int:
     where, config = load(args.config, given)
     if not config.bus.outside:
         raise ExitError(
-            Exit.USAGE, f"{where} has no tls/ endpoint in bus.listen; `acsard lan init --write`"
+            Exit.USAGE, f"{where} has no tls/ endpoint in bus.listen; `acsard tls init --write`"
         )
     log_from_environment()
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())

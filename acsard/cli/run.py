@@ -55,7 +55,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--record",
         metavar="DIRECTORY",
         help="record all that comes in and the lines that leave there (record.directory); "
-        "`acsard log` reads it",
+        "`acsard recording` reads it",
     )
     parser.add_argument(
         "--no-gateway",

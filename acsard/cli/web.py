@@ -146,7 +146,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
         raise UsageError(
             f"nobody could come with it: web.address in {where} has no https://; add "
             '"https://0.0.0.0:8443" there, or name another file by --config (or --address); and '
-            "`acsard lan init` makes a certificate"
+            "`acsard tls init` makes a certificate"
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS

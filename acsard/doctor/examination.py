@@ -46,19 +46,19 @@ def certificates(tls: str) -> Iterator[Finding]:
         file = directory / name
         if not os.access(file, os.R_OK):
             text = f"{file} is missing or not yours to read"
-            yield Finding("certificates", "failure", text, "`sudo acsard lan init`, or sudo doctor")
+            yield Finding("certificates", "failure", text, "`sudo acsard tls init`, or sudo doctor")
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
         require_usable(tls)
     except MendableError as error:
-        yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
+        yield Finding("certificates", "failure", str(error), "see `acsard tls init --help`")
         return
     ends = ends_ns(tls)
     level, words = expiry(ends, now().wall_ns)
-    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
+    mend = "`acsard tls renew`, or in a fleet a new one by `tls add`, where ca-key.pem is"
     if ends is None:
-        mend = f"{install('lan')}, to have it read"
+        mend = f"{install('tls')}, to have it read"
     yield Finding("certificates", LEVELS[level], words, mend if level else "")
 
 

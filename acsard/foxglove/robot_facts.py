@@ -16,7 +16,7 @@ from acsard.host.errors import ReplyError
 
 DEAF = (
     "what the sources command (/cmd_vel_in/…) is told to nobody who comes by TLS: see it with "
-    "`acsard foxglove` at the robot, or later by `acsard log export`"
+    "`acsard foxglove` at the robot, or later by `acsard recording export`"
 )
 
 

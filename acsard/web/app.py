@@ -311,7 +311,7 @@ ROUTES: tuple[Route, ...] = (
         "the settings that srv/set takes: values, ranges, when each may change",
         gives={200: Body("A list.", list[Setting])}),
     Route("GET", "/api/guide", Begin.least, Page.guide,
-        "what `begin` on the WebSocket takes: ways to calibrate, ports to check",
+        "what `begin` on the WebSocket takes: methods of calibration, ports to check",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",

@@ -112,14 +112,14 @@ class Ping(_Frame, frozen=True):
 
 
 class Begin(_Frame, frozen=True):
-    """Check the board at `port`, or calibrate by a `way`; "" selects the default way."""
+    """Check the board at `port`, or calibrate by a `method`; "" selects the default method."""
 
     least: ClassVar[Role] = "maintainer"  # both turn wheels and write configuration files
     begin: Literal["check", "calibrate"]
     port: Device = ""
-    way: Short = ""
+    method: Short = ""
     positions: Short = ""
-    """The key on which positions arrive, for the way `positions` only."""
+    """The key on which positions arrive, for the method `positions` only."""
 
 
 class Reply(_Frame, frozen=True):

@@ -33,12 +33,13 @@ VALUE = "Value."
 GUIDED = "Guided"
 
 SENT = (
-    socket_messages.Hello, socket_messages.Way, socket_messages.LastMinute, socket_messages.Answer,
-    socket_messages.Rows, socket_messages.Pong, socket_messages.Refused, socket_messages.Gone,
+    socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
+    socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
+    socket_messages.Gone,
 )  # fmt: skip
 
 LINES = (
-    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobProgress,
+    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobMessage,
     job_lines.Doing, job_lines.Progress, job_lines.Question, job_lines.Found, job_lines.Result,
 )  # fmt: skip
 """Types of the content of `guide`."""

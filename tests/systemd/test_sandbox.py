@@ -41,7 +41,7 @@ def test_its_exposure_is_small(container: Container, unit: str) -> None:
 
 def opened(container: Container) -> None:
     """The service with a TLS gateway."""
-    made = container.run(ACSARD, "lan", "init", "--force", "--address", "127.0.0.1")
+    made = container.run(ACSARD, "tls", "init", "--force", "--address", "127.0.0.1")
     assert made.code == 0, made.err
     listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
     container.write(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.lan.authority import Authority
+from acsard.certificates.authority import Authority
 from tests.system.harness import ROOT, until
 from tests.systemd.container import GATEWAY, PAGE, UNIT, Container, UnavailableError, unavailable
 
@@ -263,7 +263,7 @@ def test_only_root_installs(bare: Container) -> None:
 
 def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> None:
     assert bare.run(ACSARD, "service", "install").code == 0
-    made = bare.run(ACSARD, "lan", "init", "--write", CONFIGURATION)
+    made = bare.run(ACSARD, "tls", "init", "--write", CONFIGURATION)
     assert made.code == 0, made.out + made.err
     bare.run("systemctl", "daemon-reload")
     bare.run("systemctl", "restart", UNIT)
