@@ -48,7 +48,7 @@ def link(running: Running) -> Iterator[Finding]:
     # warning.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
     # The built-in simulator is late whenever the daemon is, and it is never unplugged.
-    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_late'}", 0):
+    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = f"lost {late_times} since the daemon's start because this computer did not run"
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
@@ -90,7 +90,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return the number of lost links that this computer did not cause, with a description."""
-    times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
+    times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"it was lost {many(times, 'time')} since the daemon's start: the board starts anew, is "
         "silent at times or was unplugged; the log says when (link_stale, link_down)"

@@ -803,7 +803,7 @@ class Bus:
                 neutral = waits.startswith("send a zero first")
                 if (
                     neutral
-                    or counters.get("commands_first_contact")
+                    or counters.get("commands_of_new_senders")
                     or time.monotonic() > said + 0.5
                 ):
                     self.put(commander.key, ZERO, commander.sender)

@@ -325,7 +325,7 @@ class Visitor:
         def commands() -> list[int]:
             # A first command of a new clock passes the router, and the daemon does not believe it
             # yet.
-            heard = ("commands", "commands_first_contact")
+            heard = ("commands", "commands_of_new_senders")
             return [sum(map(robot.count, heard)) for robot in fleet.robots]
 
         def obeyed() -> bool:

@@ -128,7 +128,7 @@ def test_a_machine_that_stood_still_opens_no_gateway_anew(robot: Open) -> None:
 
 
 def test_what_somebody_at_the_machine_puts_in_the_gateway_s_place_harms_nobody(robot: Open) -> None:
-    huge = b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 400 + b"}"
+    huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
     with Bus(robot.daemon.endpoint) as bus:
         until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
         for payload in (b"", b"{}", b"\xff", huge):

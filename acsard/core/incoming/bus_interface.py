@@ -129,7 +129,7 @@ class RoutersTold:
             events.append(Event("router_found", _words("connected to", come)))
         peers = [one for one in status.peers if one not in before.peers]
         if peers:
-            events.append(Event("no_router", f"{', '.join(peers)} {PEER}", "warning"))
+            events.append(Event("not_a_router", f"{', '.join(peers)} {PEER}", "warning"))
 
 
 def _words(what: str, endpoints: list[str]) -> str:

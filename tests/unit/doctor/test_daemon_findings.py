@@ -93,10 +93,10 @@ def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
 
 
 def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None:
-    counters = {"imu_absurd": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
+    counters = {"imu_out_of_range": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
     _, finding = gyro("used", counters)
     assert finding.level == "warning"
-    assert "12 second sender, 3 absurd" in finding.text
+    assert "12 second sender, 3 out of range" in finding.text
     assert finding.mend
 
 
@@ -154,16 +154,16 @@ def test_what_is_no_loss_is_not_told(sent: int, came: int, period: float, told: 
 
 def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
     assert not list(refused({"lines": 1000, "line_malformed": 20, "lines_sent": 9}))
-    (text,) = refused({"lines": 1000, "line_malformed": 12, "line_wrong_check": 30})
-    assert "12 malformed, 30 wrong check" in text
+    (text,) = refused({"lines": 1000, "line_malformed": 12, "line_crc_error": 30})
+    assert "12 malformed, 30 crc error" in text
 
 
 def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_board() -> None:
-    (late,) = found({}, {"link_lost": 3, "link_lost_late": 3})
+    (late,) = found({}, {"link_lost": 3, "link_lost_host_stall": 3})
     assert "lost 3 times" in late.text
     assert "this computer" in late.text
     assert "mcu check" not in late.mend
-    late, board = found({}, {"link_lost": 5, "link_lost_late": 3})
+    late, board = found({}, {"link_lost": 5, "link_lost_host_stall": 3})
     assert "lost 2 times" in board.text
     assert "mcu check" in board.mend
     states = replace(STATE, counters={"link_lost": 2})

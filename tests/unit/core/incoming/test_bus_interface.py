@@ -57,9 +57,9 @@ def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
         b"{}",
         b'{"opened": "now"}',
         b"[]",
-        b'{"opened": -1, "connections": 0, "crowded": 0}',
-        b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 30 + b"}",
-        b'{"opened": 1, "connections": 0, "crowded": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
+        b'{"opened": -1, "connections": 0, "full": 0}',
+        b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 30 + b"}",
+        b'{"opened": 1, "connections": 0, "full": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
     ],
 )
 def test_what_cannot_be_read_counts_nothing(payload: bytes) -> None:
@@ -114,7 +114,7 @@ def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     found = [(event.name, event.level) for event in events]
-    assert found == [("router_found", "info"), ("no_router", "warning")]
+    assert found == [("router_found", "info"), ("not_a_router", "warning")]
     assert events[-1].text.startswith(f"{A} is no router")
     assert "call stop --id '*'" in events[-1].text
 
