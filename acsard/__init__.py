@@ -21,20 +21,20 @@ this order as contracts, and `lint-imports` checks them.
     bench/           `acsard bench`: measures a daemon from outside
     doctor/          `acsard doctor`: what is wrong with this installation
     foxglove/        `acsard foxglove`: a live server for Foxglove
-    lan/             certificates for other machines
-    report/          `acsard log report`: what a recording shows, as a page
+    certificates/    certificates for other machines
+    report/          `acsard recording report`: what a recording shows, as a page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a process of its own
     client/          follow and drive a robot from Python, synchronous or with asyncio; the
                      follower and the commander hold the rules and time limits of all tools
     daemon/          the process: control loop, latch file, ways down
-    daemon/gateway/  `acsard door`: the process in which TLS ends
+    daemon/gateway/  `acsard gateway`: the process in which TLS ends
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
     host/            the machine: clock, timers, threads, files, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
-    error_budget/    `acsard odom`: what each cause contributes to the odometry's error
+    error_budget/    `acsard accuracy`: what each cause contributes to the odometry's error
     calibration/     `acsard calibrate`: from a log, or by a drive of its own
     terminal/        tables and output of all tools, by the library rich
     core/            the robot as a pure function: no clock, no I/O, no thread

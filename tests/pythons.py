@@ -77,7 +77,7 @@ def replays(python: str, paths: Sequence[Path]) -> bool:
     """Return whether that Python replays all recordings identically. Prints a line for each."""
     version, same = run(python, "-V"), True
     for path in paths:
-        said = run(python, "-m", "acsard", "log", "replay", str(path))
+        said = run(python, "-m", "acsard", "recording", "replay", str(path))
         print(f"{version:14} {path.name:20} {said}", flush=True)
         # the lines after the verdict list the items that were compared
         verdict, *_ = said.splitlines() or [""]

@@ -487,4 +487,4 @@ def test_drive_py_begins_and_ends_with_zeros() -> None:
     """
     text = (FILES / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
-    assert float(zeros) > CONFIG.commands.pause + min(TIMEOUTS)
+    assert float(zeros) > CONFIG.commands.neutral_pause + min(TIMEOUTS)

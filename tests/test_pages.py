@@ -140,7 +140,7 @@ def test_a_verb_in_the_text_has_the_options_it_is_said_to_have(
 ) -> None:
     words = [PLACEHOLDERS.get(word, word) for word in words if word not in ("…", "...")]
     verbs = [word for word in words if re.fullmatch("[a-z][a-z0-9]*", word)]
-    path = verbs[: 2 if verbs[:1] in (["lan"], ["mcu"], ["service"]) else 1]
+    path = verbs[: 2 if verbs[:1] in (["tls"], ["mcu"], ["service"]) else 1]
     with pytest.raises(SystemExit) as end:
         parser().parse_args([*path, "--help"])
     assert end.value.code == 0, f"{page}: acsard {' '.join(words)}"

@@ -52,7 +52,10 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     add_bus(parser)
     add_options(parser)
     parser.add_argument(
-        "--log", type=Path, metavar="FILE", help="a recorded drive, CSV or one of `acsard log`"
+        "--log",
+        type=Path,
+        metavar="FILE",
+        help="a recorded drive, CSV or one of `acsard recording`",
     )
     parser.add_argument(
         "--distance",

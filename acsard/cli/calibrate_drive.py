@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from acsard.prompts.calibration_prompts import Attendant
     from acsard.prompts.json_lines import JsonAttendant
 
-DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
+DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 
 IMU = "imu"
 """The gyro's key if the command line names none."""
@@ -33,7 +33,7 @@ IMU = "imu"
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that only a guided drive takes."""
     parser.add_argument(
-        "--way",
+        "--method",
         choices=tuple(NEEDS),
         help="what the drive is compared with; without it a gyro where the robot has one "
         "([odometry] gyro), else a tape",
@@ -102,17 +102,19 @@ def guided(
 
 
 def _usable(args: argparse.Namespace, odometry: str) -> None:
-    if args.way == "positions" and not args.positions:
-        raise UsageError("--way positions needs the key they come on: --positions KEY")
-    if args.positions and args.way not in (None, "positions"):
-        raise UsageError(f"--positions is for another way than --way {args.way}; leave one out")
+    if args.method == "positions" and not args.positions:
+        raise UsageError("--method positions needs the key they come on: --positions KEY")
+    if args.positions and args.method not in (None, "positions"):
+        raise UsageError(
+            f"--positions is for another method than --method {args.method}; leave one out"
+        )
     if args.positions in ("odom", odometry):
         raise UsageError(
             "odom is what the wheels say already: positions have to come from elsewhere"
         )
-    if args.imu and (args.positions or args.way not in (None, "gyro")):
-        other = "--positions" if args.positions else f"--way {args.way}"
-        raise UsageError(f"--imu is for --way gyro, not for {other}; leave one out")
+    if args.imu and (args.positions or args.method not in (None, "gyro")):
+        other = "--positions" if args.positions else f"--method {args.method}"
+        raise UsageError(f"--imu is for --method gyro, not for {other}; leave one out")
     if args.positions_at and not args.positions:
         raise UsageError("--positions-at says where --positions KEY is; give that as well")
     if not (args.yes or args.json_lines or sys.stdin.isatty()):
@@ -169,13 +171,13 @@ def differing(config: Config, mine: Config, where: str) -> str:
 def _way(args: argparse.Namespace, config: Config) -> str:
     if args.positions:
         return "positions"
-    gyro = args.way == "gyro" or args.imu
+    gyro = args.method == "gyro" or args.imu
     if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
         raise UsageError(
             "this robot's daemon hears no gyro: set odometry.gyro = true and restart it, or give "
-            "--way tape, wall or umbmark"
+            "--method tape, wall or umbmark"
         )
-    way: str = args.way or ("gyro" if gyro or config.odometry.gyro else "tape")
+    way: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")
     return way
 
 

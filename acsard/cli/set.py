@@ -42,7 +42,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--write",
         action="store_true",
-        help=f"also into the configuration file here, comments kept (an extra: {install('mcu')})",
+        help=f"also into the configuration file here, comments kept (an extra: {install('write')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer, or list, as JSON")
     add_bus(parser)

@@ -63,7 +63,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     lasting.add_argument(
         "--hours", type=_hours, metavar="N", help=f"the same, for a visitor: 1 to {MOST_HOURS}"
     )
-    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
 
 
@@ -113,8 +113,8 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         tls,
         tokens.place(),
         args.config or "",
-        next_port=args.held,
-        held=args.held,
+        next_port=args.supervised,
+        held=args.supervised,
     )
     log = Log(config.log)
     try:
@@ -146,7 +146,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
         raise UsageError(
             f"nobody could come with it: web.address in {where} has no https://; add "
             '"https://0.0.0.0:8443" there, or name another file by --config (or --address); and '
-            "`acsard lan init` makes a certificate"
+            "`acsard tls init` makes a certificate"
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS

@@ -115,7 +115,7 @@ class Robot:
         A line that did not leave does not count."""
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
-        """Totals since the start: `commands`, `commands_first_contact` of new senders whose delays
+        """Totals since the start: `commands`, `commands_of_new_senders` of new senders whose delays
         were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
         those of the port and the bus."""
         self._refused = ""
@@ -137,7 +137,7 @@ class Robot:
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if self._arbiter.forgiven_ns:
-            counters["clocks_forgiven_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
+            counters["clock_adjustments_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
         gyro = GyroStatus() if self._gyro is None else self._gyro.status
         if self._track is not None:
             gyro = replace(gyro, track_use=self._track.use)
@@ -243,7 +243,7 @@ class Robot:
         if before == "up" != link:
             self.counters["link_lost"] += 1
             if session.lateness.late_s:
-                self.counters["link_lost_late"] += 1
+                self.counters["link_lost_host_stall"] += 1
         if link != "up":
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
@@ -281,7 +281,7 @@ class Robot:
         if told is not None:
             events.append(told)
         if why:
-            self.counters["line_impossible"] += 1
+            self.counters["line_implausible"] += 1
             events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))
             self._odometry.skip(line)
             if self._sanity.doubtful:
@@ -291,14 +291,14 @@ class Robot:
         if fault:
             self._fault(fault, now, events)
         if self._sanity.turned:
-            self.counters["wheels_turned"] += 1
-            events.append(Event("wheels_turned", self._sanity.turned, "warning"))
+            self.counters["uncommanded_motion"] += 1
+            events.append(Event("uncommanded_motion", self._sanity.turned, "warning"))
         estimate = self._odometry.fold(line, self._gyro, self._speeds)
         if self._gyro is not None:
             events += self._gyro.events
             self._learn(self._gyro, events)
         if self._odometry.events:
-            self.counters["wheels_doubted"] += len(self._odometry.events)
+            self.counters["wheel_faults"] += len(self._odometry.events)
             events += self._odometry.events
         return estimate
 
@@ -415,7 +415,7 @@ class Robot:
         events.append(refused(refusal))
         # Every sender with a clock of its own begins in this state.
         if refusal.reason == "unproven":
-            self.counters["commands_first_contact"] += 1
+            self.counters["commands_of_new_senders"] += 1
             return
         self.counters[f"command_{refusal.reason}"] += 1
         self._refused_ns, self._refused = now_ns, refusal.text[:MAX_TEXT]

@@ -2,7 +2,7 @@
 
 The process sends a sign of life all the time. The supervisor ends a process that is silent, because
 it was stopped or hangs, and starts it again. If the gateway is a service, systemd does this for its
-own unit (`acsard-door.service`), with limits that only systemd can set.
+own unit (`acsard-gateway.service`), with limits that only systemd can set.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Kind(Struct, frozen=True):
     """Seconds before it is started again."""
 
 
-DOOR = Kind("the door to the network", "door_ended")
+GATEWAY = Kind("the TLS gateway", "gateway_ended")
 """The gateway is always started again: the robot drives on, and an operator may fix its files
 meanwhile."""
 
@@ -66,16 +66,18 @@ PAGE = Kind(
 """A page that keeps failing must take no time from the robot. It reports itself why it ends."""
 
 
-async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Kind = DOOR) -> int:
-    """Run `acsard` with these arguments ("door", ...), again whenever it ends, until cancelled.
+async def keep_running(
+    words: Sequence[str], log: Callable[[Event], None], kind: Kind = GATEWAY
+) -> int:
+    """Run `acsard` with these arguments ("gateway", ...), again whenever it ends, until cancelled.
 
     Return an exit code after which it must not be started again.
     """
     while True:
-        door = _Door(words)
+        child = _Child(words)
         try:
-            code = await in_thread(door.run, None)
-            why = door.silent or (
+            code = await in_thread(child.run, None)
+            why = child.silent or (
                 f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
             )
         except (OSError, RuntimeError) as error:  # no room for a process or a thread
@@ -84,17 +86,17 @@ async def keep_door(words: Sequence[str], log: Callable[[Event], None], kind: Ki
             if code in kind.final:
                 return code
         finally:
-            door.let_go()
+            child.let_go()
         log(Event(kind.ended, f"{kind.name} {why}; it is opened anew", "warning"))
         await asyncio.sleep(kind.again_s if code <= Exit.FAILURE else LATER_S)
 
 
-class _Door:
+class _Child:
     """One run of the process."""
 
     def __init__(self, words: Sequence[str]) -> None:
         # With -P Python ignores the working directory, so it runs the installed package.
-        self._command = [sys.executable, "-P", "-m", "acsard", *words, "--held"]
+        self._command = [sys.executable, "-P", "-m", "acsard", *words, "--supervised"]
         self._ours: socket.socket | None = None
         self._over = False
         self.silent = ""

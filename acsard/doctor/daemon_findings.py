@@ -48,7 +48,7 @@ def link(running: Running) -> Iterator[Finding]:
     # warning.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
     # The built-in simulator is late whenever the daemon is, and it is never unplugged.
-    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_late'}", 0):
+    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = f"lost {late_times} since the daemon's start because this computer did not run"
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
@@ -90,7 +90,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return the number of lost links that this computer did not cause, with a description."""
-    times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
+    times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"it was lost {many(times, 'time')} since the daemon's start: the board starts anew, is "
         "silent at times or was unplugged; the log says when (link_stale, link_down)"
@@ -190,9 +190,11 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from clocks(running)
     yield from gyro(state.gyro, state.counters)
     yield from linked({row.name: row for row in running.rows})
-    if state.counters.get("door_crowded"):
+    if state.counters.get("gateway_full"):
         text = "all connections from the network were taken at times: the log says by whom"
-        yield Finding("door", "warning", text, "take his certificate from [access], or his program")
+        yield Finding(
+            "gateway", "warning", text, "take his certificate from [access], or his program"
+        )
     yield from latch_file(state.latch_file)
     yield from late(running)
 
@@ -261,11 +263,11 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 
-def door(config: Config) -> Iterator[Finding]:
+def gateway(config: Config) -> Iterator[Finding]:
     """Yield a finding for each endpoint of the TLS gateway."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
-            yield Finding("door", "ok", f"open at {endpoint}")
+            yield Finding("gateway", "ok", f"open at {endpoint}")
         else:
-            mend = "systemctl status acsard-door; `acsard run` opens one by itself"
-            yield Finding("door", "warning", f"nobody listens at {endpoint}", mend)
+            mend = "systemctl status acsard-gateway; `acsard run` opens one by itself"
+            yield Finding("gateway", "warning", f"nobody listens at {endpoint}", mend)

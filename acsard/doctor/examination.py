@@ -23,7 +23,7 @@ from acsard.core.messages.expiry import expiry
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
-from acsard.doctor.daemon_findings import daemon, door, found, routers
+from acsard.doctor.daemon_findings import daemon, found, gateway, routers
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, compared
 from acsard.host import clock, real_time
@@ -46,19 +46,19 @@ def certificates(tls: str) -> Iterator[Finding]:
         file = directory / name
         if not os.access(file, os.R_OK):
             text = f"{file} is missing or not yours to read"
-            yield Finding("certificates", "failure", text, "`sudo acsard lan init`, or sudo doctor")
+            yield Finding("certificates", "failure", text, "`sudo acsard tls init`, or sudo doctor")
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding("certificates", "failure", f"others may read {file}", f"chmod 600 {file}")
     try:
         require_usable(tls)
     except MendableError as error:
-        yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
+        yield Finding("certificates", "failure", str(error), "see `acsard tls init --help`")
         return
     ends = ends_ns(tls)
     level, words = expiry(ends, now().wall_ns)
-    mend = "`acsard lan renew`, or in a fleet a new one by `lan add`, where ca-key.pem is"
+    mend = "`acsard tls renew`, or in a fleet a new one by `tls add`, where ca-key.pem is"
     if ends is None:
-        mend = f"{install('lan')}, to have it read"
+        mend = f"{install('tls')}, to have it read"
     yield Finding("certificates", LEVELS[level], words, mend if level else "")
 
 
@@ -188,7 +188,9 @@ def examine(
     running = found(config, address)
     if isinstance(running, Running) and not running.here:
         elsewhere = f"runs on another machine (its pid {running.info.pid} is none of acsard's here)"
-        yield Finding("daemon", "ok", f"{elsewhere}: its port, files and door are looked at there")
+        yield Finding(
+            "daemon", "ok", f"{elsewhere}: its port, files and gateway are looked at there"
+        )
         yield from certificates(address.tls)
         yield from daemon(running)
         return
@@ -212,4 +214,4 @@ def examine(
         yield from daemon(running)
     else:
         yield running
-    yield from door(config)
+    yield from gateway(config)

@@ -1,1 +1,1 @@
-"""`acsard odom` shows the error budget of a running robot's odometry, cause by cause."""
+"""`acsard accuracy` shows the error budget of a running robot's odometry, cause by cause."""

@@ -97,7 +97,7 @@ class Feed:
             return False
         lines, impossible = (
             last.counters.get(name, 0) - before.get(name, 0)
-            for name in ("lines", "line_impossible")
+            for name in ("lines", "line_implausible")
         )
         lost = lines - impossible - self._count
         return lost <= max(LEAST_LOST, SHARE_LOST * lines)

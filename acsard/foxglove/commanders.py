@@ -1,5 +1,5 @@
-"""Commands of a source, from any of its keys and in any encoding, as `acsard log export` writes
-them.
+"""Commands of a source, from any of its keys and in any encoding, as
+`acsard recording export` writes them.
 
 This module is pure. It decodes commands exactly as the daemon does. A command that the daemon
 refuses is not shown; it appears in the daemon's counters.

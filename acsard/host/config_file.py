@@ -64,7 +64,7 @@ def require_tomlkit() -> None:
     except ImportError:
         raise ExitError(
             Exit.FAILURE,
-            f"--write needs the library tomlkit; run: {install('mcu')}, or leave --write out and "
+            f"--write needs the library tomlkit; run: {install('write')}, or leave --write out and "
             "paste the lines",
         ) from None
 

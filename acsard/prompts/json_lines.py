@@ -26,7 +26,7 @@ from acsard.calibration.guided.legs import Ask
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
 from acsard.prompts.calibration_prompts import number_of
-from acsard.web.job_lines import Doing, Found, JobProgress, Progress, Question, Result, Subject
+from acsard.web.job_lines import Doing, Found, JobMessage, Progress, Question, Result, Subject
 
 if TYPE_CHECKING:
     from acsard.checkup.checkup_report import Report
@@ -99,7 +99,7 @@ class JsonLines:
 
     def told(self, text: str) -> None:
         """Send a text that stays visible."""
-        self._tell(JobProgress(text))
+        self._tell(JobMessage(text))
 
     def progress(self, share: float) -> None:
         """Send the progress, 0 to 1."""

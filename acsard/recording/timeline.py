@@ -121,7 +121,7 @@ NEWS = {
     "mcu_restarted": "board restart",
     "commander": "change of who drives",
     "command_refused": "refused command",
-    "wheels_doubted": "doubted wheel",
+    "wheel_fault": "wheel fault",
     "link_up": "",
 }
 """Words for the events in a summary; "" for an event that only ends another one."""

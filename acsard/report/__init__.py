@@ -1,4 +1,6 @@
-"""`acsard log report`: turns a recording into the text of one HTML file. All modules here are pure.
+"""`acsard recording report`: turns a recording into the text of one HTML file.
+
+All modules here are pure.
 
 `course` processes the steps one by one and keeps the data to draw, limited as it arrives
 (`acsard.core.thinning`), so a day takes no more memory than a minute. `commanders` keeps the data

@@ -28,7 +28,7 @@ GOOD = "lines"
 BAD = "line_"
 """Prefix of the counters of dropped lines."""
 
-IMPOSSIBLE = "line_impossible"
+IMPOSSIBLE = "line_implausible"
 """Counter of lines that were parsed but whose content was impossible."""
 
 NS_PER_MS = 1_000_000
@@ -365,7 +365,7 @@ class Course:
         inputs, left = step.inputs, step.said.left is not None
         session = robot.session
         rejected = {f"line_{reason}": count for reason, count in session.rejects.items()}
-        impossible = {"line_impossible": robot.counters["line_impossible"]}
+        impossible = {"line_implausible": robot.counters["line_implausible"]}
         self.link.step(t, left, {"lines": session.good_lines} | rejected | impossible)
         if inputs.tick:
             self.lateness.tick(t, inputs.now.mono_ns, inputs.missed, known)

@@ -87,8 +87,8 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     told = [Text(f"{what} {counted(name)}") for what, name in LINES]
     superseded = state.counters.get("lines_superseded", 0)
     told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
-    if met := state.counters.get("commands_first_contact", 0):
-        told.append(Text(f"first contact {count(met)}"))
+    if met := state.counters.get("commands_of_new_senders", 0):
+        told.append(Text(f"of new senders {count(met)}"))
     lines += flow([one for one in told if one], width, 0)
     if state.gyro != "off":
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)

@@ -140,8 +140,8 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
         ),
         row("commands", f"   {counted('commands'):<21} ").append_text(missed(state, before)),
     ]
-    if met := state.counters.get("commands_first_contact", 0):
-        lines[-1].append(f"  first contact {count(met)}", "dim")
+    if met := state.counters.get("commands_of_new_senders", 0):
+        lines[-1].append(f"  of new senders {count(met)}", "dim")
     if lost := overrun(state):
         lines[-1].append("  ").append_text(lost)
     if state.gyro != "off":

@@ -20,8 +20,8 @@ from msgspec import Meta, Struct
 
 from acsard import __version__
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
-from acsard.daemon.bus.access import least_role
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi
@@ -311,7 +311,7 @@ ROUTES: tuple[Route, ...] = (
         "the settings that srv/set takes: values, ranges, when each may change",
         gives={200: Body("A list.", list[Setting])}),
     Route("GET", "/api/guide", Begin.least, Page.guide,
-        "what `begin` on the WebSocket takes: ways to calibrate, ports to check",
+        "what `begin` on the WebSocket takes: methods of calibration, ports to check",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",

@@ -71,10 +71,10 @@ class Board(Struct, frozen=True):
 class Choices(Struct, frozen=True):
     """The checks and calibrations that the page may start."""
 
-    ways: dict[str, str]
-    """Description of the requirements of each calibration way."""
-    way: str
-    """The recommended way; "" selects the default."""
+    methods: dict[str, str]
+    """Description of the requirements of each calibration method."""
+    method: str
+    """The recommended method; "" selects the default."""
     advice: str
     """Reason for the recommendation and the alternatives."""
     ports: Sequence[Board]

@@ -20,10 +20,10 @@ class Subject(Struct, frozen=True):
     simulated: bool
 
 
-class JobProgress(Struct, frozen=True):
+class JobMessage(Struct, frozen=True):
     """A message that stays on the screen."""
 
-    told: str
+    message: str
 
 
 class Doing(Struct, frozen=True):

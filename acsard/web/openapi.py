@@ -14,7 +14,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import IMU, PUBLISHED
+from acsard.core.messages.topics import FOLLOWED
 from acsard.web import job_lines, socket_messages
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route
@@ -33,17 +33,18 @@ VALUE = "Value."
 GUIDED = "Guided"
 
 SENT = (
-    socket_messages.Hello, socket_messages.Way, socket_messages.LastMinute, socket_messages.Answer,
-    socket_messages.Rows, socket_messages.Pong, socket_messages.Refused, socket_messages.Gone,
+    socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
+    socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
+    socket_messages.Gone,
 )  # fmt: skip
 
 LINES = (
-    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobProgress,
+    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobMessage,
     job_lines.Doing, job_lines.Progress, job_lines.Question, job_lines.Found, job_lines.Result,
 )  # fmt: skip
 """Types of the content of `guide`."""
 
-KEYS = {topic.key: topic.type for topic in PUBLISHED} | {IMU: "Imu"}
+KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Type of each key that can be subscribed to."""
 
 

@@ -1,6 +1,7 @@
 """Draws reports of recordings for the page, one at a time, in a child process.
 
-The child runs `acsard log report` at the lowest priority. Its time, memory and output are bounded.
+The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
+bounded.
 The child is killed when this server ends or no client asks for the report any more. The finished
 report is kept compressed in memory until another one is drawn or nobody has asked for it for 15
 minutes; no file is written.
@@ -32,7 +33,7 @@ from acsard.host import clock
 from acsard.host.threads import in_thread
 
 # -P runs the installed package, not files in the current directory.
-COMMAND = (sys.executable, "-P", "-m", "acsard", "log", "report", "--held")
+COMMAND = (sys.executable, "-P", "-m", "acsard", "recording", "report", "--supervised")
 
 POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src "
@@ -72,16 +73,17 @@ SAID = 2000
 
 TOO_LONG = (
     f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
-    "faster machine by acsard log report"
+    "faster machine by acsard recording report"
 )
 TOO_MUCH = (
-    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, by acsard log report"
+    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, by "
+    "acsard recording report"
 )
 KILLED = (
     "it was ended from outside, for want of memory most likely: draw it on another machine, by "
-    "acsard log report"
+    "acsard recording report"
 )
-TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, by acsard log report --from --to"
+TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, by acsard recording report --from --to"
 
 State = Literal["drawing", "ready", "failed", "busy"]
 

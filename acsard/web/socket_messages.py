@@ -44,7 +44,7 @@ class Hello(Struct, frozen=True):
     hello: Greeting
 
 
-class Way(Struct, frozen=True):
+class DrivenPath(Struct, frozen=True):
     """Path of the robot in the last ten minutes: m in the odom frame, oldest first."""
 
     path: Sequence[Point]

@@ -94,7 +94,7 @@ class Viewer:
     async def run(self) -> None:
         """Serve the connection until either side ends it."""
         self._greet()
-        self._out.say(socket_messages.Way(**self._robots.way()))
+        self._out.say(socket_messages.DrivenPath(**self._robots.way()))
         self._out.say(socket_messages.LastMinute(self._robots.minute()))
         self._guide.join(self, self._out.say)
         pump = asyncio.create_task(self._out.pump(self._look_around))

@@ -37,8 +37,8 @@ def off(world: World) -> float:
 def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -> None:
     world = driven(counts, reporting=True)
     assert world.state.encoders == [counts] * 4
-    assert "line_impossible" not in world.state.counters
-    assert not [event for event in world.events if event.name in ("fault", "lines_dropped")]
+    assert "line_implausible" not in world.state.counters
+    assert not [event for event in world.events if event.name in ("fault", "lines_implausible")]
     # a count of each wheel at either end, twice that through the heading, and the shape of the arcs
     assert off(world) < 0.005 + 3 * math.tau / counts * 0.05
 
@@ -46,6 +46,6 @@ def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -
 @pytest.mark.parametrize("counts", [20, pytest.param(40, marks=pytest.mark.slow)])
 def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int) -> None:
     world = driven(counts, reporting=False)
-    assert "line_impossible" not in world.state.counters
+    assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name == "fault"]
     assert world.state.encoders == [0] * 4

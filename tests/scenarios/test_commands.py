@@ -201,11 +201,11 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     client.hold(0.0, 0.2)
     assert world.state.reason.startswith("app is new here: it drives once its delays")
     assert "app is new here" in {s.name: s.waits_for for s in world.state.sources}["app"]
-    assert world.state.counters["commands_first_contact"] == 4
+    assert world.state.counters["commands_of_new_senders"] == 4
     # Every sender begins like this: nothing is refused, and no warning is logged.
     assert not [name for name in world.state.counters if name.startswith("command_")]
     assert world.state.refused == ""
-    (told,) = [event for event in world.events if event.name == "first_contact"][:1]
+    (told,) = [event for event in world.events if event.name == "new_sender"][:1]
     assert told.level == "info"
     client.hold(0.4, 0.3)
     assert world.state.mode == "driving"
@@ -239,7 +239,7 @@ def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(wor
         "driving: held by ros2_control, which sends nothing but zeros for over 10 s; nav sends "
         "speeds and is kept waiting"
     )
-    (told,) = [event.text for event in world.events if event.name == "kept_waiting"]
+    (told,) = [event.text for event in world.events if event.name == "commands_without_effect"]
     assert "held by ros2_control" in told
     assert "nav sends speeds" in told
     world.run(0.3)
@@ -255,7 +255,7 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
     assert "`ros2 topic pub` of a speed sends none" in world.state.reason
-    (told,) = [event for event in world.events if event.name == "kept_waiting"]
+    (told,) = [event for event in world.events if event.name == "commands_without_effect"]
     assert told.text == f"app: {world.state.reason}"
 
 

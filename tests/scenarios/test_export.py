@@ -140,7 +140,7 @@ def test_every_diagnostics_has_the_same_rows_but_those(both: Any) -> None:
     assert {row.name for row in then[-1].status} >= {"acsard: mode", "acsard: commands"}
 
 
-COUNTED = {"lines_rejected", "missed_periods", "command_refused", "first_contact"}
+COUNTED = {"lines_rejected", "missed_periods", "command_refused", "new_sender"}
 """Events that repeat. `events` has them in one row with a total, and the log has a line each time.
 """
 

@@ -170,7 +170,7 @@ def test_a_sample_that_cannot_be_is_counted_and_changes_nothing() -> None:
     made.put("imu", b'{"angular_velocity": {"z": 1e9}}')
     made.put("imu", b'{"angular_velocity": {"z": NaN}}')
     made.run(1.0)
-    assert made.state.counters["imu_absurd"] == 1
+    assert made.state.counters["imu_out_of_range"] == 1
     assert made.state.counters["imu_malformed"] == 1
     assert made.state.gyro == "used"
     assert made.state.yaw == 0.0
@@ -206,9 +206,9 @@ def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> N
     assert asked.error < 0.1 * plain.error
     assert " in use, configured 1.000" in asked.world.state.track
     assert plain.world.state.track.endswith("(only shown), configured 1.000 in use")
-    (told,) = [event for event in asked.world.events if event.name == "track"]
+    (told,) = [event for event in asked.world.events if event.name == "learned_track"]
     assert told.text.endswith(" in use, configured 1.000")
-    assert not [event for event in plain.world.events if event.name == "track"]
+    assert not [event for event in plain.world.events if event.name == "learned_track"]
 
 
 @pytest.mark.slow

@@ -428,12 +428,12 @@ def test_a_loop_that_did_not_run_is_told_so_and_a_board_that_is_silent_as_that(
         world.run(0.02)
         assert world.state.link == "stale"
         assert world.state.reason.startswith("this computer did not run for 0.2")
-    assert world.state.counters["link_lost_late"] == world.state.counters["link_lost"] == 1
+    assert world.state.counters["link_lost_host_stall"] == world.state.counters["link_lost"] == 1
     world.hold(0.5, seconds=1.0)
     with world.mcu.mute():
         world.run(0.2)
     assert world.state.counters["link_lost"] == 2
-    assert world.state.counters["link_lost_late"] == 1
+    assert world.state.counters["link_lost_host_stall"] == 1
 
 
 def test_the_mcu_watchdog_is_fed_while_the_host_lives(world: World) -> None:

@@ -261,7 +261,7 @@ def test_a_burst_of_damaged_replies_stops_asks_again_and_goes_on() -> None:
     world.hold(0.5, seconds=1.0)
     assert world.state.mode == "driving"  # a short gap only ramps up again from rest
     assert check_of(world) == "checked with samples"
-    assert world.state.counters["line_wrong_check"] >= 5
+    assert world.state.counters["line_crc_error"] >= 5
     world.send(0.0)
     world.run(1.0)
     assert off_by(world) < 0.001
@@ -493,7 +493,7 @@ def test_one_impossible_line_costs_no_distance_with_counts() -> None:
     world.hold(0.5, seconds=1.0)
     world.send(0.0)
     world.run(1.0)
-    assert world.state.counters["line_impossible"] >= 1
+    assert world.state.counters["line_implausible"] >= 1
     assert world.state.mode == "ready"
     assert off_by(world) < 0.04  # that encoder did count too much
 

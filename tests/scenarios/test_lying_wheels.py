@@ -81,7 +81,7 @@ def test_the_pose_goes_on_right_and_state_names_the_wheel(kind: str, wheel: int)
         distance, turn = off(made)
         assert distance < 0.02
         assert turn < 0.03
-    told = [event.text for event in made.events if event.name == "wheels_doubted"]
+    told = [event.text for event in made.events if event.name == "wheel_fault"]
     assert f"{WHEELS[wheel]} wheel is left out" in told[0]
 
 
@@ -176,7 +176,7 @@ def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
             made.run(1.0)
             with made.mcu.pushed(dice.uniform(-0.5, 0.5)):
                 made.run(1.0)
-    assert not [event for event in made.events if event.name == "wheels_doubted"]
+    assert not [event for event in made.events if event.name == "wheel_fault"]
 
 
 # faulty gyros

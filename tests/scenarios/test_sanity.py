@@ -65,7 +65,7 @@ def test_one_impossible_line_is_dropped_and_costs_no_distance(world: World) -> N
     world.hold(0.5, seconds=1.0)
     world.send(0.0)
     world.run(1.0)
-    assert world.state.counters["line_impossible"] >= 1
+    assert world.state.counters["line_implausible"] >= 1
     assert world.state.mode == "ready"
     assert world.state.x == pytest.approx(world.mcu.vehicle.pose.x, abs=0.005)
 
@@ -165,7 +165,9 @@ def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> 
         world.run(0.5)
         leave(world, mode)
         world.port.sent.clear()
-    print(f"\nhands: {dict(kinds)}, seen {world.state.counters['wheels_turned']} times, no fault")
+    print(
+        f"\nhands: {dict(kinds)}, seen {world.state.counters['uncommanded_motion']} times, no fault"
+    )
 
 
 @pytest.mark.parametrize("mode", ["ready", "inactive", "stopped"])
@@ -176,8 +178,8 @@ def test_wheels_turned_by_hand_are_told_at_most_once_a_second_and_counted(
     with world.mcu.pushed(0.12):
         world.run(4.0)
     assert world.state.mode == mode
-    assert 3 <= len(told(world, "wheels_turned")) <= 4
-    assert world.state.counters["wheels_turned"] == len(told(world, "wheels_turned"))
+    assert 3 <= len(told(world, "uncommanded_motion")) <= 4
+    assert world.state.counters["uncommanded_motion"] == len(told(world, "uncommanded_motion"))
     leave(world, mode)
     world.drive(0.5, seconds=1.0)
     assert world.state.mode == "driving"
@@ -207,7 +209,7 @@ def test_motors_that_are_slow_to_stop_are_no_runaway_and_no_hand(lag: float, way
         world.run(3.0)
         if way == "stop":
             assert world.call("clear").success
-    assert told(world, "fault") == told(world, "wheels_turned") == []
+    assert told(world, "fault") == told(world, "uncommanded_motion") == []
 
 
 INTERRUPTIONS = (
@@ -314,7 +316,7 @@ def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost
             assert world.state.mode == "driving"
             world.send(0.0)
             world.run(dice.uniform(0.3, 1.5))
-    assert told(world, "fault") == told(world, "wheels_turned") == []
+    assert told(world, "fault") == told(world, "uncommanded_motion") == []
 
 
 def test_a_robot_that_may_not_turn_drives_straight_on() -> None:

@@ -140,7 +140,7 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             extras["board"] = [["unprompted", 0.1]]
     commands = config["commands"]
     commands["neutral_first"] = dice.random() < 0.85
-    commands["pause"] = dice.choice((0.5, 1.0, 2.0))
+    commands["neutral_pause"] = dice.choice((0.5, 1.0, 2.0))
     names = [*SOURCES, "twin"]
     commands["sources"] = [
         {
@@ -392,5 +392,5 @@ def _settings(dice: random.Random, config: dict[str, Any]) -> dict[str, float]:
         source = dice.choice(config["commands"]["sources"])["name"]
         found[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 1.0))
     if dice.random() < 0.1:
-        found["commands.pause"] = dice.choice((0.5, 1.0, 3.0))
+        found["commands.neutral_pause"] = dice.choice((0.5, 1.0, 3.0))
     return found

@@ -74,7 +74,7 @@ class Witness:
         self.neutral_first = commands.get("neutral_first", True)
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
-        self.file_pause_ns = int(commands.get("pause", 1.0) * NS)
+        self.file_pause_ns = int(commands.get("neutral_pause", 1.0) * NS)
         rate = config["control"].get("rate", 100.0)
         self.period_ns = int(NS / rate)
         quiet = max(0.1, 4 / rate, 3 * config["mcu"].get("reply_period", 0.0))
@@ -228,7 +228,7 @@ class Witness:
                 )
                 continue
             before_ns = self.pause_ns, dict(self.timeout)
-            if parts[1] == "pause":
+            if parts[1] == "neutral_pause":
                 self.pause_ns = int(value * NS)
             else:
                 self.timeout[parts[2]] = int(value * NS)

@@ -220,7 +220,7 @@ Reads = Callable[[str], str]
 
 def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
     """Go through every leg and question of a way to the written file; return the output."""
-    with calibrating(daemon, "--way", way, "--write") as (terminal, program):
+    with calibrating(daemon, "--method", way, "--write") as (terminal, program):
         seen = 0
         while program.process.poll() is None:
             words = until(lambda: question(terminal, program, seen), RIDES_S, "a question")  # noqa: B023
@@ -363,7 +363,7 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
         with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
             assert program.ended(RIDES_S) == 0, program.stderr
         found = json.loads(program.stdout)
-    assert found["way"] == "positions"
+    assert found["reference"] == "positions"
     assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
     assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
 

@@ -340,7 +340,7 @@ def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
         assert f"{robot_id!r} is not a robot's id" in ended.err
 
 
-@pytest.mark.parametrize("verb", ["top", "hz", "whoami", "set", "drive", "odom", "calibrate"])
+@pytest.mark.parametrize("verb", ["top", "hz", "whoami", "set", "drive", "accuracy", "calibrate"])
 @pytest.mark.parametrize("ids", ["*", "robot1,robot2"])
 def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:
     words = {"hz": ["odom"]}.get(verb, [])

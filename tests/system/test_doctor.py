@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from acsard.lan.authority import Authority
+from acsard.certificates.authority import Authority
 from tests.system.harness import (
     Bus,
     Daemon,

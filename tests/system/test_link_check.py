@@ -46,7 +46,7 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
         # A line that waited for a core for longer than the next two took answers an old one.
         late = {"line_stale_sequence"} if lost(started) > 0.02 else set()
         if late and daemon.events("link_stale"):
-            late.add("line_unchecked")  # the check was requested again
+            late.add("line_without_crc")  # the check was requested again
         assert {name for name in bus.state()["counters"] if name.startswith("line_")} <= late
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(2.0) == 0

@@ -41,7 +41,7 @@ def files(where: Path) -> list[Path]:
 
 def replayed(where: Path, path: Path) -> int:
     """Return the number of lines, and check that all of them replay the same."""
-    ended = finish(acsard("log", "replay", str(path)), where)
+    ended = finish(acsard("recording", "replay", str(path)), where)
     assert ended.code == 0, ended
     found = re.match(r"([\d ]+) of ([\d ]+) lines the same", ended.out)
     assert found, ended
@@ -84,7 +84,7 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
     assert whole.name.endswith(".kept.mcap")
     assert new.name > whole.name
     assert replayed(tmp_path, whole) == lines
-    listed = finish(acsard("log", "--directory", str(tmp_path / "record")), tmp_path)
+    listed = finish(acsard("recording", "--directory", str(tmp_path / "record")), tmp_path)
     assert whole.name in listed.out.splitlines()[0]
     assert "[cut: the daemon or the computer ended without a word]" in listed.out.splitlines()[0]
 
@@ -115,11 +115,11 @@ def test_a_fault_of_the_daemons_own_is_told_and_what_came_into_that_step_is_in_t
     (path,) = files(tmp_path)
     assert path.name.endswith(".kept.mcap")
     for words in ((), ("show",)):
-        said = finish(acsard("log", *words, "--directory", str(path.parent)), tmp_path).out
+        said = finish(acsard("recording", *words, "--directory", str(path.parent)), tmp_path).out
         assert "the daemon ended by a fault of its own: in step " in said
         assert "ZeroDivisionError: a fault of our own" in said
     assert replayed(tmp_path, path) > 3
-    again = finish(acsard("log", "replay", str(path)), tmp_path)
+    again = finish(acsard("recording", "replay", str(path)), tmp_path)
     assert "which ended the daemon, does not end the robot of this version" in again.out
 
 

@@ -163,7 +163,7 @@ def test_every_accepted_reply_form_drives_odometry(tmp_path: Path, peer: Peer) -
             after = until(lambda: steady(bus), 5.0, f"the speed by {name}")
         rejects = {key for key in after["counters"] if key.startswith("line_")}
         # A machine that takes the time of several ramp steps merges them into one.
-        leaps = {"line_impossible"} if lost(begun) > 0.05 else set()
+        leaps = {"line_implausible"} if lost(begun) > 0.05 else set()
         assert rejects <= leaps, after["counters"]
 
 
@@ -175,7 +175,7 @@ def always(data: bytes) -> Reply:
 REFUSED: dict[str, tuple[str, Reply]] = {
     "a wheel missing": ("malformed", always(b"ap10.00,bp10.00,cp10.00\r\n")),
     "five wheels": ("malformed", always(b"ap10.00,bp10.00,cp10.00,dp10.00,ap10.00\r\n")),
-    "a wheel twice": ("wheel_twice", always(b"ap10.00,bp10.00,cp10.00,cp10.00\r\n")),
+    "a wheel twice": ("duplicate_wheel", always(b"ap10.00,bp10.00,cp10.00,cp10.00\r\n")),
     "no sign": ("malformed", always(b"a10.00,b10.00,c10.00,d10.00\r\n")),
     "a minus": ("malformed", always(b"a-10.00,b-10.00,c-10.00,d-10.00\r\n")),
     "another wheel": ("malformed", always(b"ap10.00,bp10.00,cp10.00,ep10.00\r\n")),

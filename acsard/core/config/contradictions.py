@@ -222,14 +222,14 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
         elif endpoint.startswith("tls/"):
             if not bus.tls:
                 found.append(
-                    f"{where}: needs certificates; `acsard lan init` makes them and tells "
+                    f"{where}: needs certificates; `acsard tls init` makes them and tells "
                     "the bus.tls to write"
                 )
         elif not _is_loopback(host) and not bus.insecure:
             found.append(
                 f"{where}: leaves this machine, and there is no encryption or access control "
                 "on it; use 127.0.0.1 (a laptop joins by an SSH tunnel), certificates (`acsard "
-                'lan init`, then "tls/…"), or accept that anyone there can drive the robot: '
+                'tls init`, then "tls/…"), or accept that anyone there can drive the robot: '
                 "bus.insecure = true"
             )
     return found

@@ -54,7 +54,9 @@ LIVE: dict[str, Live] = {
     "limits.linear_jerk": Live("always", "how fast speeding up may begin"),
     "limits.angular_jerk": Live("always", "how fast speeding up a turn may begin"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
-    "commands.pause": Live("rest", "time that no speed may follow a zero of a shared identity"),
+    "commands.neutral_pause": Live(
+        "rest", "time that no speed may follow a zero of a shared identity"
+    ),
     "commands.sources.*.timeout": Live("rest", "silence after which a source is gone"),
     "odometry.covariance": Live("always", "by the model, or the diagonals as they stand"),
     "odometry.pose_covariance_diagonal": Live(

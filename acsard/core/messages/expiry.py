@@ -16,7 +16,7 @@ def expiry(ends_ns: int | None, now_ns: int) -> tuple[int, str]:
     Both times are wall-clock ns since 1970. `ends_ns` is None if the end is unknown.
     """
     if ends_ns is None:
-        return 1, "unknown: no door, or no library to read it (`acsard doctor` says which)"
+        return 1, "unknown: no gateway, or no library to read it (`acsard doctor` says which)"
     days = (ends_ns - now_ns) / DAY_NS
     if days < 0:
         return 2, f"ended {-days:.0f} days ago: nobody can join any more"

@@ -258,8 +258,8 @@ class RobotState(Message, frozen=True):
     """Seconds since the last good line of the microcontroller; null before the first one."""
 
 
-class DoorState(Message, frozen=True):
-    """Status that the TLS gateway (the process `door`) reports to the daemon."""
+class GatewayState(Message, frozen=True):
+    """Status that the TLS gateway (`acsard gateway`) reports to the daemon."""
 
     opened: Annotated[int, Meta(ge=0, lt=1 << 62)]
     """Start time of the gateway in ns of the machine's monotonic clock. Another value means that
@@ -267,7 +267,7 @@ class DoorState(Message, frozen=True):
     """
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
-    crowded: Annotated[int, Meta(ge=0, lt=1 << 31)]
+    full: Annotated[int, Meta(ge=0, lt=1 << 31)]
     """Number of checks, four a second, at which all connections were in use."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
@@ -422,7 +422,7 @@ MESSAGES: dict[str, type[Message]] = {
         Twist,
         TwistStamped,
         RobotState,
-        DoorState,
+        GatewayState,
         DiagnosticArray,
         Events,
         ServiceReply,

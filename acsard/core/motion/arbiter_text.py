@@ -9,7 +9,7 @@ from acsard.core.values import Wait
 REFUSED = {
     "unknown_source": "not one of commands.sources",
     "not_finite": "NaN or infinity",
-    "crowded": f"{MAX_SENDERS} other senders of this source are live",
+    "too_many_senders": f"{MAX_SENDERS} other senders of this source are live",
     "unproven": "a sender that is new here counts once its delays have proved steady; this is "
     "not an error",
     "stale": "older than the source's timeout allows, or than a command that was accepted: the "

@@ -25,7 +25,7 @@ def refused(refusal: Refusal) -> Event:
     """Return the event for a command that does not count, or not yet."""
     by, kind = refusal.sender[:MAX_SENDER], refusal.reason
     if kind == "unproven":
-        return Event("first_contact", refusal.text, by=by, news=False)
+        return Event("new_sender", refusal.text, by=by, news=False)
     return Event("command_refused", refusal.text, "warning", by, kind, news=False)
 
 
@@ -65,7 +65,7 @@ class CommandEvents:
             return []
         self._kept = kept
         by = _name((choice.source, choice.sender))
-        return [Event("kept_waiting", waiting(wait), "warning", by, kept)]
+        return [Event("commands_without_effect", waiting(wait), "warning", by, kept)]
 
 
 def _name(commander: tuple[str, str]) -> str:

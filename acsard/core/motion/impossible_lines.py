@@ -29,7 +29,7 @@ class ImpossibleLines:
         if why:
             self._count += 1
             if self._count == int(SHARE * WINDOW) + 1:
-                event = Event("lines_dropped", self._words(why), "warning")
+                event = Event("lines_implausible", self._words(why), "warning")
         if self._lines == WINDOW:
             self._lines = self._count = 0
         return event

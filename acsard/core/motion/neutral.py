@@ -4,8 +4,8 @@ A sender is armed by a zero, never by a pause, and it stays armed until arming i
 
 - A zero of a sender with an identity of its own arms it at once, also right behind its speeds.
 - Several programs may share an identity (a bridge, a plain key). Then a zero arms it when no speed
-  has followed for `commands.pause`. Further zeros and silence change nothing. Otherwise the zero
-  of one program would release another one that never stopped.
+  has followed for `commands.neutral_pause`. Further zeros and silence change nothing. Otherwise the
+  zero of one program would release another one that never stopped.
 
 This module holds one sender's last command and its arming. `arbiter.py` decides which sender is
 followed and asks for arming again. `freshness.py` decides whether a command counts.
@@ -46,7 +46,7 @@ class Sender:
         """Why the last command that did not count was refused by its stamp."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
-        """Apply this command timeout and this `commands.pause` from now on."""
+        """Apply this command timeout and this `commands.neutral_pause` from now on."""
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
     def live(self, now_ns: int) -> bool:

@@ -132,7 +132,7 @@ class Odometry:
 
     def missed(self) -> dict[str, int]:
         """Return counters of the time that no line reported, without those that are 0."""
-        ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
+        ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
     @property

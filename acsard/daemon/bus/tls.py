@@ -2,7 +2,7 @@
 
 Zenoh has one error for all causes. The diagnosis repeats the connection step by step with Python's
 own TLS and has a message for each way it ends; it does not open the Zenoh session. Only the end
-date of a certificate (`ends_ns`) needs the library of the optional extra `lan`.
+date of a certificate (`ends_ns`) needs the library of the optional extra `tls`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def require_usable(directory: str) -> None:
     if not Path(directory).is_dir():
         raise CertificateError(
             f"there is no directory {directory}: name the one with {CA}, {CERTIFICATE} and {KEY} "
-            "that `acsard lan init` or `lan add` made"
+            "that `acsard tls init` or `tls add` made"
         )
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
@@ -47,7 +47,7 @@ def require_usable(directory: str) -> None:
             ) from None
         except OSError as error:
             raise CertificateError(
-                f"cannot read {file}: {error.strerror}; `acsard lan init` or `lan add` makes it"
+                f"cannot read {file}: {error.strerror}; `acsard tls init` or `tls add` makes it"
             ) from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
@@ -58,7 +58,7 @@ def require_usable(directory: str) -> None:
     except (ssl.SSLError, ValueError) as error:
         raise CertificateError(
             f"the certificates in {directory} cannot be used ({error}): not PEM, or the key is of "
-            "another certificate or has a password; `acsard lan init` or `lan add` makes them",
+            "another certificate or has a password; `acsard tls init` or `tls add` makes them",
         ) from None
 
 
@@ -199,7 +199,7 @@ def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -
         case code if code == EXPIRED:
             return (
                 f"the certificate of {host} has ended, by this machine's clock ({now}); if that is "
-                "right: `acsard lan renew` where ca-key.pem is, and restart the daemon"
+                "right: `acsard tls renew` where ca-key.pem is, and restart the daemon"
             )
         case code if code == NOT_YET:
             return (
@@ -209,11 +209,11 @@ def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -
         case code if code in (WRONG_NAME, WRONG_ADDRESS):
             return (
                 f"the certificate there is not for {host}; connect by a name or address it has, or "
-                f"on the robot: `acsard lan renew --address {host}`, and restart the daemon"
+                f"on the robot: `acsard tls renew --address {host}`, and restart the daemon"
             )
     return (
         f"the certificate of {host} is of another authority than {directory}/{CA} "
-        f"({error.verify_message}); get a directory made by `acsard lan` for this robot"
+        f"({error.verify_message}); get a directory made by `acsard tls` for this robot"
     )
 
 
@@ -226,11 +226,11 @@ def _of_ours(reason: str, host: str, directory: str) -> str:
     if "CERTIFICATE_EXPIRED" in reason:
         return (
             f"{host} says that {mine} has ended or does not count yet: make a new one with `acsard "
-            "lan add` where ca-key.pem is, or set the clocks of both (`timedatectl`)"
+            "tls add` where ca-key.pem is, or set the clocks of both (`timedatectl`)"
         )
     if "UNKNOWN_CA" in reason or "CERTIFICATE" in reason or "DECRYPT" in reason:
         return (
             f"{host} does not take {mine}: it is of another authority than the robot's; get one "
-            "made by `acsard lan add` there"
+            "made by `acsard tls add` there"
         )
     return f"{host} does not speak TLS with us ({reason}); a plain endpoint begins with tcp/"

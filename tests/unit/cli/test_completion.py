@@ -76,7 +76,7 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     [
         ("acsard ca", {"call", "calibrate"}),
         ("acsard call cl", {"clear"}),
-        ("acsard lan init --wr", {"--write"}),
+        ("acsard tls init --wr", {"--write"}),
         ("acsard service uninstall --pu", {"--purge"}),
         *VALUES,
     ],
@@ -145,7 +145,7 @@ def test_recordings_are_offered_by_number_beside_the_files(
     (tmp_path / "42.mcap").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
-    script, words = scripts[shell], "acsard log show 4"
+    script, words = scripts[shell], "acsard recording show 4"
     ask = {
         "bash": ("-c", ASK.format(script=script, words=words, function="_shtab_acsard")),
         "fish": ("--no-config", "-c", f"source {script}; complete -C '{words}'"),
@@ -168,7 +168,7 @@ def test_every_shell_knows_every_verb_and_takes_its_script(
 def test_the_man_page_says_what_help_says(capsys: pytest.CaptureFixture[str]) -> None:
     page = printed(capsys, "man").replace("\\-", "-").replace("\\", "")
     assert page.startswith(".TH ACSARD")
-    words = ("acsard service uninstall", "--purge", "acsard lan renew", "exit codes: 0 done")
+    words = ("acsard service uninstall", "--purge", "acsard tls renew", "exit codes: 0 done")
     assert [word for word in words if word not in page] == []
 
 

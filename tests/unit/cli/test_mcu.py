@@ -150,7 +150,7 @@ def test_write_without_tomlkit_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "tomlkit", None)
-    with pytest.raises(ExitError, match=r"pip install .*\[mcu\]'"):
+    with pytest.raises(ExitError, match=r"pip install .*\[write\]'"):
         called(tmp_path, "--port", "sim", "--yes", "--write")
 
 

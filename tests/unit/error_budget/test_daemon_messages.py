@@ -33,7 +33,7 @@ ZERO = Twist(Vector3(), Vector3())
 
 
 def state(lines: int, gyro: str = "off", impossible: int = 0) -> RobotState:
-    counters = {"lines": lines, "line_impossible": impossible}
+    counters = {"lines": lines, "line_implausible": impossible}
     return RobotState(
         START, "ready", "", 0.0, 0.0, 0.0, 0.0, 0.0, [], "up", "", [], "", counters, gyro=gyro
     )

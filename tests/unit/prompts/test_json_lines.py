@@ -273,6 +273,6 @@ def test_what_cannot_be_written_is_not_asked_for_and_says_why(
         assert not lines.offer(None, OFFERED)
         assert not lines.offer(None, OFFERED, "the daemon runs with another")
     assert program.told("question") == []
-    first, second = program.told("told")
+    first, second = program.told("message")
     assert "no configuration file" in first
     assert "the daemon runs with another" in second

@@ -215,7 +215,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
 ) -> None:
     data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
     (first, _), *_ = chunks(data)
-    config_end = data.index(b"acsard.Told")
+    config_end = data.index(b"acsard.TimelineEntry")
     for _ in range(cuts):
         size = dice.randrange(first)
         tail = dice.choice([b"", bytes(512), dice.randbytes(64)])

@@ -24,9 +24,9 @@ from tests.unit.top.screens import (
 
 
 def test_first_contact_is_counted_beside_the_commands_and_is_no_refusal() -> None:
-    counters = {**STATE.counters, "commands_first_contact": 40}
+    counters = {**STATE.counters, "commands_of_new_senders": 40}
     shown = lines_of(replace(SEEN, state=replace(STATE, counters=counters)))
-    (line,) = [line for line in shown if "first contact 40" in line]
+    (line,) = [line for line in shown if "of new senders 40" in line]
     assert line.startswith("commands")
     assert any(line.startswith("rejected") and "nothing" in line for line in shown)
 
@@ -92,14 +92,14 @@ def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
 
 
 def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
-    counters = {"line_malformed": 3, "line_impossible": 12, "command_stale": 4, "line_zero": 0}
+    counters = {"line_malformed": 3, "line_implausible": 12, "command_stale": 4, "line_zero": 0}
     seen = of(counters=counters, refused="source nav: NaN or infinity")
     assert line_with("rejected", seen).split(maxsplit=1)[1] == (
-        "lines impossible 12, malformed 3 · commands stale 4"
+        "lines implausible 12, malformed 3 · commands stale 4"
     )
     assert "source nav: NaN or infinity" in line_with("last one", seen)
-    assert "\x1b[33mimpossible 12\x1b[0m" in painted(seen)
-    assert "\x1b[33mimpossible" not in painted(replace(seen, before=seen.state))
+    assert "\x1b[33mimplausible 12\x1b[0m" in painted(seen)
+    assert "\x1b[33mimplausible" not in painted(replace(seen, before=seen.state))
     assert "nothing" in line_with("rejected")
 
 
@@ -116,8 +116,8 @@ def test_the_track_that_was_learned_stands_beside_the_configured_one() -> None:
 
 
 def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
-    seen = of(counters={"imu_second_sender": 1200, "imu_absurd": 3})
-    assert "gyro second sender 1,200, absurd 3" in line_with("rejected", seen)
+    seen = of(counters={"imu_second_sender": 1200, "imu_out_of_range": 3})
+    assert "gyro second sender 1,200, out of range 3" in line_with("rejected", seen)
 
 
 def test_the_link_is_told_with_its_port() -> None:

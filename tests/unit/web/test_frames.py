@@ -37,7 +37,7 @@ def test_each_kind_is_told_by_its_field() -> None:
     assert decode('{"call": "set", "payload": {"a": 1}, "id": "x"}') == Call("set", "x", {"a": 1})
     assert decode('{"ping": 12.5}') == Ping(12.5)
     assert decode('{"begin": "check", "port": "sim"}') == Begin("check", "sim")
-    assert decode('{"begin": "calibrate", "way": "tape"}') == Begin("calibrate", "", "tape")
+    assert decode('{"begin": "calibrate", "method": "tape"}') == Begin("calibrate", "", "tape")
     assert decode('{"reply": 3, "value": 1.5}') == Reply(3, 1.5)
     assert decode('{"reply": 3, "value": "start"}') == Reply(3, "start")
     assert decode('{"reply": 3}') == Reply(3)

@@ -39,14 +39,16 @@ def test_a_calibration_goes_to_the_robot_of_the_page_and_asks(way: str) -> None:
     positions = "sim/pose" if way == "positions" else ""
     args = parsed(words(Begin("calibrate", "", way, positions), REACH, ()))
     assert (args.connect, args.id, args.tls) == (REACH.endpoint, REACH.robot_id, REACH.tls)
-    assert (args.way or "", args.positions or "") == (way, positions)
+    assert (args.method or "", args.positions or "") == (way, positions)
     assert args.json_lines
     assert [args.yes, args.write, args.log] == [False, False, None]
 
 
 def test_what_is_not_known_is_not_given() -> None:
     given = words(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
-    assert not any(word.startswith(("--config", "--tls", "--way", "--positions")) for word in given)
+    assert not any(
+        word.startswith(("--config", "--tls", "--method", "--positions")) for word in given
+    )
 
 
 @pytest.mark.parametrize(
@@ -86,7 +88,7 @@ def test_no_text_becomes_an_option_of_its_own(
     names = {word.partition("=")[0] for word in given}
     assert names <= {
         "mcu", "check", "calibrate", "--json-lines", "--config", "--port", "--connect", "--id",
-        "--tls", "--way", "--positions",
+        "--tls", "--method", "--positions",
     }  # fmt: skip
 
 

@@ -12,8 +12,8 @@ import pytest
 from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
+from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import SERVICES, TOPICS
-from acsard.daemon.bus.access import SERVICE_ROLES, least_role
 from acsard.web.app import ROUTES
 from acsard.web.frames import KINDS, FrameError, decode
 from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document

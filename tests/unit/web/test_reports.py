@@ -124,7 +124,7 @@ def test_it_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
 
     async def story() -> None:
         told = await become(drawn_by(WAITS), A, "ready", "failed")
-        assert "acsard log report" in told.text
+        assert "acsard recording report" in told.text
 
     run(story)
 

@@ -27,7 +27,7 @@ GREETING = socket_messages.Greeting(
 
 SAID: tuple[Struct, ...] = (
     socket_messages.Hello(GREETING),
-    socket_messages.Way([(0.0, 1.5)], []),
+    socket_messages.DrivenPath([(0.0, 1.5)], []),
     socket_messages.LastMinute(Minute().plotted(0)),
     socket_messages.Answer(7, True, "stopped"),
     socket_messages.Rows([socket_messages.Row("acsar", None, "", None, "", None, "")], ""),
@@ -40,7 +40,7 @@ GUIDED: tuple[Struct, ...] = (
     socket_messages.Running("check", "here", True),
     socket_messages.Ended(0, "success", ""),
     job_lines.Subject("port sim", True),
-    job_lines.JobProgress("so"),
+    job_lines.JobMessage("so"),
     job_lines.Doing("so"),
     job_lines.Progress(0.5),
     job_lines.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),

@@ -93,7 +93,7 @@ class _Side:
         self._agreed_s += dt
         if self._agreed_s >= BACK_S:
             again = f"{self.left_out} wheel agrees with the other one of its side: it counts again"
-            self.event = Event("wheels_doubted", again, kind="again")
+            self.event = Event("wheel_fault", again, kind="again")
             self.out, self.residual.learns = None, True
 
     def stands_still(
@@ -134,7 +134,7 @@ class _Side:
         self.slip_s, told = SLIP_S, self._odd_s >= SLIP_TOLD_S
         self._odd_s += dt
         if self._odd_s >= SLIP_TOLD_S and not told:
-            self.event = Event("wheels_doubted", self.text, "warning", kind="slip")
+            self.event = Event("wheel_fault", self.text, "warning", kind="slip")
         return False
 
     def lied(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
@@ -155,7 +155,7 @@ class _Side:
         self.out, self.slip_s, self._odd_s, self.suspected = i, 0.0, 0.0, False
         for suspect in self._suspects:
             suspect.forget()
-        self.event = Event("wheels_doubted", self.text, "warning", kind="left out")
+        self.event = Event("wheel_fault", self.text, "warning", kind="left out")
 
 
 class Witness:

@@ -35,12 +35,12 @@ HERE = "tcp/127.0.0.1:7448"
 def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
     listen = (HERE, endpoint)
     (line,) = problems(bus=BusConfig(listen=listen))
-    assert "acsard lan init" in line
+    assert "acsard tls init" in line
     assert problems(bus=BusConfig(listen=listen, tls="/etc/acsard/tls")) == []
     assert problems(bus=BusConfig(connect=(endpoint,), tls="/etc/acsard/tls")) == []
 
 
-def test_the_door_needs_a_way_to_the_daemon() -> None:
+def test_the_gateway_needs_a_way_to_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
         'bus.listen = ["tls/0.0.0.0:7449"]: who comes by TLS reaches the daemon through its '
@@ -51,7 +51,7 @@ def test_the_door_needs_a_way_to_the_daemon() -> None:
 @pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7448", "tcp/[::]:7448", "tcp/robot:7448"])
 def test_a_plain_endpoint_stays_on_this_machine_even_with_certificates(endpoint: str) -> None:
     (line,) = problems(bus=BusConfig(listen=(endpoint,), tls="/etc/acsard/tls"))
-    assert "acsard lan init" in line
+    assert "acsard tls init" in line
     assert "bus.insecure = true" in line
     assert problems(bus=BusConfig(listen=(endpoint,), insecure=True)) == []
 

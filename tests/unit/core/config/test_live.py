@@ -187,7 +187,7 @@ def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> 
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.pause", 2.0),
+    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.neutral_pause", 2.0),
      ("commands.sources.nav.timeout", 0.5)],
 )  # fmt: skip
 def test_what_would_jump_or_forget_who_drives_waits_for_rest(key: str, value: float) -> None:

@@ -71,7 +71,7 @@ def test_no_rate_is_let_in_that_no_base_has(rate: float) -> None:
         return
     with pytest.raises(DecodeError) as refused:
         reading(arrival(encode(imu, "cdr")))
-    assert refused.value.reason == ("absurd" if math.isfinite(rate) else "not_finite")
+    assert refused.value.reason == ("out_of_range" if math.isfinite(rate) else "not_finite")
 
 
 REFUSED: dict[str, Arrival] = {
@@ -83,7 +83,7 @@ REFUSED: dict[str, Arrival] = {
             Imu(Header(), Quaternion(), ZEROS, Vector3(x=math.nan), ZEROS, Vector3(), ZEROS), "cdr"
         )
     ),
-    "absurd": turning(50.1),
+    "out_of_range": turning(50.1),
     "no_rate": said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[-1.0, *ZEROS[1:]]),
     "too_big": arrival(b"{" + b" " * 5000),
     "not_a_put": arrival(encode(FULL, "json"), put=False),
@@ -154,5 +154,5 @@ def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_
 
 def test_what_is_refused_keeps_nobody_out() -> None:
     daemon = Daemon()
-    daemon.told.hear(REFUSED["absurd"], daemon.counters, daemon.events)
+    daemon.told.hear(REFUSED["out_of_range"], daemon.counters, daemon.events)
     assert daemon.hears(0.1, 8, "other")

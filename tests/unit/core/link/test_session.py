@@ -446,7 +446,7 @@ def test_good_lines_are_counted_and_bad_ones_by_reason() -> None:
         "malformed": 2,
         "too_long": 2,
         "over_range": 1,
-        "wheel_twice": 3,
+        "duplicate_wheel": 3,
     }
 
 
@@ -525,9 +525,9 @@ def test_an_mcu_without_the_check_is_driven_plainly() -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        (GOOD, "unchecked"),
+        (GOOD, "without_crc"),
         (seal(GOOD, 200), "stale_sequence"),
-        (seal(GOOD, 1).replace(b"12.50", b"12.51"), "wrong_check"),
+        (seal(GOOD, 1).replace(b"12.50", b"12.51"), "crc_error"),
         (seal(b"ap12.50\r\n", 1), "malformed"),
         (b"x" * 200 + b"\n", "too_long"),
     ],

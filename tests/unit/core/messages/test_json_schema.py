@@ -27,7 +27,7 @@ from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 INCOMING = {
     "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
-    "DoorState"
+    "GatewayState"
 }  # fmt: skip
 OUTGOING = set(SCHEMAS) - INCOMING
 

@@ -39,7 +39,7 @@ PROMISED = [
     ("wheel_cmd/<source>/<certificate>", "in", "JointState"),
     ("imu", "in", "Imu"),
     ("stop", "in", "anything"),
-    ("door", "in", "DoorState"),
+    ("gateway", "in", "GatewayState"),
     ("srv/stop", "service", "ServiceReply"),
     ("srv/clear", "service", "ServiceReply"),
     ("srv/activate", "service", "ServiceReply"),

@@ -81,4 +81,4 @@ def test_whose_command_is_followed_or_why_nobody_s_is_a_sentence(choice: Choice,
 
 def test_whatever_a_command_is_refused_for_is_said_in_words() -> None:
     assert {"", *REFUSED} == {*get_args(Objection)}
-    assert REFUSED["crowded"] == "16 other senders of this source are live"
+    assert REFUSED["too_many_senders"] == "16 other senders of this source are live"

@@ -63,7 +63,11 @@ def test_who_sends_speeds_that_must_wait_is_told_once_it_lasts() -> None:
     assert told.changes(Mode.READY, early, "") == []
     late = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0, ros=True), sender="joe")
     (event,) = told.changes(Mode.READY, late, "")
-    assert (event.name, event.level, event.by) == ("kept_waiting", "warning", "nav (joe)")
+    assert (event.name, event.level, event.by) == (
+        "commands_without_effect",
+        "warning",
+        "nav (joe)",
+    )
     assert "ros2 topic pub" in event.text
     later = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=10.0, ros=True), sender="joe")
     assert told.changes(Mode.READY, later, "") == []
@@ -81,7 +85,7 @@ def test_who_is_held_up_by_zeros_is_told_once_however_often_he_pauses() -> None:
 
     assert zeros("") == []
     (event,) = zeros("nav")
-    assert (event.name, event.by, event.kind) == ("kept_waiting", "app (joe)", "nav")
+    assert (event.name, event.by, event.kind) == ("commands_without_effect", "app (joe)", "nav")
     assert event.text.startswith("held by app, which sends nothing but zeros for over 3 s; nav")
     assert zeros("") + zeros("nav") == []
     assert [event.kind for event in zeros("teleop")] == ["teleop"]

@@ -33,7 +33,7 @@ def test_it_is_told_as_soon_as_there_are_too_many() -> None:
 
 def test_the_words_say_what_was_dropped_and_what_to_do() -> None:
     (event,) = told(ImpossibleLines(), WINDOW)
-    assert (event.name, event.level) == ("lines_dropped", "warning")
+    assert (event.name, event.level) == ("lines_implausible", "warning")
     assert event.text.startswith(f"{MOST + 1} of {MOST + 1} lines were dropped")
     assert WHY in event.text
     assert "mcu.link_check" in event.text

@@ -680,7 +680,7 @@ def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
     odometry.fold(Feedback(at, moving, 0.01))
     odometry.fold(Feedback(at, moving, 0.0, gap=0.25))
     odometry.fold(Feedback(at, moving, 0.04, bridged=0.03))
-    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}
+    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "gaps_filled_ms": 30}
 
 
 # whole counts of a single line

@@ -1,4 +1,4 @@
-"""Tests of `acsard log report`, which writes a recording as one HTML file."""
+"""Tests of `acsard recording report`, which writes a recording as one HTML file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ QUIET = RECORDINGS / "quiet.mcap"
 
 
 def report(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    code = main(["log", "report", *map(str, words)])
+    code = main(["recording", "report", *map(str, words)])
     told = capsys.readouterr()
     return code, told.out, told.err
 

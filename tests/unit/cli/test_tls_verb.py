@@ -1,4 +1,4 @@
-"""Tests of `acsard lan`: the certificates it makes, their file permissions, and its output."""
+"""Tests of `acsard tls`: the certificates it makes, their file permissions, and its output."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from acsard.host.own_identity import own_addresses
 ROLES = ("viewer", "operator", "maintainer")
 
 
-def lan(*words: str) -> int:
-    """Run `acsard lan` and return its exit code."""
+def tls(*words: str) -> int:
+    """Run `acsard tls` and return its exit code."""
     try:
-        return main(["lan", *words])
+        return main(["tls", *words])
     except SystemExit as end:  # the parser exits this way
         return int(end.code or 0)
 
@@ -69,10 +69,10 @@ def tables(printed: str) -> bytes:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the directory that `lan init` makes. Tests must not change it."""
-    directory = tmp_path_factory.mktemp("lan") / "tls"
+    """Return the directory that `tls init` makes. Tests must not change it."""
+    directory = tmp_path_factory.mktemp("certificates") / "tls"
     address = ("--address", "192.0.2.7", "--address", "robot.example", "--address", "2001:db8::7")
-    assert lan("init", "--directory", str(directory), *address, "--days", "30") == 0
+    assert tls("init", "--directory", str(directory), *address, "--days", "30") == 0
     return directory
 
 
@@ -85,7 +85,7 @@ def _own(made: Path, tmp_path: Path) -> Path:
 PLACES = (".", *(f"clients/{role}" for role in ROLES))
 
 
-# files of `lan init`
+# files of `tls init`
 
 
 def test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role(made: Path) -> None:
@@ -180,7 +180,7 @@ def hook(event, arguments):
         print(event, arguments[0], file=sys.stderr)
 sys.addaudithook(hook)
 os.umask(0)
-sys.exit(main(["lan", *sys.argv[1:]]))
+sys.exit(main(["tls", *sys.argv[1:]]))
 """
 """A program without umask that reports every later change of a file's mode."""
 
@@ -205,7 +205,7 @@ def test_a_key_is_not_written_through_a_link_that_lies_in_its_place(
     elsewhere.write_text("untouched")
     (own / "key.pem").unlink()
     (own / "key.pem").symlink_to(elsewhere)
-    assert lan("init", "--force", "--directory", str(own)) == 0
+    assert tls("init", "--force", "--directory", str(own)) == 0
     assert elsewhere.read_text() == "untouched"
     assert not (own / "key.pem").is_symlink()
 
@@ -217,17 +217,17 @@ def test_init_overwrites_nothing_without_force(
     own: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = files(own)
-    assert lan("init", "--directory", str(own)) == Exit.FAILURE
+    assert tls("init", "--directory", str(own)) == Exit.FAILURE
     assert files(own) == before
     said = capsys.readouterr()
     assert said.out == ""
     assert "--force" in said.err
-    assert "acsard lan add" in said.err
+    assert "acsard tls add" in said.err
 
 
 def test_init_with_force_makes_an_authority_that_the_old_certificates_are_not_of(own: Path) -> None:
     old = certificate(own / "clients/operator")
-    assert lan("init", "--force", "--directory", str(own)) == 0
+    assert tls("init", "--force", "--directory", str(own)) == 0
     with pytest.raises(InvalidSignature):
         old.verify_directly_issued_by(certificate(own, "ca.pem"))
     certificate(own / "clients/operator").verify_directly_issued_by(certificate(own, "ca.pem"))
@@ -235,7 +235,7 @@ def test_init_with_force_makes_an_authority_that_the_old_certificates_are_not_of
 
 def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: Path) -> None:
     before = files(own)
-    assert lan("add", "anna", "--role", "operator", "--directory", str(own), "--days", "7") == 0
+    assert tls("add", "anna", "--role", "operator", "--directory", str(own), "--days", "7") == 0
     after = files(own)
     assert {name: after[name] for name in before} == before
     new = own / "clients/anna"
@@ -250,7 +250,7 @@ def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: 
 
 def test_add_does_not_replace_a_certificate(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files(own)
-    assert lan("add", "viewer", "--role", "operator", "--directory", str(own)) == Exit.FAILURE
+    assert tls("add", "viewer", "--role", "operator", "--directory", str(own)) == Exit.FAILURE
     assert files(own) == before
     assert "exists" in capsys.readouterr().err
 
@@ -261,7 +261,7 @@ def test_add_does_not_replace_a_certificate(own: Path, capsys: pytest.CaptureFix
 def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
     own: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert lan("init", "--force", "--directory", str(own)) == 0
+    assert tls("init", "--force", "--directory", str(own)) == 0
     config = parse(tables(capsys.readouterr().out))
     assert config.bus.tls == str(own)
     assert not config.bus.insecure
@@ -281,7 +281,7 @@ def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
 def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
     own: Path, capsys: pytest.CaptureFixture[str], role: str, name: str
 ) -> None:
-    assert lan("add", name, "--role", role, "--directory", str(own)) == 0
+    assert tls("add", name, "--role", role, "--directory", str(own)) == 0
     told = capsys.readouterr().out
     assert "systemctl restart acsard" in told
     assert "--write" in told
@@ -323,7 +323,7 @@ def test_what_cannot_name_a_certificate_is_refused_in_words_and_leaves_nothing(
     own: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     before = sorted(own.parent.rglob("*"))
-    assert lan("add", "--role", "viewer", "--directory", str(own), "--", name) == Exit.USAGE
+    assert tls("add", "--role", "viewer", "--directory", str(own), "--", name) == Exit.USAGE
     assert "not a name for a certificate" in capsys.readouterr().err
     assert sorted(own.parent.rglob("*")) == before
 
@@ -334,8 +334,8 @@ def test_days_that_no_certificate_can_hold_are_refused_in_words_and_leave_nothin
 ) -> None:
     before = sorted(own.parent.rglob("*"))
     words = ("--directory", str(own), f"--days={days}")
-    assert lan("add", "anna", "--role", "viewer", *words) == Exit.USAGE
-    assert lan("init", "--force", *words) == Exit.USAGE
+    assert tls("add", "anna", "--role", "viewer", *words) == Exit.USAGE
+    assert tls("init", "--force", *words) == Exit.USAGE
     assert "days" in capsys.readouterr().err
     assert sorted(own.parent.rglob("*")) == before
 
@@ -344,13 +344,13 @@ def test_an_address_that_is_none_is_refused_in_words_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--directory", str(tmp_path / "tls"), "--address", "r\u00f6bot")
-    assert lan("init", *words) == Exit.USAGE
+    assert tls("init", *words) == Exit.USAGE
     assert "address" in capsys.readouterr().err
     assert files(tmp_path) == {}
 
 
 def test_a_role_that_is_none_is_refused(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert lan("add", "anna", "--role", "king", "--directory", str(own)) == Exit.USAGE
+    assert tls("add", "anna", "--role", "king", "--directory", str(own)) == Exit.USAGE
     assert "viewer" in capsys.readouterr().err
 
 
@@ -358,8 +358,8 @@ def test_add_without_an_authority_says_what_makes_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ("--role", "viewer", "--directory", str(tmp_path / "none"))
-    assert lan("add", "anna", *words) == Exit.FAILURE
-    assert "acsard lan init" in capsys.readouterr().err
+    assert tls("add", "anna", *words) == Exit.FAILURE
+    assert "acsard tls init" in capsys.readouterr().err
     assert files(tmp_path) == {}
 
 
@@ -369,24 +369,24 @@ def test_add_with_a_broken_authority_says_so(
 ) -> None:
     (own / name).write_text("not what it should be")
     before = sorted(own.rglob("*"))
-    assert lan("add", "anna", "--role", "viewer", "--directory", str(own)) == Exit.FAILURE
+    assert tls("add", "anna", "--role", "viewer", "--directory", str(own)) == Exit.FAILURE
     assert "cannot use the authority" in capsys.readouterr().err
     assert sorted(own.rglob("*")) == before
 
 
 AS_NOBODY = """\
 import os, sys
-import acsard.lan.authority
+import acsard.certificates.authority
 from acsard.cli import main
 try:
-    main(["lan", "init", "--help"])  # nobody may not be let read what is imported late
+    main(["tls", "init", "--help"])  # nobody may not be let read what is imported late
 except SystemExit:
     pass
 if os.geteuid() == 0:
     os.setgroups([])
     os.setgid(65534)
     os.setuid(65534)
-sys.exit(main(["lan", *sys.argv[1:]]))
+sys.exit(main(["tls", *sys.argv[1:]]))
 """
 
 
@@ -419,7 +419,7 @@ def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
     assert list(locked.iterdir()) == []
 
 
-# the configuration that `lan init` writes
+# the configuration that `tls init` writes
 
 
 def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
@@ -427,7 +427,7 @@ def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
 ) -> None:
     file, directory = tmp_path / "acsard.toml", tmp_path / "tls"
     file.write_text('# mine\n[robot]\nid = "r1" # the first\n[bus]\nlisten = ["tcp/127.0.0.1:9"]\n')
-    assert lan("init", "--directory", str(directory), "--write", str(file)) == 0
+    assert tls("init", "--directory", str(directory), "--write", str(file)) == 0
     text = file.read_text()
     assert text.startswith('# mine\n[robot]\nid = "r1" # the first\n')
     config = parse(text.encode())
@@ -446,7 +446,7 @@ def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) ->
     real.write_bytes(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
     real.chmod(0o640)
     link.symlink_to("real.toml")
-    assert lan("init", "--directory", str(tmp_path / "tls"), "--write", str(link)) == 0
+    assert tls("init", "--directory", str(tmp_path / "tls"), "--write", str(link)) == 0
     text = real.read_bytes()
     assert link.is_symlink()
     assert real.stat().st_mode & 0o777 == 0o640
@@ -457,7 +457,7 @@ def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) ->
 
 def test_init_writes_a_configuration_where_there_is_none(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
-    assert lan("init", "--directory", str(tmp_path / "tls"), "--write", str(file)) == 0
+    assert tls("init", "--directory", str(tmp_path / "tls"), "--write", str(file)) == 0
     assert parse(file.read_bytes()).bus.tls == str(tmp_path / "tls")
 
 
@@ -468,18 +468,18 @@ def test_init_leaves_a_configuration_that_is_wrong_as_it_was(
     for text in ("[bus\n", "[bus]\ncolour = 1\n"):
         file.write_text(text)
         words = ("--directory", str(tmp_path / "tls"), "--force", "--write", str(file))
-        assert lan("init", *words) == Exit.FAILURE
+        assert tls("init", *words) == Exit.FAILURE
         assert "left as it was" in capsys.readouterr().err
         assert file.read_text() == text
 
 
 def test_renew_makes_the_robot_s_certificate_anew_and_leaves_all_others(tmp_path: Path) -> None:
     directory = tmp_path / "tls"
-    assert lan("init", "--directory", str(directory), "--days", "5") == 0
+    assert tls("init", "--directory", str(directory), "--days", "5") == 0
     before = files(directory)
     old = certificate(directory)
     words = ("--directory", str(directory), "--days", "9", "--address", "10.0.0.9")
-    assert lan("renew", *words) == 0
+    assert tls("renew", *words) == 0
     after = files(directory)
     assert {name for name in after if after[name] != before[name]} == {"certificate.pem", "key.pem"}
     new = certificate(directory)
@@ -492,8 +492,8 @@ def test_renew_makes_the_robot_s_certificate_anew_and_leaves_all_others(tmp_path
 def test_without_an_authority_nothing_is_renewed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert lan("renew", "--directory", str(tmp_path)) == Exit.FAILURE
-    assert "acsard lan init" in capsys.readouterr().err
+    assert tls("renew", "--directory", str(tmp_path)) == Exit.FAILURE
+    assert "acsard tls init" in capsys.readouterr().err
 
 
 # files that the operator would lose
@@ -508,7 +508,7 @@ def names_of(directory: Path) -> set[str]:
 def test_init_certifies_the_machine_s_addresses_and_prints_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert lan("init", "--directory", str(tmp_path / "tls")) == 0
+    assert tls("init", "--directory", str(tmp_path / "tls")) == 0
     said = capsys.readouterr().out
     expected = {"127.0.0.1", "localhost", os.uname().nodename, *own_addresses()}
     assert expected <= names_of(tmp_path / "tls")
@@ -517,7 +517,7 @@ def test_init_certifies_the_machine_s_addresses_and_prints_them(
 
 def test_renew_keeps_the_names_that_were_certified(own: Path) -> None:
     before = names_of(own)
-    assert lan("renew", "--directory", str(own), "--address", "more.example") == 0
+    assert tls("renew", "--directory", str(own), "--address", "more.example") == 0
     assert names_of(own) >= {*before, "more.example", "robot.example", "192.0.2.7"}
 
 
@@ -527,7 +527,7 @@ def test_add_prints_a_list_that_keeps_who_is_there(
     file = tmp_path / "acsard.toml"
     file.write_text('[access]\noperators = ["bob", "carol"]\n')
     words = ("--role", "operator", "--directory", str(own), "--config", str(file))
-    assert lan("add", "anna", *words) == 0
+    assert tls("add", "anna", *words) == 0
     printed = tables(capsys.readouterr().out)
     assert parse(printed).access.operators == ("bob", "carol", "anna")
 
@@ -539,13 +539,13 @@ def test_nothing_is_made_where_the_configuration_cannot_be_written(
     file = tmp_path / "acsard.toml"
     file.write_text(text)
     words = ("--directory", str(tmp_path / "tls"), "--write", str(file))
-    assert lan("init", *words) == Exit.FAILURE
+    assert tls("init", *words) == Exit.FAILURE
     assert [path.name for path in tmp_path.iterdir()] == ["acsard.toml"]
 
 
 def test_add_and_renew_make_no_directory_and_then_fail(tmp_path: Path) -> None:
     for words in (["add", "anna", "--role", "viewer"], ["renew"]):
-        assert lan(*words, "--directory", str(tmp_path / "none")) == Exit.FAILURE
+        assert tls(*words, "--directory", str(tmp_path / "none")) == Exit.FAILURE
     assert not list(tmp_path.iterdir())
 
 
@@ -555,9 +555,9 @@ def test_add_writes_the_name_into_its_role_s_list_and_leaves_nothing_to_paste(
     file = tmp_path / "acsard.toml"
     file.write_text('# mine\n[access]\noperators = ["bob"]\n')
     words = ("--directory", str(own), "--write", str(file))
-    assert lan("add", "eve", *words) == Exit.USAGE
+    assert tls("add", "eve", *words) == Exit.USAGE
     assert not (own / "clients" / "eve").exists()
-    assert lan("add", "eve", "--role", "operator", *words) == 0
+    assert tls("add", "eve", "--role", "operator", *words) == 0
     told = capsys.readouterr().out
     assert parse(file.read_bytes()).access.operators == ("bob", "eve")
     assert file.read_text().startswith("# mine\n")
@@ -574,7 +574,7 @@ def encrypt(own: Path, password: bytes) -> None:
 
 def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
     encrypt(own, b"secret")
-    words = [sys.executable, "-m", "acsard", "lan", "renew", "--directory", str(own)]
+    words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
     before = certificate(own).serial_number
     leader, follower = os.openpty()
     process = subprocess.Popen(
@@ -592,7 +592,7 @@ def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
 
 def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
     encrypt(own, b"secret")
-    words = [sys.executable, "-m", "acsard", "lan", "renew", "--directory", str(own)]
+    words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
     done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
     assert done.returncode == Exit.USAGE
     assert "encrypted" in done.stderr
@@ -606,7 +606,7 @@ def test_init_prints_how_this_robot_is_asked_by_its_id(
     monkeypatch.chdir(tmp_path)
     Path("acsard.toml").write_text('[robot]\nid = "robot7"\n')
     words = ("--write", "acsard.toml") if write else ()
-    assert lan("init", "--directory", "tls", *words) == 0
+    assert tls("init", "--directory", "tls", *words) == 0
     told = capsys.readouterr().out
     assert "acsard echo state --id robot7 --connect tls/" in told
     assert 'robot_id="robot7"' in told

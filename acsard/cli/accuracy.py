@@ -1,4 +1,4 @@
-"""`acsard odom`: show what makes odometry wrong now, and how to improve it.
+"""`acsard accuracy`: show what makes odometry wrong now, and how to improve it.
 
 `error_budget/budget.py` computes it.
 """
@@ -33,7 +33,7 @@ LOOK_S = 0.05
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
-        "odom", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
+        "accuracy", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
     )
     parser.add_argument(
         "--seconds", type=_seconds, default=5.0, metavar="S", help="how long to look; 5 s"

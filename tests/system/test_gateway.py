@@ -40,9 +40,9 @@ class Open:
         bus = {"listen": [self._plain, self.tls], "tls": str(certificates.robot)}
         self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
 
-    def door(self) -> int:
+    def gateway(self) -> int:
         """The gateway's process."""
-        (pid,) = until(lambda: children(self.daemon.pid, "acsard door"), 5.0, "a door")
+        (pid,) = until(lambda: children(self.daemon.pid, "acsard gateway"), 5.0, "a gateway")
         return pid
 
     def lets_in(self) -> bool:
@@ -74,76 +74,76 @@ def gone(pid: int) -> bool:
         return True
 
 
-def test_a_door_that_is_killed_is_opened_anew_and_counted(robot: Open) -> None:
+def test_a_gateway_that_is_killed_is_opened_anew_and_counted(robot: Open) -> None:
     assert robot.lets_in()
-    first = robot.door()
+    first = robot.gateway()
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("door_opened") == 1, 5.0, "it has told that it is open")
+        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
     os.kill(first, signal.SIGKILL)
-    robot.daemon.door_opens(times=2)
+    robot.daemon.gateway_opens(times=2)
     assert robot.lets_in()
-    assert robot.door() != first
-    (line,) = robot.daemon.events("door_ended")
+    assert robot.gateway() != first
+    (line,) = robot.daemon.events("gateway_ended")
     assert "ended by signal 9" in line["text"]
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("door_opened") == 2, 5.0, "it is counted")
+        until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
-def test_the_door_closes_with_the_daemon(robot: Open, number: signal.Signals) -> None:
-    door = robot.door()
+def test_the_gateway_closes_with_the_daemon(robot: Open, number: signal.Signals) -> None:
+    gateway = robot.gateway()
     robot.daemon.signal(number)
     robot.daemon.ended(5.0)
-    until(lambda: gone(door), 1.0, "it closes")
+    until(lambda: gone(gateway), 1.0, "it closes")
     assert not robot.lets_in()
 
 
-def test_a_door_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
-    door = robot.door()
-    os.kill(door, signal.SIGSTOP)
+def test_a_gateway_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
+    gateway = robot.gateway()
+    os.kill(gateway, signal.SIGSTOP)
     robot.daemon.signal(signal.SIGTERM)
     begun = time.monotonic()
     assert robot.daemon.ended(2.0) == 0
-    until(lambda: gone(door), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
+    until(lambda: gone(gateway), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
 
 
-def test_a_door_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
-    first = robot.door()
+def test_a_gateway_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
+    first = robot.gateway()
     os.kill(first, signal.SIGSTOP)
-    robot.daemon.door_opens(times=2)
+    robot.daemon.gateway_opens(times=2)
     assert robot.lets_in()
     assert gone(first)
-    (line,) = robot.daemon.events("door_ended")
+    (line,) = robot.daemon.events("gateway_ended")
     assert "stopped, or hung" in line["text"]
 
 
-def test_a_machine_that_stood_still_opens_no_door_anew(robot: Open) -> None:
-    door = robot.door()
-    os.kill(door, signal.SIGSTOP)
+def test_a_machine_that_stood_still_opens_no_gateway_anew(robot: Open) -> None:
+    gateway = robot.gateway()
+    os.kill(gateway, signal.SIGSTOP)
     end = time.monotonic() + 2.0
     until(lambda: time.monotonic() > end, 5.0, "two seconds")
-    os.kill(door, signal.SIGCONT)
+    os.kill(gateway, signal.SIGCONT)
     until(robot.lets_in, 5.0, "it goes on")
-    assert robot.door() == door
+    assert robot.gateway() == gateway
 
 
-def test_what_somebody_at_the_machine_puts_in_the_door_s_place_harms_nobody(robot: Open) -> None:
-    huge = b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 400 + b"}"
+def test_what_somebody_at_the_machine_puts_in_the_gateway_s_place_harms_nobody(robot: Open) -> None:
+    huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
     with Bus(robot.daemon.endpoint) as bus:
-        until(lambda: bus.count("door_opened") == 1, 5.0, "it has told that it is open")
+        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
         for payload in (b"", b"{}", b"\xff", huge):
-            bus.session.put("acsard/acsar/door", payload)
+            bus.session.put("acsard/acsar/gateway", payload)
         assert bus.ask("info")
-        assert bus.count("door_opened") == 1
+        assert bus.count("gateway_opened") == 1
 
 
-def test_without_a_tls_endpoint_there_is_no_door_to_open(tmp_path: Path) -> None:
+def test_without_a_tls_endpoint_there_is_no_gateway_to_open(tmp_path: Path) -> None:
     config = write_config(tmp_path / "plain.toml", {"bus": {"listen": [free_endpoint()]}})
-    done = finish(acsard("door", "--config", str(config)), tmp_path)
+    done = finish(acsard("gateway", "--config", str(config)), tmp_path)
     assert done.code == 2
     assert "no tls/ endpoint" in done.err
     with Daemon(tmp_path) as daemon:
-        assert not children(daemon.pid, "acsard door")
+        assert not children(daemon.pid, "acsard gateway")
 
 
 def listening(endpoint: str) -> zenoh.Config:
@@ -170,29 +170,29 @@ def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
 
     with zenoh.open(listening(plain)) as daemon:
         daemon.declare_queryable("acsard/acsar/info", on_query)
-        with Program(acsard("door", "--config", str(config)), tmp_path) as door:
-            until(lambda: len(asked) > UNANSWERED + 2 * answers, 30.0, f"questions\n{door}")
+        with Program(acsard("gateway", "--config", str(config)), tmp_path) as gateway:
+            until(lambda: len(asked) > UNANSWERED + 2 * answers, 30.0, f"questions\n{gateway}")
             if answers:
-                assert door.process.poll() is None
+                assert gateway.process.poll() is None
                 return
-            assert door.ended(10.0) == 1
-            assert "door_alone" in door.stdout + door.stderr
+            assert gateway.ended(10.0) == 1
+            assert "gateway_lost_daemon" in gateway.stdout + gateway.stderr
 
 
-def test_a_door_whose_daemon_ended_without_reading_its_signs_of_life_ends_in_order(
+def test_a_gateway_whose_daemon_ended_without_reading_its_signs_of_life_ends_in_order(
     tmp_path: Path, certificates: Certificates
 ) -> None:
     """The kernel then reports a reset connection in place of its end."""
     bus = {"listen": [free_endpoint(), free_tls_endpoint()], "tls": str(certificates.robot)}
-    config = write_config(tmp_path / "door.toml", {"bus": bus})
+    config = write_config(tmp_path / "gateway.toml", {"bus": bus})
     ours, theirs = socket.socketpair()
     with ours, theirs:
-        door = subprocess.Popen(
-            acsard("door", "--held", "--config", str(config)),
+        gateway = subprocess.Popen(
+            acsard("gateway", "--supervised", "--config", str(config)),
             stdin=theirs.fileno(), stderr=subprocess.PIPE, cwd=tmp_path, text=True,
         )  # fmt: skip
         theirs.close()
         until(lambda: select.select([ours], [], [], 0)[0], 10.0, "a sign of life")
         ours.close()
-        _, told = door.communicate(timeout=10.0)
-    assert (door.returncode, told) == (0, "")
+        _, told = gateway.communicate(timeout=10.0)
+    assert (gateway.returncode, told) == (0, "")

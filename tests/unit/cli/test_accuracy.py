@@ -1,4 +1,4 @@
-"""Tests of the options of `acsard odom`."""
+"""Tests of the options of `acsard accuracy`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import argparse
 
 import pytest
 
-from acsard.cli import odom
+from acsard.cli import accuracy
 
 
 def parsed(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    odom.add(parser.add_subparsers())
-    return parser.parse_args(["odom", *words])
+    accuracy.add(parser.add_subparsers())
+    return parser.parse_args(["accuracy", *words])
 
 
 def test_it_looks_for_ten_seconds_and_ends() -> None:

@@ -1,4 +1,4 @@
-"""Tests of `acsard log`: the list, the timeline, the replay and the recovered file."""
+"""Tests of `acsard recording`: the list, the timeline, the replay and the recovered file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.cli import main
-from acsard.cli.log import SERVICE
+from acsard.cli.recording import SERVICE
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import Event
 from acsard.host.errors import Exit
@@ -51,7 +51,7 @@ def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def log(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[int, str, str]:
-    code = main(["log", *words, "--directory", str(where)])
+    code = main(["recording", *words, "--directory", str(where)])
     told = capsys.readouterr()
     return code, told.out, told.err
 
@@ -330,7 +330,7 @@ def test_what_was_cut_is_written_as_a_finished_file(
     code, out, _ = log(capsys, where, "recover", str(cut), str(new))
     assert code == 0
     assert f"messages in {new}" in out
-    assert main(["log", "replay", str(new)]) == 0
+    assert main(["recording", "replay", str(new)]) == 0
     assert "cut, or still being written, when it was recovered" in capsys.readouterr().err
     assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
 
@@ -417,7 +417,7 @@ def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     code, _, err = log(capsys, tmp_path / "none")
     assert (code, "--directory" in err) == (1, True)
     (tmp_path / "x").write_bytes(b"x")
-    assert main(["log", "replay", str(tmp_path / "x")]) == 1
+    assert main(["recording", "replay", str(tmp_path / "x")]) == 1
     assert "no recording of acsard" in capsys.readouterr().err
 
 

@@ -20,12 +20,12 @@ SLOW = pytest.mark.slow
     "verb", ["replay", pytest.param("report", marks=SLOW), pytest.param("export", marks=SLOW)]
 )
 def test_it_says_how_far_it_is(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["log", verb, str(QUIET), *([] if verb == "replay" else [str(tmp_path / "new")])]
+    words = ["recording", verb, str(QUIET), *([] if verb == "replay" else [str(tmp_path / "new")])]
     told = on_terminal(80, lambda: main(words), monkeypatch)
     assert re.match(r"\r0 of \d s\r\d of \d s", told)
     assert told.endswith("\r\x1b[K")
 
 
 def test_into_a_pipe_it_says_nothing_of_it(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["log", "replay", str(QUIET)]) == 0
+    assert main(["recording", "replay", str(QUIET)]) == 0
     assert capsys.readouterr().err == ""

@@ -1,4 +1,4 @@
-"""`acsard log`: list, show, replay and export the recordings of the black box."""
+"""`acsard recording`: list, show, replay and export the recordings of the black box."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli import log_export, log_report, log_span
+from acsard.cli import recording_export, recording_report, recording_span
 from acsard.cli.common import load
-from acsard.cli.log_progress import telling
+from acsard.cli.recording_progress import telling
 from acsard.core.formatting import json_line, many, printable
 from acsard.host.errors import Exit, ExitError
 
@@ -32,14 +32,14 @@ each. FILE is a recording, or its number in that list; without it the newest.
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
-    parser = verbs.add_parser("log", help="what was recorded, told or lived again",
+    parser = verbs.add_parser("recording", help="what was recorded, told or lived again",
                               description=DESCRIPTION)  # fmt: skip
     _directory(parser, None)
     parser.set_defaults(main=list_all)
     inner = parser.add_subparsers(title="verbs", metavar="VERB")
     show = inner.add_parser("show", help="tell what happened, sentence by sentence")
     show.add_argument("file", nargs="?", metavar="FILE")
-    log_span.add(show)
+    recording_span.add(show)
     show.add_argument("--json", action="store_true", help="print one JSON object a line")
     show.set_defaults(main=show_one)
     replay = inner.add_parser(
@@ -58,11 +58,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     recover.add_argument("new", metavar="NEW", help="the file to write")
     recover.add_argument("--force", action="store_true", help="write over what is there")
     recover.set_defaults(main=recover_one)
-    export = log_export.add(inner)
-    log_span.add(export)
+    export = recording_export.add(inner)
+    recording_span.add(export)
     export.set_defaults(main=export_one)
-    report = log_report.add(inner)
-    log_span.add(report)
+    report = recording_report.add(inner)
+    recording_span.add(report)
     report.set_defaults(main=report_one)
     for one in (show, replay, recover, export, report):
         _directory(one, argparse.SUPPRESS)
@@ -149,7 +149,7 @@ def show_one(args: argparse.Namespace) -> int:
     from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
     recording = _recording(args)
-    begin, end = log_span.span(args, recording)
+    begin, end = recording_span.span(args, recording)
     story, last = TimelineWriter(), recording.about.wall_ns / 1e9
     inside = begin <= 0.0
     for step in steps(recording):
@@ -229,7 +229,7 @@ def recover_one(args: argparse.Namespace) -> int:
 def export_one(args: argparse.Namespace) -> int:
     """Export a recording for other programs."""
     recording = _recording(args)
-    trouble = log_export.export_one(recording, args)
+    trouble = recording_export.export_one(recording, args)
     note = trouble or _state(recording).strip()
     if note:
         print(f"{recording.path}: {note}", file=sys.stderr)
@@ -238,9 +238,11 @@ def export_one(args: argparse.Namespace) -> int:
 
 def report_one(args: argparse.Namespace) -> int:
     """Draw a recording as an HTML file."""
-    plotly = log_report.library()
+    plotly = recording_report.library()
     recording = _recording(args)
-    notes = log_report.report_one(recording, args, plotly, log_report.Words(_clock, _state))
+    notes = recording_report.report_one(
+        recording, args, plotly, recording_report.Words(_clock, _state)
+    )
     for note in notes:
         print(f"{recording.path}: {note}", file=sys.stderr)
     return int(Exit.OK)
@@ -276,7 +278,7 @@ def _recording(args: argparse.Namespace) -> Recording:
         files = [path for path in files if int(path.name.partition("-")[0]) == int(name)]
     if not files:
         which = "recording" if name is None else f"recording {name}"
-        raise ExitError(Exit.FAILURE, f"no {which} in {where}; `acsard log` lists them")
+        raise ExitError(Exit.FAILURE, f"no {which} in {where}; `acsard recording` lists them")
     return Recording(files[-1])
 
 

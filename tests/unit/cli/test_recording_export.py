@@ -1,4 +1,4 @@
-"""Tests of `acsard log export`, and of `acsard calibrate --log` with a recording as its input."""
+"""Tests of `acsard recording export`, and of `acsard calibrate --log` with a recording."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def export(where: Path, *words: str) -> int:
-    return main(["log", "export", *words, "--directory", str(where)])
+    return main(["recording", "export", *words, "--directory", str(where)])
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
     (here / "acsard.toml").write_text("")
     assert main(["calibrate", "--log", "drive.log", "--json"]) == 0
     by_recording = capsys.readouterr().out
-    assert main(["log", "export", "drive.log", "drive.csv", "--csv"]) == 0
+    assert main(["recording", "export", "drive.log", "drive.csv", "--csv"]) == 0
     capsys.readouterr()
     assert main(["calibrate", "--log", "drive.csv", "--json"]) == 0
     by_table = capsys.readouterr().out.replace("drive.csv", "drive.log")

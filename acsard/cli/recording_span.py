@@ -1,4 +1,4 @@
-"""`--from` and `--to` of `acsard log`: a part of a recording, in seconds or by the time of day.
+"""`--from` and `--to` of `acsard recording`: a part of one, in seconds or by the time of day.
 
 A recording may cross midnight, and its clock may be set in the middle of it. The time of day is
 therefore looked up in every stretch between two clock steps. The result is in seconds from the

@@ -1,4 +1,4 @@
-"""`acsard lan init | add | renew | router`: make certificates for a bus that leaves the machine."""
+"""`acsard tls init | add | renew | router`: make certificates for a bus that leaves the machine."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
+from acsard.certificates import identities
 from acsard.cli.common import add_config, load
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import write
@@ -15,7 +16,6 @@ from acsard.core.values import ROLES
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.host.errors import UsageError
 from acsard.host.service_installation import TLS
-from acsard.lan import identities
 
 MOST_DAYS = 3650
 
@@ -25,7 +25,7 @@ NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
     parser = verbs.add_parser(
-        "lan",
+        "tls",
         help="make certificates, so that other machines may join",
         description="Certificates for a bus that leaves this machine. Needs the "
         "library cryptography; without it, it tells what to type.",
@@ -222,7 +222,7 @@ def _admit_service(directory: Path) -> None:
     if step is None:
         return
     step.do()
-    print(f"{step}\nFor the service's door; look at the networks in it, then:")
+    print(f"{step}\nFor the service's gateway; look at the networks in it, then:")
     print("systemctl daemon-reload && systemctl restart acsard\n")
 
 

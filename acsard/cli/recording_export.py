@@ -1,4 +1,4 @@
-"""`acsard log export`: write a recording as files that other programs open."""
+"""`acsard recording export`: write a recording as files that other programs open."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acsard.cli import log_span
+from acsard.cli import recording_span
 from acsard.cli.common import load
-from acsard.cli.log_progress import telling
+from acsard.cli.recording_progress import telling
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def export_one(recording: Recording, args: argparse.Namespace) -> str:
 
     kind: Kind = args.kind
     new = Path(args.new) if args.new else _name(recording.path, kind)
-    span = Span(*log_span.span(args, recording))
+    span = Span(*recording_span.span(args, recording))
     other = None if args.config is None else load(args.config)[1]
     try:
         with telling(recording) as tell:

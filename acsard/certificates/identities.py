@@ -23,7 +23,7 @@ from acsard.host.extras import install
 from acsard.host.own_identity import own_addresses
 
 if TYPE_CHECKING:
-    from acsard.lan.authority import Authority
+    from acsard.certificates.authority import Authority
 
 PORT = 7449
 CA_KEY = "ca-key.pem"
@@ -42,7 +42,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
     if (directory / CA).exists() and not force:
         raise ExitError(
             Exit.FAILURE,
-            f"{directory / CA} exists: `acsard lan add` makes one more certificate with it; "
+            f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
             "--force makes a new authority, and all certificates of the old one are refused then",
         )
     maker = _maker()
@@ -94,10 +94,10 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 def _maker() -> type[Authority]:
     try:
-        from acsard.lan.authority import Authority
+        from acsard.certificates.authority import Authority
     except ImportError:
         raise ExitError(
-            Exit.FAILURE, f"needs the library cryptography; run: {install('lan')}"
+            Exit.FAILURE, f"needs the library cryptography; run: {install('tls')}"
         ) from None
     return Authority
 
@@ -110,7 +110,7 @@ def _load(directory: Path) -> Authority:
         return maker.load(directory, _password)
     except FileNotFoundError:
         raise ExitError(
-            Exit.FAILURE, f"no authority in {directory}: run `acsard lan init` first"
+            Exit.FAILURE, f"no authority in {directory}: run `acsard tls init` first"
         ) from None
     except (OSError, ValueError) as error:
         raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None

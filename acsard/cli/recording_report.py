@@ -1,4 +1,4 @@
-"""`acsard log report`: draw a recording as one HTML file."""
+"""`acsard recording report`: draw a recording as one HTML file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from acsard.cli import log_span
-from acsard.cli.log_progress import telling
+from acsard.cli import recording_span
+from acsard.cli.recording_progress import telling
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
@@ -27,7 +27,7 @@ tells what to type.
 
 
 class Words(NamedTuple):
-    """Functions that the actions of `acsard log` share to format times and recordings."""
+    """Functions that the actions of `acsard recording` share to format times and recordings."""
 
     clock: Callable[[float, bool], str]
     state: Callable[[Recording], str]
@@ -44,7 +44,7 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
     parser.add_argument("file", nargs="?", metavar="FILE")
     parser.add_argument("new", nargs="?", metavar="NEW.html", help="else FILE.html, here")
     parser.add_argument("--force", action="store_true", help="write over what is there")
-    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     return parser
 
 
@@ -68,7 +68,7 @@ def report_one(
     """Write the report, print a summary, and return notes about the recording."""
     from acsard.recording.atomic_output import beside
 
-    if args.held:
+    if args.supervised:
         return _held(recording, args, plotly, words)
     new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
     try:
@@ -126,7 +126,7 @@ def _drawn(
     from acsard.report.page import page
 
     about, looked = recording.about, Onlooker(recording)
-    began, (begin, end) = about.wall_ns / NS_PER_S, log_span.span(args, recording)
+    began, (begin, end) = about.wall_ns / NS_PER_S, recording_span.span(args, recording)
     course = Course(looked.config, began + begin, began + end)
     for number, (step, outputs, robot) in enumerate(looked.steps()):
         if number % EVERY == 0:

@@ -1,4 +1,4 @@
-"""Progress of those actions of `acsard log` that take minutes, shown on a terminal."""
+"""Progress of those actions of `acsard recording` that take minutes, shown on a terminal."""
 
 from __future__ import annotations
 
