@@ -64,7 +64,7 @@ class Feedback(Struct, frozen=True, gc=False):
     """Monotonic time at which the line was complete here."""
     counted: Motors | None = None
     """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
-    the speeds show whole counts (`snapping.py`)."""
+    the speeds show whole counts (`quantization.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
 
