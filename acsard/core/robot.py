@@ -19,15 +19,14 @@ from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
-from acsard.core.link.contract import WATCHDOG_S
 from acsard.core.link.feedback import Feedback
+from acsard.core.link.link_diagnosis import UnansweredLines
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import REFUSED, chosen
-from acsard.core.motion.command_events import CommandEvents, missed, refused
+from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
 from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.gyro import Gyro
-from acsard.core.motion.impossible_lines import ImpossibleLines
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import LearnedTrack
 from acsard.core.motion.lifecycle import Lifecycle
@@ -35,7 +34,6 @@ from acsard.core.motion.limits import Limiter
 from acsard.core.motion.modes import LEAVING, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
-from acsard.core.motion.unanswered_lines import UnansweredLines
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -121,7 +119,6 @@ class Robot:
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
-        self._dropped = ImpossibleLines()
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -153,7 +150,7 @@ class Robot:
             gyro=gyro,
             doubt=self._odometry.doubt,
             check=session.negotiation.in_force,
-            encoders=session.snapping.counts,
+            encoders=session.count_recovery.counts,
             sender=self._choice.sender,
         )
 
@@ -277,12 +274,11 @@ class Robot:
         Several impossible lines in a row latch a fault.
         """
         why = self._sanity.impossible(line)
-        told = self._dropped.line(why)
-        if told is not None:
-            events.append(told)
+        if self._sanity.warning is not None:
+            events.append(self._sanity.warning)
         if why:
             self.counters["line_implausible"] += 1
-            events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))
+            events.append(Event("lines_rejected", why, "warning", kind="implausible", news=False))
             self._odometry.skip(line)
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now, events)
@@ -364,7 +360,7 @@ class Robot:
     def _place(self, pose: Pose) -> str:
         """Set the pose, and drop the corrections that were due to the pose before."""
         self._odometry.set_pose(pose)
-        self.session.snapping.forgive()
+        self.session.count_recovery.forgive()
         if self._gyro is not None:
             self._gyro.forgive()
         pose = self._odometry.pose

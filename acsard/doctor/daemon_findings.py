@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 
 from acsard.core.config.settings import Config
 from acsard.core.formatting import many
-from acsard.core.link.host_stalls import BUSY, is_ours
+from acsard.core.link.link_diagnosis import BUSY, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.gyro import WORDS

@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from acsard.core.formatting import many
-from acsard.core.link.host_stalls import is_ours
+from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.values import Event
 from acsard.recording.recorded_steps import MICRO, Step
 

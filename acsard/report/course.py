@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from msgspec import Struct
 
 from acsard.core.config.settings import Config
-from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.robot import Robot
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist

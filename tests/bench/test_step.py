@@ -165,7 +165,7 @@ def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
         rounds.append(found | {"added": added, "share": added / (found["step"] - added)})
     told = {name: median(one[name] for one in rounds) for name in rounds[0]}
     assert run.world.state.gyro == "used"
-    assert run.world.loop.robot.session.snapping.counts == (400,) * 4
+    assert run.world.loop.robot.session.count_recovery.counts == (400,) * 4
     share = told.pop("share")
     print("\nus a line: " + ", ".join(f"{name} {value:.1f}" for name, value in told.items()))
     print(f"added is {share:.0%} of the rest of the step; it may be {ALLOWED / STEP:.0%}")

@@ -24,7 +24,7 @@ from acsard.client.legs import POSITIONS, Sensor
 from acsard.client.riding import HELD_UP, Recorder, Sample
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import JointsConfig
-from acsard.core.link.host_stalls import is_ours
+from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session

@@ -3,8 +3,8 @@
 The time between two samples comes from the best clock that is available:
 
 - the board's own clock, if the board sends it with its counts;
-- the lines that left, if the board answers each one (`clock_of_answers.py`);
-- the period of a free-running board (`clock_of_reports.py`), where `habit.py` detects which of the
+- the lines that left, if the board answers each one (`sample_time.py`);
+- the period of a free-running board (`sample_time.py`), where `ReplyStyle` detects which of the
   two kinds the board is;
 - otherwise the times of the reads, spread evenly over the lines of a read.
 
@@ -12,8 +12,6 @@ The time between two samples comes from the best clock that is available:
 """
 
 from __future__ import annotations
-
-from typing import Literal
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -23,9 +21,7 @@ from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.core.link.check import Reading
 from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
-from acsard.core.link.free_running_times import BRIDGED_S, Slots
-from acsard.core.link.prompted_times import Prompts
-from acsard.core.link.reply_style import ReplyStyle
+from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, PromptedTimes
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
@@ -37,6 +33,25 @@ LATER = 0.05
 
 FULL_READ = 1024
 """Bytes of a full read of the port. After a full read more data may wait."""
+
+DIFFERS = 1.5
+"""Difference between periods and lines sent since the last read that scheduling does not cause."""
+
+TELLING = 2.5
+"""Difference between the two sums that is needed for a decision."""
+
+LATEST = 100.0
+"""Periods since the last read. After more, the read is ignored."""
+
+CLEAR = 0.5
+"""Share of the sums' difference by which one sum must be nearer to the received lines."""
+
+AFTER = 3
+"""Number of reads after a differing one that belong to it."""
+
+NEAR = 0.35
+"""Largest distance of the nearer sum from the received lines, as a share of these: lines are lost
+too."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -64,26 +79,59 @@ class Feedback(Struct, frozen=True, gc=False):
     """Monotonic time at which the line was complete here."""
     counted: Motors | None = None
     """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
-    the speeds show whole counts (`snapping.py`)."""
+    the speeds show whole counts (`quantization.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
 
 
-class Placed(Struct, frozen=True, gc=False):
-    """The place of a line on one of the clocks; `due_ns` is when it was due to be complete here."""
+class ReplyStyle:
+    """Detects whether the board reports by its own clock or answers the daemon's lines.
 
-    clock: Literal["slots", "prompts", "reads"]
-    due_ns: int
-    dt: float | None = None
-    """Seconds since the last line by the same clock, None for the first line."""
-    bridged: float = 0.0
-    """Seconds of `dt` that no line reported."""
-    place: float = 0.0
-    """Slot of the line on the clock with the number `found`."""
-    found: int = 0
-    early: bool = False
-    """Whether the line came before it was due. Then `due_ns` is its arrival, and the time to the
-    next line is the difference of their `due_ns`."""
+    While the daemon sends one line per period, both look alike. Sometimes it sends more or fewer
+    lines: the host stood still, or a command's line went at once. Then the number of lines received
+    follows either the periods that passed or the lines that left. The decision compares both sums
+    with the lines received, over the reads in which they differ and over the next few, which bring
+    the lines that an adapter still held.
+    """
+
+    def __init__(self, speaks: bool) -> None:
+        """Start. With `speaks` the configuration says that the board reports by its own clock."""
+        self.speaks: bool | None = speaks or None
+        """True if the board reports by its own clock, False if it answers, None while unknown."""
+        self._known = speaks
+        self._left = self._after = 0
+        self._came = self._periods = self._asked = 0.0
+
+    def left(self) -> None:
+        """Note that a command line left."""
+        self._left += 1
+
+    def read(self, lines: int, periods: float) -> None:
+        """Take a read of `lines` lines, `periods` reply periods after the last read."""
+        left, self._left = self._left, 0
+        if self._known or periods > LATEST:
+            return
+        if abs(periods - left) >= DIFFERS:
+            self._after = AFTER
+        elif self._after:
+            self._after -= 1
+        else:
+            return
+        self._came += lines
+        self._periods += periods
+        self._asked += left
+        came, own, asked = (
+            self._came,
+            abs(self._came - self._periods),
+            abs(self._came - self._asked),
+        )
+        apart = abs(self._periods - self._asked)
+        if apart < TELLING or abs(own - asked) < CLEAR * apart:
+            return
+        if min(own, asked) <= max(1.5, NEAR * came):
+            self.speaks = own < asked
+        self._came = self._periods = self._asked = 0.0
+        self._after = 0
 
 
 class Timeline:
@@ -108,9 +156,9 @@ class Timeline:
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
         self._counts = mcu.encoder_counts
         known = (mcu.reply_period,) if mcu.reply_period else ()
-        self._slots = Slots((*known, 1 / rate_hz))
+        self._slots = FreeRunningTimes((*known, 1 / rate_hz))
         self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
-        self._prompts = Prompts(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
+        self._prompts = PromptedTimes(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
         self._habit = ReplyStyle(mcu.reply_period > 0)
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
@@ -214,32 +262,23 @@ class Timeline:
 
     def _told_by(self, asked_ns: int | None, came_ns: int) -> Placed:
         """Return the place of the next line on the best available clock."""
-        speaks, slots = self._habit.speaks, self._slots
+        speaks, answered = self._habit.speaks, None
         if asked_ns is not None or not speaks:
-            answered = self._prompts.answer(asked_ns)
-            prompts = self._prompts
-            ours = asked_ns is not None or speaks is False or prompts.thinks
+            answered = self._prompts.place(asked_ns)
+            ours = asked_ns is not None or speaks is False or self._prompts.thinks
             if ours and answered is not None:
                 if answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay comes from a first reply that was read late, during a stall
                     # that the line before has already counted. This line's time is therefore its
                     # arrival.
                     return Placed("prompts", came_ns, early=True)
-                return Placed("prompts", answered.due_ns, answered.dt, answered.bridged)
-        else:
-            answered = None
-        if slots.period is None:
+                return answered
+        slot = self._slots.place(self._rest)
+        if slot is None:
             return self._told_by_reads()
-        place, slot_ns, last = slots.place(self._rest), slots.time_ns(self._rest), self._told
-        due_ns = min(slot_ns, came_ns)
         if answered is not None:
-            self._compare(answered.due_ns - slot_ns)
-        if last.clock != "slots" or last.found != slots.found:
-            return Placed("slots", due_ns, place=place, found=slots.found)
-        passed = place - last.place if place > last.place else 0.0
-        missing = passed - 1.0 if passed > 1.0 else 0.0
-        dt, bridged = passed * slots.period, missing * slots.period
-        return Placed("slots", due_ns, dt, bridged, place, slots.found)
+            self._compare(answered, slot)
+        return slot if slot.due_ns <= came_ns else replace(slot, due_ns=came_ns)
 
     def _told_by_reads(self) -> Placed:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
@@ -264,9 +303,10 @@ class Timeline:
         missing = dt > 1.5 * period and self._habit.speaks is not False
         return dt, dt - period if missing else 0.0
 
-    def _compare(self, later_ns: int) -> None:
+    def _compare(self, answered: Placed, slot: Placed) -> None:
         """Update the mean by which replies are due later by their lines than by the slots."""
-        if self._told.found != self._slots.found:
+        later_ns = answered.due_ns - slot.due_ns
+        if slot.dt is None or self._told.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 

@@ -11,7 +11,7 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.outcomes import find
 from acsard.core.config.settings import Config, McuConfig
-from acsard.core.link.silence_diagnosis import Look
+from acsard.core.link.link_diagnosis import Look
 from tests.unit.checkup.robots import Checked, Robot
 
 

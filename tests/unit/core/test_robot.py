@@ -21,8 +21,7 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.link.codec import Codec
-from acsard.core.motion.arbiter_text import waiting
-from acsard.core.motion.command_events import MAX_SENDER
+from acsard.core.motion.arbiter_text import MAX_SENDER, waiting
 from acsard.core.robot import Robot
 from acsard.core.values import (
     NS_PER_S,

@@ -32,7 +32,7 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.guard import Guard
-from acsard.core.link.free_running_times import BRIDGED_S
+from acsard.core.link.sample_time import BRIDGED_S
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.odometry import TAKEN_BACK
 from acsard.core.robot import Robot

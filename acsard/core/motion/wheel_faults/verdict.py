@@ -15,8 +15,7 @@ import math
 from acsard.core.link.codec import Motors
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.wheel_faults.residual import MEMORY_S, Residual
-from acsard.core.motion.wheel_faults.stuck import Stuck
-from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Suspect, has_lied
+from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Stuck, Suspect, has_lied
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000

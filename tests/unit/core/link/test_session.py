@@ -691,7 +691,7 @@ def counts_after(bench: Bench, counts: int) -> tuple[int, ...]:
     for i in range(400):
         line = ",".join(f"{motor}p{speed * (i % 2):05.2f}" for motor in "abcd")
         bench.wait(10, line.encode() + b"\r\n")
-    return bench.session.snapping.counts
+    return bench.session.count_recovery.counts
 
 
 def test_the_counts_of_an_encoder_are_found_in_its_lines() -> None:
@@ -704,7 +704,7 @@ def test_behind_a_port_opened_again_the_encoders_are_unknown(counts: int) -> Non
     counts_after(bench, 20)
     bench.close().wait(10)
     bench.open().wait(10)
-    assert bench.session.snapping.counts == (0,) * 4
+    assert bench.session.count_recovery.counts == (0,) * 4
     assert counts_after(bench, counts) == (counts,) * 4
 
 
@@ -712,7 +712,7 @@ def test_an_mcu_that_has_started_again_may_be_another() -> None:
     bench = Bench().up()
     counts_after(bench, 20)
     bench.wait(10, BOOTED)
-    assert bench.session.snapping.counts == (0,) * 4
+    assert bench.session.count_recovery.counts == (0,) * 4
 
 
 @pytest.mark.parametrize("reads", [1, 4])

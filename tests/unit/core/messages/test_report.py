@@ -43,7 +43,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.topics import PUBLISHED
-from acsard.core.motion.command_events import missed
+from acsard.core.motion.arbiter_text import missed
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import (
     Estimate,

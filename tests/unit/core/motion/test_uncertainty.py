@@ -308,7 +308,7 @@ def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_the
     before, after = variances[:-1], variances[1:]
     count = RADIUS * math.tau / counts
     leap = max(b - a for a, b in zip(before, after, strict=True))
-    assert session.snapping.counts == (counts,) * 4
+    assert session.count_recovery.counts == (counts,) * 4
     assert leap >= 2 * count**2 / 24 * 2 / TRACK**2, "of where it started, and of where it is"
 
 
