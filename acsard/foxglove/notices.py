@@ -1,4 +1,7 @@
-"""Messages to the viewers: as status messages, on the topic `log`, and on the terminal."""
+"""Messages to the viewers: as status messages, on the topic `log`, and on the terminal.
+
+`Objections` decides when a viewer learns why its commands do not drive.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from foxglove import StatusLevel
 from foxglove.websocket import WebSocketServer
 from msgspec import Struct
 
+from acsard.client.commander import GRACE_S
 from acsard.core.messages.schema import Time
 from acsard.core.ros.shapes import LEVELS, Log
 from acsard.core.values import NS_PER_S, Level
@@ -91,3 +95,25 @@ class Notices:
             stamp = Time.from_ns(clock.now().wall_ns)
             log(Log(stamp, LEVELS[one.level], f"foxglove.{one.name}", one.text))
             self._tell(one.text)
+
+
+class Objections:
+    """The objection to one viewer's commands. The class is pure."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self.told = ""
+        """The objection that was reported and still holds, or ""."""
+
+    def look(self, objection: str, now_ns: int) -> bool:
+        """Process the current objection ("" for none); return whether `told` has changed."""
+        if not objection:
+            self._since_ns = None
+            changed, self.told = bool(self.told), ""
+            return changed
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        if now_ns - self._since_ns < GRACE_S * NS_PER_S or objection == self.told:
+            return False
+        self.told = objection
+        return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from acsard.client.commander import GRACE_S
 from acsard.core.values import NS_PER_S
-from acsard.foxglove.refusal_notices import Objections
+from acsard.foxglove.notices import Objections
 
 OBJECTS_NS = int(GRACE_S * NS_PER_S)
 
