@@ -6,7 +6,6 @@ command that the daemon refuses is not shown; it appears in the daemon's counter
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 
 import zenoh
@@ -24,6 +23,7 @@ from acsard.core.ros.shapes import asked
 from acsard.core.ros.transports import endpoints
 from acsard.foxglove.robot_facts import Facts
 from acsard.host import clock
+from acsard.host.mailbox import Mailbox
 
 MOST = 100
 """Maximum number of waiting commands per source, about one second of the highest accepted rate; the
@@ -126,8 +126,8 @@ class _Heard:
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
     ) -> None:
-        self._ways, self._wake = by_key, wake
-        self._held: deque[tuple[Arrival, int]] = deque(maxlen=MOST)
+        self._ways = by_key
+        self._box = Mailbox[tuple[Arrival, int]](MOST, wake)
         handler = zenoh.handlers.Callback(self._take)
         self._declared = [session.declare_subscriber(key, handler) for key in by_key]
 
@@ -152,12 +152,11 @@ class _Heard:
             way.via,
             b"" if attached is None else attached.to_bytes(),
         )
-        self._held.append((arrival, now.wall_ns))
-        self._wake()
+        self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
         """Return the commands since the last call, with their wall-clock arrival times in ns."""
-        return [self._held.popleft() for _ in range(len(self._held))]
+        return self._box.take()
 
     def undeclare(self) -> None:
         """End the subscriptions."""

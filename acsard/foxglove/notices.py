@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from threading import Lock
 
@@ -18,6 +17,7 @@ from acsard.core.messages.schema import Time
 from acsard.core.ros.shapes import LEVELS, Log
 from acsard.core.values import NS_PER_S, Level
 from acsard.host import clock
+from acsard.host.mailbox import Mailbox
 
 STATUS: dict[Level, StatusLevel] = {
     "info": StatusLevel.Info,
@@ -48,9 +48,9 @@ class Notices:
     """Collects notices from any thread; the main thread sends them."""
 
     def __init__(self, tell: Callable[[str], None], wake: Callable[[], None]) -> None:
-        self._tell, self._wake = tell, wake
+        self._tell = tell
         self._lock = Lock()
-        self._waiting: deque[Notice] = deque(maxlen=WAITING)
+        self._waiting = Mailbox[Notice](WAITING, wake)
         self._said: dict[str, int] = {}
         """Time at which each text was last reported."""
         self._staying: dict[str, Notice] = {}
@@ -66,25 +66,18 @@ class Notices:
             if text in recent and not stays:
                 return
             self._said = recent | {text: now_ns}
-            self._waiting.append(Notice(level, name, text, stays))
-        self._wake()
+        self._waiting.put(Notice(level, name, text, stays))
 
     def over(self, stays: str) -> None:
         """End the lasting status with this id."""
-        with self._lock:
-            self._waiting.append(Notice("info", "", "", stays))
-        self._wake()
+        self._waiting.put(Notice("info", "", "", stays))
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send the waiting notices. With `newcomers`, send all lasting statuses again first."""
         if newcomers:
             for one in self._staying.values():
                 server.publish_status(one.text, STATUS[one.level], one.stays)
-        while True:
-            with self._lock:
-                if not self._waiting:
-                    return
-                one = self._waiting.popleft()
+        for one in self._waiting.take():
             if not one.text:
                 if self._staying.pop(one.stays, None):
                     server.remove_status([one.stays])

@@ -138,7 +138,7 @@ class Relay:
         arrivals = queue_on(self._robot.session, self._robot.key(key), latched=topic.latched)
         arrivals.wakes(self._wake)
         if not topic.latched:
-            self._robot.ask(key, arrivals.take)  # the next message may be seconds away
+            self._robot.ask(key, arrivals.put)  # the next message may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
     def pass_on(self) -> None:
