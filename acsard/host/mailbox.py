@@ -53,14 +53,13 @@ class Mailbox(Generic[T]):
             wake: what `put` calls after it has stored an item, on the writer's thread. By default
                 it ends the reader's `wait`.
         """
-        self._items: deque[T] = deque(maxlen=most)
+        self.waiting: deque[T] = deque(maxlen=most)
+        """The items that wait, the oldest on the left. Only the reader may take from it directly.
+        In each step the daemon looks at about forty mailboxes, too many for a method call each."""
         self._bell = Bell()
         self._wake = wake or self._bell.ring
         self.closed = False
         """Whether the last item has arrived. It may still wait."""
-
-    def __len__(self) -> int:
-        return len(self._items)
 
     # The writers' side
 
@@ -69,7 +68,7 @@ class Mailbox(Generic[T]):
 
         The answer is exact for a single writer.
         """
-        items = self._items
+        items = self.waiting
         room = len(items) < items.maxlen  # type: ignore[operator]
         items.append(item)
         return room
@@ -90,25 +89,23 @@ class Mailbox(Generic[T]):
     def wakes(self, wake: Callable[[], object]) -> None:
         """Call `wake` from now on instead of ending `wait`, and at once if there is news."""
         self._wake = wake
-        if self._items or self.closed:
+        if self.waiting or self.closed:
             wake()
 
     def pop(self) -> T | None:
         """Remove and return the oldest item, or return None if none waits."""
-        try:
-            return self._items.popleft()
-        except IndexError:
-            return None
+        # No other thread can take the item in between, because there is one reader.
+        return self.waiting.popleft() if self.waiting else None
 
     def take(self) -> list[T]:
         """Remove and return the items that wait now. A flood cannot prolong this."""
-        items = self._items
+        items = self.waiting
         return [items.popleft() for _ in range(len(items))]
 
     def wait(self, seconds: float | None = None) -> bool:
         """Wait until an item waits or the mailbox is closed, at most `seconds`; return whether."""
         began_ns, left = clock.mono_ns(), seconds
-        while not (self._items or self.closed):
+        while not (self.waiting or self.closed):
             if left is not None and left <= 0:
                 return False
             self._bell.wait(left)

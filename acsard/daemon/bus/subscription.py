@@ -29,7 +29,7 @@ class Arrivals(Mailbox[zenoh.Sample]):
     def try_recv(self) -> zenoh.Sample | None:
         """Return the next sample, or None if none has arrived; raise `ZError` after the end."""
         sample = self.pop()
-        if sample is None and self.closed and not self:
+        if sample is None and self.closed and not self.waiting:
             raise zenoh.ZError("the session has been closed")
         return sample
 

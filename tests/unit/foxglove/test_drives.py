@@ -190,7 +190,7 @@ def told_slow(every_ns: float) -> bool:
 
 
 def said(notices: Notices) -> list[str]:
-    return [one.text for one in notices._waiting._items]
+    return [one.text for one in notices._waiting.waiting]
 
 
 # the messages of a panel: accepted whole, or refused with the reason

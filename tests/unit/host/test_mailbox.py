@@ -32,7 +32,7 @@ def took_s(begin_ns: int) -> float:
 
 def test_items_come_out_once_and_in_the_order_in_which_they_came() -> None:
     box = filled(4, 3)
-    assert (len(box), box.pop(), box.take(), box.take(), box.pop(), len(box)) == (
+    assert (len(box.waiting), box.pop(), box.take(), box.take(), box.pop(), len(box.waiting)) == (
         3, 0, [1, 2], [], None, 0,
     )  # fmt: skip
 
@@ -56,7 +56,7 @@ class Flooded(deque[int]):
 
 def test_a_flood_cannot_hold_the_reader() -> None:
     box = Mailbox[int](3)
-    box._items = Flooded([0, 0, 0], maxlen=3)
+    box.waiting = Flooded([0, 0, 0], maxlen=3)
     assert box.take() == [0, 0, 0]
     assert box.take() == [1, 1, 1]
 
