@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
+from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Sequence
 
 import msgspec
@@ -21,6 +21,7 @@ from msgspec import Struct
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.child import acsard, running
 from acsard.host.errors import WORDS, Exit
 from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
@@ -31,9 +32,6 @@ from acsard.web.socket_messages import Ended, Guided, Running
 
 ENDING_S = 1.0
 """Longest time that the answer to a STOP waits for the child to end."""
-
-LINE_BYTES = 65536
-"""Maximum length of one line of the child's output."""
 
 LAST_BYTES = 4000
 """Number of bytes that are kept from the end of the child's standard error."""
@@ -238,7 +236,7 @@ class _Errand:
     def __init__(self, viewer: object, by: str, name: str, say: Say) -> None:
         self.viewer, self.by, self.name, self.say = viewer, by, name, say
         self.left = False
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: Process | None = None
         self._question = 0
         """Number of the open question; 0 if none is open."""
         self._leg = self._rides = False
@@ -256,20 +254,12 @@ class _Errand:
         """
         if self.left:
             return int(Exit.FAILURE), ""
-        # The child gets a session of its own, so a Ctrl-C at this server's terminal reaches it
-        # once, from this server.
-        process = self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-P", "-m", "acsard", *given, limit=LINE_BYTES, start_new_session=True,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-        )  # fmt: skip
-        if self.left:
-            self._interrupt()
-        try:
+        async with running(acsard(*given), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
+            self._process = process
+            if self.left:
+                self._interrupt()
             await asyncio.gather(self._hear(process), self._overhear(process))
             code = await process.wait()
-        finally:
-            self.kill()
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
@@ -322,12 +312,12 @@ class _Errand:
             assert self._process.stdin is not None
             self._process.stdin.write(msgspec.json.encode(message) + b"\n")
 
-    async def _hear(self, process: asyncio.subprocess.Process) -> None:
+    async def _hear(self, process: Process) -> None:
         assert process.stdout is not None
         try:
             async for line in process.stdout:
                 self._take(line)
-        except ValueError:  # a line over LINE_BYTES
+        except ValueError:  # a line that is too long
             self.leave()
             while await process.stdout.read(4096):
                 pass
@@ -343,7 +333,7 @@ class _Errand:
             self._rides = False
         self.say(Guided(msgspec.Raw(line)))
 
-    async def _overhear(self, process: asyncio.subprocess.Process) -> None:
+    async def _overhear(self, process: Process) -> None:
         assert process.stderr is not None
         while said := await process.stderr.read(4096):
             self._last = (self._last + said)[-LAST_BYTES:]
