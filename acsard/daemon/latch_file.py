@@ -333,8 +333,8 @@ class LatchFile:
             # The rename comes before the sync. A process is killed far more often than the power
             # fails, and a sync takes up to seconds on an SD card. A power cut in between may leave
             # half a file, which counts as unreadable: the robot then starts stopped.
-            text = encode(self._robot, self._with_missed(latches)).decode()
-            replace(self._path, text, synced=False)
+            content = encode(self._robot, self._with_missed(latches))
+            replace(self._path, content, synced=False)
         except OSError as error:
             return _reason(error)
         self._held = latches
@@ -345,6 +345,7 @@ class LatchFile:
         assert self._path is not None
         try:
             sync(self._path)
+            sync(self._path.parent)
         except OSError as error:
             return _reason(error)
         return ""
