@@ -18,6 +18,7 @@ from acsard.core.ros.shapes import LEVELS, Log
 from acsard.core.values import NS_PER_S, Level
 from acsard.host import clock
 from acsard.host.mailbox import Mailbox
+from acsard.host.rate_limits import Buckets, Rate
 
 STATUS: dict[Level, StatusLevel] = {
     "info": StatusLevel.Info,
@@ -25,8 +26,8 @@ STATUS: dict[Level, StatusLevel] = {
     "error": StatusLevel.Error,
 }
 
-AGAIN_NS = 2 * NS_PER_S
-"""Minimum interval between two notices with the same text."""
+AGAIN = Rate(0.5)
+"""Rate of the notices with the same text: one in two seconds."""
 
 WAITING = 100
 """Maximum number of waiting notices; the oldest are dropped."""
@@ -51,8 +52,7 @@ class Notices:
         self._tell = tell
         self._lock = Lock()
         self._waiting = Mailbox[Notice](WAITING, wake)
-        self._said: dict[str, int] = {}
-        """Time at which each text was last reported."""
+        self._texts = Buckets(AGAIN)
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
@@ -62,11 +62,9 @@ class Notices:
         """
         now_ns = clock.mono_ns()
         with self._lock:
-            recent = {t: ns for t, ns in self._said.items() if now_ns - ns < AGAIN_NS}
-            if text in recent and not stays:
-                return
-            self._said = recent | {text: now_ns}
-        self._waiting.put(Notice(level, name, text, stays))
+            new = self._texts.take(text, now_ns)
+        if new or stays:
+            self._waiting.put(Notice(level, name, text, stays))
 
     def over(self, stays: str) -> None:
         """End the lasting status with this id."""

@@ -19,10 +19,10 @@ import msgspec
 from msgspec import Struct
 
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
-from acsard.core.values import NS_PER_S
 from acsard.host import clock
 from acsard.host.child import acsard, running
 from acsard.host.errors import WORDS, Exit
+from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
 from acsard.web.calls import Ending
@@ -36,9 +36,9 @@ ENDING_S = 1.0
 LAST_BYTES = 4000
 """Number of bytes that are kept from the end of the child's standard error."""
 
-RELAY_NS = NS_PER_S // 20
-"""Minimum interval between signs of life that are relayed to the child. The browser sends them at
-about half this rate (page/guide.js), so none is lost."""
+RELAYED = Rate(20.0)
+"""Rate of the signs of life that are relayed to the child. The browser sends them at about half
+this rate (page/guide.js), so none is lost."""
 
 PATIENCE_S = 6.0
 """Time for the child to send zeros and exit after an interrupt, before it is killed."""
@@ -240,7 +240,7 @@ class _Errand:
         self._question = 0
         """Number of the open question; 0 if none is open."""
         self._leg = self._rides = False
-        self._relayed_ns = 0
+        self._relayed = Bucket(RELAYED)
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
@@ -281,9 +281,7 @@ class _Errand:
 
     def relay(self) -> None:
         """Send a sign of life: the operator who can stop the robot is still connected."""
-        now_ns = clock.mono_ns()
-        if now_ns - self._relayed_ns >= RELAY_NS:
-            self._relayed_ns = now_ns
+        if self._relayed.take(clock.mono_ns()):
             self._write({})
 
     def leave(self) -> None:
