@@ -89,7 +89,7 @@ def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Wo
 
     The progress in percent goes to standard error.
     """
-    from acsard.host.processes import end_with_parent
+    from acsard.host.child import end_with_parent
     from acsard.recording.end_record import closing
 
     end_with_parent(signal.SIGKILL)

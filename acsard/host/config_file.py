@@ -77,7 +77,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
     """
     try:
         place, text, given = _changed(file, keys, new)
-        replace(place, text)
+        replace(place, text.encode())
         return given
     except (OSError, ValueError, ConfigError) as error:
         raise _left(file, error) from None

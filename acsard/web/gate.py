@@ -14,10 +14,10 @@ from typing import Any
 from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
+from acsard.host.rate_limits import Places
 from acsard.web.answers import HEADERS, problem
 from acsard.web.callers import unmapped
 from acsard.web.counts import Counts
-from acsard.web.limits import Places
 
 SOCKETS, SOCKETS_OF_ONE = 256, 64
 """Maximum number of TCP connections per listening address, in all and from one client address. A

@@ -19,6 +19,7 @@ from acsard.core.messages.signature import public_name
 from acsard.core.values import Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
+from acsard.host.rate_limits import Bucket
 from acsard.web import socket_messages
 from acsard.web.callers import RefusedError, Who
 from acsard.web.calls import Calls
@@ -40,7 +41,7 @@ from acsard.web.frames import (
 )
 from acsard.web.guide import Guide
 from acsard.web.keys import Keys
-from acsard.web.limits import MESSAGES, OVERRUNS, Bucket
+from acsard.web.limits import MESSAGES, OVERRUNS
 from acsard.web.robots import Robots
 from acsard.web.socket_sender import Outgoing
 
@@ -79,7 +80,7 @@ class Viewer:
         self._socket = socket
         self._robots, self._hand, self._calls = robots, hand, calls
         self._fleet, self._guide, self._counts = fleet, guide, counts
-        self._bucket = Bucket(MESSAGES, clock.mono_ns())
+        self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts, who.origin)
         self._keys = Keys(self._out, robots, self._start, who.token or who.name)

@@ -9,6 +9,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Event, EventName
+from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.silence import Silence
 
 STUCK_NS = NS_PER_S
@@ -17,7 +18,8 @@ STUCK_NS = NS_PER_S
 FIRST_NS, ALONE_NS = 5 * NS_PER_S, NS_PER_S
 """Time to wait for the daemon, ns: at the start, while other clients connect too, and later."""
 
-TOLD_EVERY_NS = 60 * NS_PER_S
+REPORTS = Rate(1 / 60)
+"""Rate of the reports that all connections are taken: one a minute."""
 
 UNANSWERED = 4
 """Number of consecutive queries without an end, each at least a second old, that show a dead
@@ -61,7 +63,7 @@ class Watch:
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
         self._last_ns, self._silence = 0, Silence(STUCK_NS)
-        self._told_ns: int | None = None
+        self._reports = Bucket(REPORTS)
         self.full = 0
         """Number of looks at which all connections were in use."""
 
@@ -70,9 +72,8 @@ class Watch:
         if len(look.holders) < self._most:
             return None
         self.full += 1
-        if self._told_ns is not None and look.at_ns - self._told_ns < TOLD_EVERY_NS:
+        if not self._reports.take(look.at_ns):
             return None
-        self._told_ns = look.at_ns
         text = f"all {self._most} connections are taken, {crowd(look.holders)}"
         return Event(self._events["full"], f"{text}: nobody else is let in", "warning")
 

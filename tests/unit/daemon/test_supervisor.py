@@ -50,7 +50,7 @@ def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
 
 
 def test_one_that_falls_silent_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("acsard.daemon.supervisor.SILENT_NS", 0)
+    monkeypatch.setattr("acsard.host.child.SILENT_NS", 0)
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
     program(monkeypatch, tmp_path, stops + "os.kill(os.getpid(), 19)")

@@ -92,7 +92,7 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
         ("raise MemoryError", "memory: draw it on another machine"),
         ("{}['x']", "KeyError: 'x'"),
         ("import os; os.kill(os.getpid(), 9)", "want of memory most likely"),
-        ("import os; os.kill(os.getpid(), 15)", "ended with -15"),
+        ("import os; os.kill(os.getpid(), 15)", "was ended by signal 15"),
         (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of it"),
     ],
 )

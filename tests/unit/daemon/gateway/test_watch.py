@@ -9,7 +9,6 @@ from acsard.daemon.gateway.watch import (
     ALONE_NS,
     FIRST_NS,
     STUCK_NS,
-    TOLD_EVERY_NS,
     UNANSWERED,
     Look,
     Watch,
@@ -37,7 +36,7 @@ def test_a_gateway_without_room_tells_who_has_it_once_a_minute_and_counts_every_
         event = watch.tell(look(number * S // 4, "ben", "ann", "ben", ""))
         if event is not None:
             told.append((number * S // 4, event))
-    assert [at for at, _ in told] == [0, TOLD_EVERY_NS, 2 * TOLD_EVERY_NS]
+    assert [at for at, _ in told] == [0, 60 * S, 120 * S]
     _, event = told[0]
     assert (event.name, event.level) == ("gateway_full", "warning")
     assert event.text.startswith("all 4 connections are taken, 2 by ben, 1 by ann, 1 by an unnamed")

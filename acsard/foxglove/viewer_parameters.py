@@ -1,4 +1,4 @@
-"""The viewers' parameters: reads and changes the robot's live settings."""
+"""The robot's live settings as the viewers' parameters: reads, changes and follows them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from threading import Lock
 from typing import Any
 
 from acsard.client import Client
+from acsard.core.config.live import flat, live
 from acsard.core.values import NS_PER_S, AcsardError
-from acsard.foxglove import parameters
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
@@ -38,9 +38,9 @@ class Settings:
 
         `tables` is None if this program may not read the configuration.
         """
-        now = {} if tables is None else parameters.values(tables)
+        now = {} if tables is None else values(tables)
         with self._lock:
-            news = parameters.news(self._known, now)
+            news = changes(self._known, now)
             self._known, self._read_ns = now, clock.mono_ns()
             self._asked, self._readable = False, tables is not None
         return news
@@ -49,7 +49,7 @@ class Settings:
         """Return the settings with these names, or all, as last read."""
         with self._lock:
             self._asked = True
-            return parameters.asked(self._known, names)
+            return asked(self._known, names)
 
     def follow(self, names: Collection[str]) -> None:
         """Record that a viewer follows these settings."""
@@ -77,7 +77,7 @@ class Settings:
             said, done = str(error), False
         self._notices.say("info" if done else "error", "set", said if done else f"not set: {said}")
         with self._lock:
-            return parameters.asked(self._known, wishes.keys()) if wishes else {}
+            return asked(self._known, wishes.keys()) if wishes else {}
 
     def refresh(self) -> dict[str, Any]:
         """Read the settings again if a viewer needs them; return the settings that changed."""
@@ -92,3 +92,19 @@ class Settings:
             with self._lock:
                 self._read_ns = clock.mono_ns()
             return {}  # the daemon is gone, which the bridge reports
+
+
+def values(config: object) -> dict[str, Any]:
+    """Return the settings that can be changed at run time, by key, tuples as lists."""
+    found = ((key, value) for key, value in flat(config) if live(key))
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in found}
+
+
+def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Return the settings with these names, or all of them if `names` is empty."""
+    return {key: value for key, value in known.items() if key in names or not names}
+
+
+def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings whose value has changed."""
+    return {key: value for key, value in now.items() if before.get(key) != value}

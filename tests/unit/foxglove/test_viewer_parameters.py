@@ -1,4 +1,4 @@
-"""The viewers' parameters follow the robot's settings while a viewer follows any of them."""
+"""A viewer's parameters are exactly the live settings, and follow them while a viewer looks."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from typing import Any, cast
 import pytest
 
 from acsard.client import Client
+from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
 from acsard.foxglove.server import Listener, Shown
-from acsard.foxglove.settings import POLL_NS, Settings
+from acsard.foxglove.viewer_parameters import POLL_NS, Settings, asked, changes, values
 from acsard.host import clock
 
 KEY, OTHER = "rates.odom", "rates.joint_states"
+
+NOW = values(effective(Config()))
 
 
 class Robot:
@@ -60,3 +63,34 @@ def test_without_a_follower_the_robot_is_not_queried(monkeypatch: pytest.MonkeyP
         monkeypatch, ("subscribe", [KEY, OTHER]), ("unsubscribe", [OTHER]), ("unsubscribe", [KEY])
     )
     assert made.refresh() == {}
+
+
+def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
+    single = {key for key in LIVE if "*" not in key}
+    timeouts = {
+        f"commands.sources.{name}.timeout" for name in ("teleop", "app", "nav", "ros2_control")
+    }
+    assert set(NOW) == single | timeouts
+
+
+def test_lists_are_lists_as_the_protocol_wants_them() -> None:
+    assert {type(value) for value in NOW.values()} <= {float, int, str, bool, list}
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ([], set(NOW)),
+        (["rates.odom"], {"rates.odom"}),
+        (["rates.odom", "no.such"], {"rates.odom"}),
+    ],
+)
+def test_who_names_none_gets_all(names: list[str], found: set[str]) -> None:
+    assert set(asked(NOW, names)) == found
+
+
+def test_changes_are_the_settings_with_another_value() -> None:
+    later = NOW | {"rates.odom": 50.0, "log.level": "debug"}
+    assert changes(NOW, later) == {"rates.odom": 50.0, "log.level": "debug"}
+    assert changes(later, later) == {}
+    assert changes({}, later) == later

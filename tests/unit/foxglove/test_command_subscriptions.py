@@ -14,7 +14,7 @@ from acsard.core.messages.schema import Header, JointState, Time, Twist, TwistSt
 from acsard.core.messages.topics import full_key
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.transports import command_keys
-from acsard.foxglove.commanders import Reader, Way, ways
+from acsard.foxglove.command_subscriptions import Reader, Way, ways
 
 TWIST = Twist(Vector3(x=0.3), Vector3(z=-0.2))
 STAMPED = TwistStamped(Header(Time(5), "elsewhere"), TWIST)

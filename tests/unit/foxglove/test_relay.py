@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import Events, Happening, Time
-from acsard.foxglove.log_messages import News
+from acsard.foxglove.relay import News
 
 KEPT = 20
 
