@@ -15,11 +15,8 @@ from acsard.host.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
-    from acsard.calibration.guided.legs import Setup
-    from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
-    from acsard.client.legs import Robot
     from acsard.core.config.settings import Config
     from acsard.prompts.calibration_prompts import Attendant
     from acsard.prompts.json_lines import JsonAttendant
@@ -69,8 +66,8 @@ def guided(
     A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
     `RefusedError`.
     """
+    from acsard.calibration.guided.guide import guide
     from acsard.calibration.guided.legs import GuideError, setup
-    from acsard.calibration.guided.ways import KINDS
     from acsard.cli.common import require_one
     from acsard.client import connect
     from acsard.client.legs import SOURCE, Robot
@@ -86,7 +83,7 @@ def guided(
         _may(args, simulated=info.simulated)
         config = _in_force(client, config, where, write=args.write)
         name = _way(args, config)
-        made, kind = setup(config), KINDS[name]
+        made = setup(config)
         if lines is not None:
             lines.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
         attendant = stack.enter_context(_attendant(args, lines))
@@ -96,7 +93,7 @@ def guided(
         elif name == "positions":
             robot.positions(args.positions, _elsewhere(args, tls, stack))
         try:
-            return _played(kind, made, robot, attendant), config
+            return guide(name, made, attendant, robot.ride), config
         except KeyboardInterrupt:
             raise GuideError("ended by the person. Nothing is written") from None
 
@@ -204,26 +201,3 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
     session = client_session(args.positions_at, tls)
     stack.callback(session.close)
     return session
-
-
-def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Calibration:
-    from acsard.calibration.guided.legs import Leg
-
-    attendant.say(
-        f"Calibration with {kind.needs}. {kind.told(made)} Stay beside the robot: any key stops it "
-        "at once."
-    )
-    way, number = kind.begin(made), 0
-    step = next(way)
-    while True:
-        if isinstance(step, Leg):
-            number += 1
-            attendant.start(f"{number}. {step.words} ({step.seconds:.0f} s)", step.by_key)
-            answer: object = robot.ride(step)
-        else:
-            answer = attendant.number(step)
-        try:
-            step = way.send(answer)
-        except StopIteration as end:
-            found: Calibration = end.value
-            return found

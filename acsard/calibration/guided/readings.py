@@ -5,15 +5,14 @@ how much turned, or where in x and y. The fit is Gauss-Newton on all readings, a
 (`calibration/places.py` sums the path). A reading is off by the error of tape and eye and by
 skidding on the way. If there are enough readings, their scatter shows how much the robot skidded.
 
-For turns on the spot, a person ends the first turn with a key. The later turns use the track that
-the first one showed.
+A person ends the first turn on the spot with a key. The later turns use the track that the first
+one showed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from msgspec import Struct
@@ -21,18 +20,12 @@ from msgspec import Struct
 from acsard.calibration.doubts import RefusedError, in_range
 from acsard.calibration.evidence import COUNT, LEFT, RATE, RIGHT, TURN, Base
 from acsard.calibration.fit import USUAL
-from acsard.calibration.guided.legs import WIDEST, GuideError, Leg, Part, Setup, ask
+from acsard.calibration.guided.legs import WIDEST, GuideError, Mean, Measure, What
 from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import wheels
 from acsard.calibration.places import Grid, grid, path
 from acsard.calibration.runs import Run
 from acsard.core.config.settings import DriveConfig
-
-What = Literal["turned", "angle", "distance", "ahead", "aside"]
-"""Kind of a reading. `turned` is an angle that includes whole turns, and `angle` one that does not.
-
-Both are in rad, positive to the left. The other kinds are in m.
-"""
 
 SKIDDING = 0.015
 """Heading error by skidding, rad for 1 m of rolling.
@@ -237,33 +230,28 @@ def _without(
 READ_M = 0.002
 """Standard deviation of a distance of a few decimetres, and of placing the robot on a line, m."""
 
-FIRST = 1.2
-"""Rate of the first turn as it would be without skidding, rad/s."""
-
-LATE = 1.1
-"""Timeout of the first turn, as a multiple of the duration with the widest track.
-
-Beyond it, the person has missed the end of the turn.
-"""
-
-MOST_SPIN_S = 24.0
-"""Longest time for several turns on the spot, s."""
-
 BELIEVABLE = 0.85, 3.0
 """Credible ratios of effective to geometric track. Outside them, a reading must be wrong."""
 
-
-def once_round(setup: Setup, words: str) -> Leg:
-    """Return a leg that turns to the left until a key is pressed."""
-    longest = LATE * 2 * math.pi * WIDEST
-    rate = abs(setup.command(FIRST)) * setup.drive.wheel_separation_multiplier
-    return Leg(words, (setup.spin(FIRST, longest / rate),), by_key=True)
+Answers = dict[tuple[str, str], float]
+"""Numbers in m and rad by leg and name; the leg is "" if they were asked for before the first."""
 
 
-def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of whole turns that fit into `MOST_SPIN_S`, from 1 to `most`."""
-    one = setup.turn(2 * math.pi, rate, track).seconds
-    return max(1, min(most, int(MOST_SPIN_S / one)))
+def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
+    """Return what a leg has measured. Raises `RefusedError` if the numbers are impossible."""
+    driven = tuple(rides[name] for name in measure.over or (leg,))
+    if isinstance(measure, Mean):
+        numbers = [answers[leg, name] for name in measure.answers]
+        value = measure.plus + sum(numbers) / len(numbers)
+        return Reading(driven, measure.what, value, measure.deviation)
+    apart = answers["", measure.apart]
+
+    def angle(leg: str) -> float:
+        return slant(answers[leg, measure.near], answers[leg, measure.far], apart)
+
+    turned = angle(leg) - (angle(measure.since) if measure.since else 0.0)
+    # Each of the two angles has two distances.
+    return Reading(driven, measure.what, measure.plus + turned, 2 * READ_M / apart)
 
 
 def effective(reading: Reading, drive: DriveConfig) -> float:
@@ -297,17 +285,3 @@ def slant(near: float, far: float, apart: float) -> float:
             f"{far * 1000:.0f} mm from the line: measure again from the start"
         )
     return math.asin(share)
-
-
-def millimetres(words: str, least: float, most: float) -> Part[float]:
-    """Ask for a length in mm and return it in m."""
-    length = yield from ask(words, "mm", least, most)
-    return length / 1000.0
-
-
-def deviation(apart: float) -> float:
-    """Return the standard deviation of the difference of two slants, rad.
-
-    Each has two distances.
-    """
-    return 2 * READ_M / apart

@@ -15,8 +15,8 @@ from acsard.core.config.settings import DriveConfig
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import REST, Twist
 
-LEG = Leg("", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
-TURN = Leg("", (Move(5.0, 0.0, 0.5),), by_key=True)
+LEG = Leg("", "", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
+TURN = Leg("", "", (Move(5.0, 0.0, 0.5),), by_key=True)
 
 TICK = 0.02
 RADIUS, TRACK = 0.05, 0.30
@@ -103,7 +103,7 @@ STOPS: dict[str, Late] = {
 
 @pytest.mark.parametrize("why", STOPS)
 def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.tells = STOPS[why]
     world.run(3.0)
     stopped = world.said.index(REST, world.said.index(Twist(0.3, 0.0)))
@@ -151,7 +151,7 @@ def test_a_program_that_leaves_while_zeros_go_out_is_waited_for() -> None:
 
 
 def test_a_daemon_that_falls_silent_stops_it() -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
@@ -159,7 +159,7 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     assert world.riding.step(world.now + QUIET_S + TICK) == REST
     assert world.riding.halted == HELD_UP
 
@@ -185,7 +185,7 @@ def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
 
 
 def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
     world.run(0.3)
     world.tells = lambda state: state
@@ -242,7 +242,7 @@ def test_a_gyro_that_sees_less_than_the_wheels_do_is_no_disobedience() -> None:
 
 
 def test_wheels_that_never_come_to_rest_are_told() -> None:
-    world = World(Leg("", (Move(0.5, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(0.5, 0.3),))).until_moving()
     for _ in range(500):
         world.now += TICK
         world.riding.state(telling(REST), world.now)
