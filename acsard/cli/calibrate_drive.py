@@ -68,9 +68,9 @@ def guided(
     """
     from acsard.calibration.guided.guide import guide
     from acsard.calibration.guided.legs import GuideError, setup
+    from acsard.calibration.guided.robot_on_bus import SOURCE, Robot
     from acsard.cli.common import require_one
     from acsard.client import connect
-    from acsard.client.legs import SOURCE, Robot
     from acsard.core.messages.topics import full_key
     from acsard.daemon.bus.address import address_of
 

@@ -41,7 +41,7 @@ its last line.
 The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
 after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
 three times would be as late. On a computer that is too busy for this, the leg has ended before,
-because the daemon was silent for 0.5 s (client/riding.py). When a person drives by
+because the daemon was silent for 0.5 s (calibration/guided/leg_driver.py). When a person drives by
 hand, each command is a sign of life, and the source's timeout applies.
 """
 
