@@ -17,7 +17,6 @@ Where to look: each package may import only those below it. `pyproject.toml` sta
 this order as contracts, and `lint-imports` checks them.
 
     cli/             one file per verb: its options, one call into another package, its output
-    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     bench/           `acsard bench`: measures a daemon from outside
     doctor/          `acsard doctor`: what is wrong with this installation
     foxglove/        `acsard foxglove`: a live server for Foxglove
@@ -33,6 +32,7 @@ this order as contracts, and `lint-imports` checks them.
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
+    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     host/            the machine: clock, timers, threads, files, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
     error_budget/    `acsard odom`: what each cause contributes to the odometry's error

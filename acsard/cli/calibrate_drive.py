@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
     from acsard.core.config.settings import Config
-    from acsard.prompts.calibration_prompts import Attendant
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
+    from acsard.prompts.prompt import Prompt
 
 DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
 
@@ -59,7 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def guided(
-    args: argparse.Namespace, config: Config, where: str, lines: JsonAttendant | None
+    args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
     """Drive the robot and return the calibration with the configuration that the robot runs with.
 
@@ -84,16 +83,15 @@ def guided(
         config = _in_force(client, config, where, write=args.write)
         name = _way(args, config)
         made = setup(config)
-        if lines is not None:
-            lines.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
-        attendant = stack.enter_context(_attendant(args, lines))
-        robot = Robot(client, config, attendant)
+        prompt = stack.enter_context(_prompt(args, lines))
+        prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
+        robot = Robot(client, config, prompt)
         if name == "gyro":
             robot.gyro(args.imu or IMU)
         elif name == "positions":
             robot.positions(args.positions, _elsewhere(args, tls, stack))
         try:
-            return guide(name, made, attendant, robot.ride), config
+            return guide(name, made, prompt, robot.ride), config
         except KeyboardInterrupt:
             raise GuideError("ended by the person. Nothing is written") from None
 
@@ -177,19 +175,20 @@ def _way(args: argparse.Namespace, config: Config) -> str:
 
 
 @contextmanager
-def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterator[Attendant]:
-    from acsard.prompts.calibration_prompts import Nobody, attending, interrupted_by
+def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prompt]:
+    from acsard.host.terminal_modes import one_by_one
+    from acsard.prompts.prompt import ended_by_signals
+    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
 
     if args.yes:
-        yield Nobody()
+        yield NoPrompt(args.json)
         return
-    numbers = signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-    if lines is not None:
-        with interrupted_by((signal.SIGINT, *numbers)):
+    with ended_by_signals():
+        if lines is not None:
             yield lines
-        return
-    with attending() as person, interrupted_by(numbers):
-        yield person
+            return
+        with one_by_one():
+            yield TerminalPrompt(args.json)
 
 
 def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Session | None:

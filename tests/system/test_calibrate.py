@@ -20,7 +20,7 @@ import zenoh
 
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.leg_driver import HELD_UP, Recorder, Sample
-from acsard.calibration.guided.legs import Ask, GuideError
+from acsard.calibration.guided.legs import GuideError
 from acsard.calibration.guided.robot_on_bus import POSITIONS, Sensor
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import JointsConfig
@@ -28,6 +28,7 @@ from acsard.core.link.host_stalls import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
+from acsard.prompts.prompt import Ask
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,

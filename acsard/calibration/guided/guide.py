@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from msgspec.structs import replace
 
-from acsard.calibration.guided.legs import UNITS, Ask, Leg, Setup
+from acsard.calibration.guided.legs import UNITS, Leg, Setup
 from acsard.calibration.guided.measured import calibrated
 from acsard.calibration.guided.needs import NEEDS
 from acsard.calibration.guided.readings import Answers, Reading, effective, reading
@@ -15,26 +14,14 @@ from acsard.calibration.guided.ways import STRAIGHT, WAYS
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.tape_distance import LEAST_M, Tape
-
-
-class Prompt(Protocol):
-    """Interface of the prompt to the person who stands beside the robot."""
-
-    def say(self, text: str) -> None:
-        """Show a text."""
-
-    def start(self, text: str, by_key: bool = False) -> None:
-        """Return when the leg may begin."""
-
-    def number(self, ask: Ask) -> float:
-        """Return the number that the person read off."""
+from acsard.prompts.prompt import Ask, Prompt
 
 
 def guide(name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run]) -> Calibration:
     """Lead a person through the way of calibration of this name, and return the result.
 
-    `ride` drives one leg and returns its recording. Raises `GuideError`, `LogError` and
-    `RefusedError`.
+    `ride` drives one leg and returns its recording. Raises `GuideError`, `LogError`,
+    `NobodyError` and `RefusedError`.
     """
     way = WAYS[name]
     prompt.say(

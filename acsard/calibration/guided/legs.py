@@ -19,6 +19,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.values import AcsardError
+from acsard.prompts.prompt import Ask
 
 
 class GuideError(AcsardError):
@@ -40,19 +41,6 @@ class Move(Struct, frozen=True):
 
 UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
 """Units of the numbers that a person reads off, in m or rad."""
-
-
-class Ask(Struct, frozen=True):
-    """A number within bounds that the person reads off."""
-
-    words: str
-    unit: str
-    least: float
-    most: float
-    usual: float | None = None
-    """The number that Enter alone stands for, or None."""
-    name: str = ""
-    """The name by which a measurement refers to the answer."""
 
 
 What = Literal["turned", "angle", "distance", "ahead", "aside"]

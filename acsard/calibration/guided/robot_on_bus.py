@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
@@ -23,6 +23,7 @@ from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped
 from acsard.core.messages.topics import by_key
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
+from acsard.prompts.prompt import Prompt
 
 SOURCE = "app"
 
@@ -41,16 +42,6 @@ CDR does not name its type, and a payload that is too short for odometry is a po
 """
 
 Take = Callable[[Any, float], object]
-
-
-class Prompt(Protocol):
-    """Interface of the prompt as a leg uses it."""
-
-    def keys(self, wait_s: float) -> str:
-        """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
-
-    def progress(self, share: float) -> None:
-        """Show which share of the leg is done, 0 to 1."""
 
 
 class Sensor:

@@ -14,7 +14,6 @@ from acsard.calibration.guided.legs import (
     EDGE,
     ROOM,
     WIDEST,
-    Ask,
     Leg,
     Mean,
     Measure,
@@ -24,6 +23,7 @@ from acsard.calibration.guided.legs import (
     Way,
 )  # fmt: skip
 from acsard.calibration.tape_distance import LEAST_M
+from acsard.prompts.prompt import Ask
 
 TAPE_M = 0.005
 """Standard deviation of the long distance, including the position of its ends, m."""

@@ -12,12 +12,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from acsard.calibration.guided.guide import guide
-from acsard.calibration.guided.legs import Ask, Leg, Setup, setup
+from acsard.calibration.guided.legs import Leg, Setup, setup
 from acsard.calibration.guided.ways import WAYS
 from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
+from acsard.prompts.prompt import Ask
+from acsard.prompts.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
@@ -129,17 +131,12 @@ class Player:
         return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
 
 
-class Asked:
+class Asked(NoPrompt):
     """A prompt that passes every question to the simulated person."""
 
     def __init__(self, player: Player) -> None:
+        super().__init__()
         self._player = player
-
-    def say(self, text: str) -> None:
-        pass
-
-    def start(self, text: str, by_key: bool = False) -> None:
-        pass
 
     def number(self, ask: Ask) -> float:
         return self._player.answer(ask)
