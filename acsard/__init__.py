@@ -24,7 +24,8 @@ this order as contracts, and `lint-imports` checks them.
     report/          `acsard log report`: what a recording shows, as a page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a process of its own
-    calibration/     `acsard calibrate`: from a log, or by a drive of its own
+    calibration/     `acsard calibrate`, by a log or a drive of its own, and `acsard odom`: how
+                     much each cause contributes to the odometry's error
     client/          follow and drive a robot from Python, synchronous or with asyncio; the
                      follower and the commander hold the rules and time limits of all tools
     daemon/          the process: control loop, latch file, ways down
@@ -35,7 +36,6 @@ this order as contracts, and `lint-imports` checks them.
     prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     host/            the machine: clock, timers, threads, files, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
-    error_budget/    `acsard odom`: what each cause contributes to the odometry's error
     terminal/        tables and output of all tools, by the library rich
     core/            the robot as a pure function: no clock, no I/O, no thread
 
