@@ -65,9 +65,9 @@ def guided(
     A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
     `RefusedError`.
     """
-    from acsard.calibration.guided.guide import guide
     from acsard.calibration.guided.legs import GuideError, setup
     from acsard.calibration.guided.robot_on_bus import SOURCE, Robot
+    from acsard.calibration.guided.runner import guide
     from acsard.cli.common import require_one
     from acsard.client import connect
     from acsard.core.messages.topics import full_key

@@ -1,7 +1,7 @@
 """The tables of a guided drive: legs to drive, numbers to ask for, and what they measure.
 
 A way of calibration is a `Way`: the numbers to ask for first, and its legs in order. `ways.py` has
-the table of the ways, and `guide.py` leads a person through one of them.
+the table of the ways, and `runner.py` leads a person through one of them.
 
 The robot stays on 3 m x 3 m and within its limits. The true turns are unknown, since they are what
 the calibration measures. The plan allows for an effective track of 1 to 2.5 times the geometric

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Struct
 
 from acsard.calibration.doubts import RefusedError, in_range
-from acsard.calibration.evidence import COUNT, LEFT, RATE, RIGHT, TURN, Base
+from acsard.calibration.evidence import COUNT, LEFT, RATE, RIGHT, TURN, Base, condition
 from acsard.calibration.fit import USUAL
 from acsard.calibration.guided.legs import WIDEST, GuideError, Mean, Measure, What
 from acsard.calibration.log_table import Floats
@@ -45,6 +45,8 @@ PRIOR_FREE = 4.0
 LEAST_FREE = 3.0
 MOST_STEPS = 50
 SMALL = 1e-9
+WORST_CONDITION = 1e8
+"""Largest condition number at which the readings determine the parameters."""
 
 ACTIVE = [LEFT, RIGHT, TURN, RATE]
 
@@ -118,7 +120,7 @@ def found(readings: Sequence[Reading], base: Base) -> Found:
     """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
     steps = [joined(reading.rides) for reading in readings]
     start = _begun(readings, steps, base)
-    parameters, normal, _ = _solved(readings, steps, base, start)
+    parameters, normal = _solved(readings, steps, base, start)
     in_range(np.array([1 / parameters[TURN], parameters[LEFT], parameters[RIGHT]]))
     left, weights = _left(readings, steps, base, parameters)
     # Combine the scatter of these readings with the assumed noise. If there are few readings, widen
@@ -155,8 +157,8 @@ def _begun(readings: Sequence[Reading], steps: Sequence[Grid], base: Base) -> Fl
 
 def _solved(
     readings: Sequence[Reading], steps: Sequence[Grid], base: Base, start: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return the parameters, the normal equations and the right-hand side.
+) -> tuple[Floats, Floats]:
+    """Return the parameters and the normal equations.
 
     Raises `RefusedError` if the readings do not determine the parameters.
     """
@@ -175,7 +177,7 @@ def _solved(
         normal += np.outer(both, both) / UNKNOWN**2
         score += both * float(both @ (begun - parameters)) / UNKNOWN**2
         inner = normal[np.ix_(ACTIVE, ACTIVE)]
-        if np.linalg.cond(_correlated(inner)) > 1e8:
+        if condition(inner) > WORST_CONDITION:
             raise RefusedError(
                 "what was measured does not tell the wheels from the track: the robot hardly moved "
                 "or hardly turned. See that it can, and begin again"
@@ -183,16 +185,11 @@ def _solved(
         step = np.linalg.solve(inner, score[ACTIVE])
         parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
         if float(np.abs(step).max()) < SMALL:
-            return parameters, normal, score
+            return parameters, normal
     raise RefusedError(
         "what was measured does not fit together: is each number in its unit, and of the end that "
         "was asked for? Begin again"
     )
-
-
-def _correlated(normal: Floats) -> Floats:
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.asarray(normal / np.outer(size, size))
 
 
 def _off(reading: Reading, told: float) -> float:
@@ -218,9 +215,7 @@ def _without(
     """Return the residual of one reading by the fit without it, or NaN if that fit fails."""
     kept = [n for n in range(len(readings)) if n != number]
     try:
-        parameters, _, _ = _solved(
-            [readings[n] for n in kept], [steps[n] for n in kept], base, start
-        )
+        parameters, _ = _solved([readings[n] for n in kept], [steps[n] for n in kept], base, start)
     except RefusedError:
         return math.nan
     told = predicted(steps[number], readings[number].what, base, parameters)

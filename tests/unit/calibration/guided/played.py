@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from acsard.calibration.guided.guide import guide
 from acsard.calibration.guided.legs import Leg, Setup, setup
+from acsard.calibration.guided.runner import guide
 from acsard.calibration.guided.ways import WAYS
 from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs

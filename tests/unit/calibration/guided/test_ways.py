@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from acsard.calibration.doubts import RefusedError
-from acsard.calibration.guided.guide import guide
 from acsard.calibration.guided.legs import MOST_S, WIDEST, GuideError, Slant, setup
 from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.runner import guide
 from acsard.calibration.guided.ways import WAYS, side_of_square
 from acsard.calibration.log_table import LogError
 from acsard.calibration.solve import Calibration
