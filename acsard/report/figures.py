@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from acsard.core.thinning import Point, Span
 from acsard.core.values import WHEELS
-from acsard.report.commanders import OTHERS
+from acsard.report.command_sources import OTHERS
 from acsard.report.course import Course, Mark
 from acsard.report.drawing import (
     COLOURS,
@@ -194,7 +194,7 @@ class Pictures:
             ("mode", course.modes.spans()),
             ("link", course.links.spans()),
         ]
-        for name, band in course.commanders.bands.items():
+        for name, band in course.sources.bands.items():
             if band.spans():
                 rows.append((name, band.spans()))
             elif name != OTHERS:
