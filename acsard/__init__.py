@@ -17,7 +17,6 @@ Where to look: each package may import only those below it. `pyproject.toml` sta
 this order as contracts, and `lint-imports` checks them.
 
     cli/             one file per verb: its options, one call into another package, its output
-    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     bench/           `acsard bench`: measures a daemon from outside
     doctor/          `acsard doctor`: what is wrong with this installation
     foxglove/        `acsard foxglove`: a live server for Foxglove
@@ -25,6 +24,8 @@ this order as contracts, and `lint-imports` checks them.
     report/          `acsard recording report`: what a recording shows, as a page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a process of its own
+    calibration/     `acsard calibrate`, by a log or a drive of its own, and `acsard accuracy`: how
+                     much each cause contributes to the odometry's error
     client/          follow and drive a robot from Python, synchronous or with asyncio; the
                      follower and the commander hold the rules and time limits of all tools
     daemon/          the process: control loop, latch file, ways down
@@ -32,10 +33,9 @@ this order as contracts, and `lint-imports` checks them.
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
+    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     host/            the machine: clock, timers, threads, files, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
-    error_budget/    `acsard accuracy`: what each cause contributes to the odometry's error
-    calibration/     `acsard calibrate`: from a log, or by a drive of its own
     terminal/        tables and output of all tools, by the library rich
     core/            the robot as a pure function: no clock, no I/O, no thread
 

@@ -101,10 +101,7 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
 
 
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
-    base = Base(
-        drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
-        drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
-    )  # fmt: skip
+    base = Base.of(drive)
     angles = [wheels(run) for run in log.runs]
     headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
     tries: list[tuple[float, int, Prepared, Fit]] = []

@@ -60,8 +60,8 @@ class Wire(Protocol):
 class Operator(Protocol):
     """The operator at the robot."""
 
-    def say(self, text: str) -> None:
-        """Show a message about the present action."""
+    def doing(self, text: str) -> None:
+        """Show the present activity until the next one."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Return one of the answers, or None if no person watches the robot."""

@@ -1,6 +1,6 @@
 """`acsard accuracy`: show what makes odometry wrong now, and how to improve it.
 
-`error_budget/budget.py` computes it.
+`calibration/error_budget/budget.py` computes it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from acsard.cli.common import add_bus, load, robot_address
 from acsard.host.errors import Exit, ExitError
 
 if TYPE_CHECKING:
+    from acsard.calibration.error_budget.budget import Budget
+    from acsard.calibration.error_budget.daemon_messages import Feed
     from acsard.client import Client, Subscription
     from acsard.core.config.settings import Config
-    from acsard.error_budget.budget import Budget
-    from acsard.error_budget.daemon_messages import Feed
 
 DESCRIPTION = """\
 Follow the robot while somebody drives it, and tell how much each cause alone makes its odometry
@@ -51,9 +51,9 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Follow the robot and print its error budget."""
+    from acsard.calibration.error_budget.budget import budget
+    from acsard.calibration.error_budget.daemon_messages import KEYS, Feed
     from acsard.client import connect
-    from acsard.error_budget.budget import budget
-    from acsard.error_budget.daemon_messages import KEYS, Feed
 
     endpoint, robot_id, tls = robot_address(args)
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
@@ -138,7 +138,7 @@ def _follow(feed: Feed, queues: dict[str, Subscription], seconds: float) -> None
 def _print(found: Budget, as_json: bool) -> None:
     import msgspec
 
-    from acsard.error_budget.budget_report import advice, parts
+    from acsard.calibration.error_budget.budget_report import advice, parts
     from acsard.terminal.output import SENTENCES, show
 
     if not as_json:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
     from acsard.calibration.tape_distance import Tape
     from acsard.core.config.settings import DriveConfig
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
 
 DESCRIPTION = """\
 Find the wheels' radii and the effective track, each with its standard deviation, and tell what they
@@ -82,19 +82,20 @@ def main(args: argparse.Namespace) -> int:
         return _calibrate(args, None)
     if args.yes:
         raise UsageError("--yes asks nobody, and --json-lines a program: one of both")
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
 
-    with JsonAttendant() as lines:
+    with JsonPrompt() as lines:
         return _calibrate(args, lines)
 
 
-def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
+def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     import msgspec
 
     from acsard.calibration.calibration_report import Refusal, keys, parts, report
     from acsard.calibration.doubts import RefusedError
     from acsard.calibration.guided.legs import GuideError
     from acsard.calibration.log_table import LogError
+    from acsard.prompts.prompt import NobodyError
     from acsard.terminal.output import SENTENCES, plain, show
 
     where, mine = load(args.config)
@@ -106,7 +107,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
             found, config = _calibrated(_only_log(args), mine.drive, args.distance), mine
         else:
             found, config = guided(_no_log(args), mine, where, lines)
-    except (LogError, RefusedError, GuideError) as error:
+    except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
@@ -122,7 +123,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
         else:
             show(*parts(told, found, where), most=SENTENCES)
     else:
-        lines.shows(plain(*parts(told, found, where), width=SENTENCES))
+        lines.result(plain(*parts(told, found, where), width=SENTENCES))
         trouble = differing(config, mine, where)
         written = written or lines.offer(args.config, keys(found), trouble)
     if written and not args.log:

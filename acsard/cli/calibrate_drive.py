@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,14 +14,11 @@ from acsard.host.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
-    from acsard.calibration.guided.legs import Setup
-    from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
-    from acsard.client.legs import Robot
     from acsard.core.config.settings import Config
-    from acsard.prompts.calibration_prompts import Attendant
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
+    from acsard.prompts.prompt import Prompt
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 
@@ -62,7 +58,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def guided(
-    args: argparse.Namespace, config: Config, where: str, lines: JsonAttendant | None
+    args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
     """Drive the robot and return the calibration with the configuration that the robot runs with.
 
@@ -70,10 +66,10 @@ def guided(
     `RefusedError`.
     """
     from acsard.calibration.guided.legs import GuideError, setup
-    from acsard.calibration.guided.ways import KINDS
+    from acsard.calibration.guided.robot_on_bus import SOURCE, Robot
+    from acsard.calibration.guided.runner import guide
     from acsard.cli.common import require_one
     from acsard.client import connect
-    from acsard.client.legs import SOURCE, Robot
     from acsard.core.messages.topics import full_key
     from acsard.daemon.bus.address import address_of
 
@@ -86,17 +82,16 @@ def guided(
         _may(args, simulated=info.simulated)
         config = _in_force(client, config, where, write=args.write)
         name = _way(args, config)
-        made, kind = setup(config), KINDS[name]
-        if lines is not None:
-            lines.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
-        attendant = stack.enter_context(_attendant(args, lines))
-        robot = Robot(client, config, attendant)
+        made = setup(config)
+        prompt = stack.enter_context(_prompt(args, lines))
+        prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
+        robot = Robot(client, config, prompt)
         if name == "gyro":
             robot.gyro(args.imu or IMU)
         elif name == "positions":
             robot.positions(args.positions, _elsewhere(args, tls, stack))
         try:
-            return _played(kind, made, robot, attendant), config
+            return guide(name, made, prompt, robot.ride), config
         except KeyboardInterrupt:
             raise GuideError("ended by the person. Nothing is written") from None
 
@@ -182,19 +177,20 @@ def _way(args: argparse.Namespace, config: Config) -> str:
 
 
 @contextmanager
-def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterator[Attendant]:
-    from acsard.prompts.calibration_prompts import Nobody, attending, interrupted_by
+def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prompt]:
+    from acsard.host.terminal_modes import one_by_one
+    from acsard.prompts.prompt import ended_by_signals
+    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
 
     if args.yes:
-        yield Nobody()
+        yield NoPrompt(args.json)
         return
-    numbers = signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-    if lines is not None:
-        with interrupted_by((signal.SIGINT, *numbers)):
+    with ended_by_signals():
+        if lines is not None:
             yield lines
-        return
-    with attending() as person, interrupted_by(numbers):
-        yield person
+            return
+        with one_by_one():
+            yield TerminalPrompt(args.json)
 
 
 def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Session | None:
@@ -206,26 +202,3 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
     session = client_session(args.positions_at, tls)
     stack.callback(session.close)
     return session
-
-
-def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Calibration:
-    from acsard.calibration.guided.legs import Leg
-
-    attendant.say(
-        f"Calibration with {kind.needs}. {kind.told(made)} Stay beside the robot: any key stops it "
-        "at once."
-    )
-    way, number = kind.begin(made), 0
-    step = next(way)
-    while True:
-        if isinstance(step, Leg):
-            number += 1
-            attendant.start(f"{number}. {step.words} ({step.seconds:.0f} s)", step.by_key)
-            answer: object = robot.ride(step)
-        else:
-            answer = attendant.number(step)
-        try:
-            step = way.send(answer)
-        except StopIteration as end:
-            found: Calibration = end.value
-            return found

@@ -195,7 +195,10 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         return state.reason
     if state.sender in ("", sender):
         return ""
-    return f"another program drives as {source}, {state.sender}: until it is silent"
+    return (
+        f"another program drives the robot as {source}, {state.sender}: end it, or wait until it "
+        "is silent"
+    )
 
 
 def heard(state: RobotState, source: str) -> bool:

@@ -88,6 +88,11 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
     return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
 
 
+def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
+    """Return a curve, or a mark at each place."""
+    return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
+
+
 def sentence(mark: Mark) -> str:
     """Return the hover text of an event."""
     head = f"<b>{label(mark.name.replace('_', ' '))}</b>"
@@ -168,20 +173,14 @@ def _noted(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
     if not here:
         return None
     trace = _places(name.replace("_", " "), [at for _, at in here], "markers", marker=dot)
-    words = [sentence(mark) for mark, _ in here]
-    return trace | {"hovertext": words, "hovertemplate": "%{hovertext}<extra></extra>"}
+    del trace["hovertemplate"]
+    return trace | {"hovertext": [sentence(mark) for mark, _ in here], "hoverinfo": "text"}
 
 
 def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
-    return {
-        "type": "scatter",
-        "mode": mode,
-        "name": name,
-        "x": numbers(place.x for place in places),
-        "y": numbers(place.y for place in places),
-        "hovertemplate": f"{name}: x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
-        **look,
-    }
+    hover = f"{name}: x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>"
+    x, y = [place.x for place in places], [place.y for place in places]
+    return scatter(name, x, y, mode=mode, hovertemplate=hover, **look)
 
 
 def _broken(places: list[Place]) -> list[Place]:

@@ -1,6 +1,6 @@
 """Runs a board check or a calibration for a browser, as a child process of the same command.
 
-Only one runs at a time. The child's lines (`--json-lines`, see prompts/json_lines.py) go to the
+Only one runs at a time. The child's lines (`--json-lines`, see prompts/json_prompt.py) go to the
 connection that started it, and only that connection may send answers and key presses. If the
 connection ends, the child is interrupted as by Ctrl-C, so it still sends its zeros to the board.
 The child also watches its standard input and does not outlive this server. Nothing is queued: a

@@ -15,7 +15,8 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.topics import FOLLOWED
-from acsard.web import job_lines, socket_messages
+from acsard.prompts import json_messages
+from acsard.web import socket_messages
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route
 
@@ -39,8 +40,9 @@ SENT = (
 )  # fmt: skip
 
 LINES = (
-    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobMessage,
-    job_lines.Doing, job_lines.Progress, job_lines.Question, job_lines.Found, job_lines.Result,
+    socket_messages.Running, socket_messages.Ended, json_messages.Subject,
+    json_messages.JobMessage, json_messages.Doing, json_messages.Progress, json_messages.Question,
+    json_messages.Found, json_messages.Result,
 )  # fmt: skip
 """Types of the content of `guide`."""
 

@@ -18,16 +18,17 @@ import numpy as np
 import pytest
 import zenoh
 
-from acsard.calibration.guided.legs import Ask, GuideError
-from acsard.client import legs
-from acsard.client.legs import POSITIONS, Sensor
-from acsard.client.riding import HELD_UP, Recorder, Sample
+from acsard.calibration.guided import robot_on_bus
+from acsard.calibration.guided.leg_driver import HELD_UP, Recorder, Sample
+from acsard.calibration.guided.legs import GuideError
+from acsard.calibration.guided.robot_on_bus import POSITIONS, Sensor
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import JointsConfig
 from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
+from acsard.prompts.prompt import Ask
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -401,7 +402,7 @@ def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free
 def test_what_is_no_position_and_what_does_not_come_is_told(
     free: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(legs, "FIRST_S", 0.2)
+    monkeypatch.setattr(robot_on_bus, "FIRST_S", 0.2)
     with router(free) as said, client_session(free, "") as heard:
         sensor = Sensor(heard, "slam/pose", POSITIONS)
         with pytest.raises(GuideError, match="does not come on slam/pose"):

@@ -15,7 +15,7 @@ import aiohttp
 import pytest
 
 from acsard.certificates.authority import Authority
-from acsard.prompts.json_lines import HEARD_S
+from acsard.prompts.json_prompt import HEARD_S
 from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost

@@ -534,7 +534,7 @@ def test_what_it_does_is_said_before_it_takes_time() -> None:
     said: list[str] = []
 
     class Listener(Nobody):
-        def say(self, text: str) -> None:
+        def doing(self, text: str) -> None:
             said.append(text)
 
     robot = Robot()
@@ -770,7 +770,7 @@ def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not()
         return command
 
     class Sees(Nobody):
-        def say(self, text: str) -> None:
+        def doing(self, text: str) -> None:
             if "once more" not in text:
                 robot.looked = text.startswith("trying the comma")
 

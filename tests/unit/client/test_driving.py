@@ -364,7 +364,7 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
         (FOLLOWED, ""),
         (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
         (replace(FOLLOWED, sources=[source("1 more of its senders: the first")]), ""),
-        (replace(FOLLOWED, sender=OTHER), f"another program drives as app, {OTHER}"),
+        (replace(FOLLOWED, sender=OTHER), f"another program drives the robot as app, {OTHER}"),
         (OPENING, NEUTRAL),
         (HIGHER, "teleop has the higher priority"),
         (replace(STOPPED, mode="ready", sources=[source("a command", 7.0)]), "hears no command"),

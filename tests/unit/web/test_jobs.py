@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
-from acsard.calibration.guided.ways import KINDS
+from acsard.calibration.guided.ways import WAYS
 from acsard.cli import calibrate, mcu
 from acsard.web.frames import Begin, FrameError
 from acsard.web.jobs import KEY, Reach, words
@@ -93,7 +93,7 @@ def test_no_text_becomes_an_option_of_its_own(
 
 
 def test_the_ways_are_those_there_are() -> None:
-    assert {name: kind.needs for name, kind in KINDS.items()} == NEEDS
+    assert WAYS.keys() == NEEDS.keys()
 
 
 def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:

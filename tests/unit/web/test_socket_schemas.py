@@ -13,7 +13,8 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
-from acsard.web import job_lines, socket_messages
+from acsard.prompts import json_messages
+from acsard.web import socket_messages
 from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, LINES, SENT, VALUE
 from acsard.web.socket_sender import Following
@@ -39,13 +40,13 @@ SAID: tuple[Struct, ...] = (
 GUIDED: tuple[Struct, ...] = (
     socket_messages.Running("check", "here", True),
     socket_messages.Ended(0, "success", ""),
-    job_lines.Subject("port sim", True),
-    job_lines.JobMessage("so"),
-    job_lines.Doing("so"),
-    job_lines.Progress(0.5),
-    job_lines.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    job_lines.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
-    job_lines.Result("all"),
+    json_messages.Subject("port sim", True),
+    json_messages.JobMessage("so"),
+    json_messages.Doing("so"),
+    json_messages.Progress(0.5),
+    json_messages.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
+    json_messages.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    json_messages.Result("all"),
 )
 
 

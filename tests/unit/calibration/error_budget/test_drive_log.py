@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acsard.calibration.error_budget.drive_log import Line, motion
 from acsard.core.config.settings import DriveConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.error_budget.drive_log import Line, motion
 
 KINEMATICS = Kinematics(DriveConfig())
 SPEED, PERIOD = 10.0, 0.01
@@ -40,8 +40,8 @@ def test_a_gap_in_which_the_pose_stood_is_all_the_way_that_was_driven_in_it() ->
     moved = [SPEED * PERIOD] * 200
     moved[100] = 0.0
     found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
-    (stood,) = found.stood.values()
-    assert stood.distance == pytest.approx(0.5 * 0.51)
+    (stood,) = found.stood[found.stood.any(axis=1)]
+    assert stood[0] == pytest.approx(0.5 * 0.51)
     assert found.unseen == pytest.approx(0.51)
 
 
@@ -53,7 +53,7 @@ def test_lines_that_are_missing_are_a_doubt_where_the_pose_went_on() -> None:
     assert found.missing == 3
     assert found.unseen == pytest.approx(0.03)
     assert np.flatnonzero(found.bridged[:, 0]).tolist() == [99]
-    assert not found.stood
+    assert not found.stood.any()
 
 
 def test_lines_that_only_we_have_missed_are_no_gap() -> None:

@@ -36,7 +36,7 @@ MOST_TEXT = 300
 MOST_SENDERS = 256
 
 
-class Commanders:
+class CommandSources:
     """The states of all sources over the steps."""
 
     def __init__(self, sources: Sequence[Source]) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
+from acsard.calibration.error_budget.budget import Heard
+from acsard.calibration.error_budget.drive_log import Line
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import (
     DiagnosticArray,
@@ -15,8 +17,6 @@ from acsard.core.messages.schema import (
     TwistStamped,
 )
 from acsard.core.values import NS_PER_S
-from acsard.error_budget.budget import Heard
-from acsard.error_budget.drive_log import Line
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Keys to subscribe to."""

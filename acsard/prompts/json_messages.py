@@ -1,7 +1,7 @@
 """The lines that a check or a calibration prints with `--json-lines`, one JSON object each.
 
-This module is pure. It is here because the page's server relays the lines and describes them for
-programs (openapi.py). The lines in the other direction are `json_lines.Line`.
+The page's server relays the lines and describes them for programs (`web/openapi.py`). The lines in
+the other direction are `json_prompt.Line`.
 """
 
 from __future__ import annotations

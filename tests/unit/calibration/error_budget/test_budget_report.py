@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from acsard.error_budget.budget import Basis, Budget, Cause, Share
-from acsard.error_budget.budget_report import advice, parts
+from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
+from acsard.calibration.error_budget.budget_report import advice, parts
 from acsard.terminal.output import SENTENCES, plain
 
 DRIVEN = Budget(

@@ -7,6 +7,7 @@ import math
 import pytest
 from msgspec.structs import replace
 
+from acsard.calibration.error_budget.daemon_messages import Feed
 from acsard.core.config.settings import Config, McuConfig, RatesConfig
 from acsard.core.messages.schema import (
     DiagnosticArray,
@@ -26,7 +27,6 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.values import NS_PER_S
-from acsard.error_budget.daemon_messages import Feed
 
 START = Time(1000, 0)
 ZERO = Twist(Vector3(), Vector3())

@@ -21,7 +21,7 @@ from msgspec import Struct
 from acsard.calibration.guided.legs import Leg
 from acsard.calibration.log_table import Floats, Table
 from acsard.calibration.runs import Run, runs
-from acsard.client.commander import NEVER, OPENED_S, OPENING_S
+from acsard.client.commander import NEVER, OPENED_S, OPENING_S, objection
 from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState, Time
@@ -137,16 +137,11 @@ class Phase(StrEnum):
     HALTED = "halted"
 
 
-class Riding:
+class LegDriver:
     """A leg while it is driven. All times are in s of the same clock."""
 
-    def __init__(
-        self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str = ""
-    ) -> None:
-        """Start a leg.
-
-        `sender` is the identity in our commands, for a daemon that reports which sender it follows.
-        """
+    def __init__(self, leg: Leg, source: str, drive: DriveConfig, now: float, sender: str) -> None:
+        """Start a leg that is commanded as `source` by `sender`."""
         self._leg, self._source, self._drive, self._sender = leg, source, drive, sender
         self.phase = Phase.OPENING
         self.halted = ""
@@ -154,9 +149,8 @@ class Riding:
         self._begun = self._heard = self._stepped = self._changed = now
         self._number, self._ends = -1, now
         self._command = REST
-        self._waits: str | None = "a daemon that hears us"
-        self._another = ""
-        """Another program that drives as our source, as a sentence, or ""."""
+        self._waits = "no state of the daemon has arrived"
+        """Why the zeros do not count yet, or ""."""
         self._still_since: float | None = None
         self._doubted: float | None = None
 
@@ -192,16 +186,17 @@ class Riding:
     def state(self, state: RobotState, now: float) -> None:
         """Handle a `state` message of the daemon."""
         self._heard = now
+        why = self._objection(state)
         if state.mode in (*NEVER, "waiting"):
             self._halt(f"the robot is {state.mode}: {state.reason}")
         elif state.source not in ("", self._source):
             self._halt(f"{state.source} commands the robot now")
-        elif self._driven_by_another(state) and self.phase is not Phase.OPENING:
-            self._halt(self._another)
         elif self.phase is Phase.OPENING:
-            self._waits = self._another or self._missing(state)
+            self._waits = why
+        elif state.sender not in ("", self._sender):
+            self._halt(why)
         elif self.phase is Phase.MOVING:
-            self._doubt(self._objection(state, now), now)
+            self._doubt(why or self._deviation(state, now), now)
 
     def wheels(self, fastest: float, now: float) -> None:
         """Handle wheel feedback: the fastest wheel turns at `fastest` rad/s."""
@@ -234,8 +229,7 @@ class Riding:
         if passed >= OPENING_S and not self._waits:
             self.phase, self._ends = Phase.MOVING, now
         elif passed >= OPENED_S:
-            waits = f"the daemon does not take our commands: it waits for {self._waits}"
-            self._halt(self._another or waits)
+            self._halt(self._waits)
 
     def _next(self, now: float) -> None:
         self._number += 1
@@ -274,14 +268,22 @@ class Riding:
         elif now - self._doubted >= DOUBT_S:
             self._halt(why)
 
-    def _objection(self, state: RobotState, now: float) -> str:
-        """Return why the robot does not follow the command, or "".
+    def _objection(self, state: RobotState) -> str:
+        """Return why the commands of this calibration do not count, or ""."""
+        if why := objection(state, self._source, self._sender):
+            return why
+        # If the source has a long timeout, the robot follows a command for long after the last one.
+        (age,) = [one.age for one in state.sources if one.name == self._source]
+        if age is None or age >= OPENING_S:
+            return f"no command of source {self._source} has arrived for {OPENING_S:g} s"
+        return ""
+
+    def _deviation(self, state: RobotState, now: float) -> str:
+        """Return how the wheels deviate from the command, or "".
 
         The wheels decide this, not a gyro: a gyro shows the turn that remains after skidding, which
         is not disobedience.
         """
-        if waits := self._missing(state):
-            return f"the daemon does not follow us, it waits for {waits}"
         if now - self._changed < OBEYED_S:
             return ""
         if not state.wheels:
@@ -300,29 +302,6 @@ class Riding:
                     "commander, a limit or an obstacle"
                 )
         return ""
-
-    def _driven_by_another(self, state: RobotState) -> bool:
-        """Return whether another program drives as our source, for example a second calibration."""
-        other = bool(self._sender) and state.sender not in ("", self._sender)
-        self._another = (
-            f"another program drives the robot as {self._source}, {state.sender}: a calibration or "
-            "a client; end it, or wait until it is done"
-            if other and state.source == self._source
-            else ""
-        )
-        return bool(self._another)
-
-    def _missing(self, state: RobotState) -> str:
-        """Return the condition that our commands wait for, or "" if they are accepted."""
-        for one in state.sources:
-            if one.name == self._source:
-                heard = one.age is not None and one.age < OPENING_S
-                # With several senders, the daemon lists the others as waiting although it follows
-                # us.
-                followed = state.mode == "driving" and state.sender == self._sender != ""
-                waits_for = "" if followed else one.waits_for
-                return waits_for if heard else waits_for or "a command"
-        return f"a source {self._source} in commands.sources"
 
     def _halt(self, why: str) -> None:
         if not self.over:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from acsard.core.thinning import Span
-from acsard.report.commanders import OTHERS
+from acsard.report.command_sources import OTHERS
 from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two
 
 
 def spans(source: str) -> list[Span]:
     course, _ = drive_of_two()
-    return course.commanders.bands[source].spans()
+    return course.sources.bands[source].spans()
 
 
 def test_who_drives_is_who_the_recording_says_drives() -> None:
@@ -20,7 +20,7 @@ def test_who_drives_is_who_the_recording_says_drives() -> None:
         seconds = sum(end - begin for begin, end in drives)
         assert abs(seconds - course.driven[name].seconds) < 0.05
     recorded = {step.said.status[3] for step in steps if step.said.status[0] == "driving"}
-    drew = {n for n, b in course.commanders.bands.items() for s in b.spans() if s.kind == "drives"}
+    drew = {n for n, b in course.sources.bands.items() for s in b.spans() if s.kind == "drives"}
     assert drew == recorded == {"nav", "teleop"}
 
 
@@ -38,7 +38,7 @@ def test_who_sends_to_a_robot_in_fault_reads_the_fault_and_no_other_reason() -> 
 
     course, _ = course_of(dead)
     (fault,) = [span for span in course.modes.spans() if span.kind == "fault"]
-    said = [s for s in course.commanders.bands["app"].spans() if s.begin > fault.begin]
+    said = [s for s in course.sources.bands["app"].spans() if s.begin > fault.begin]
     assert {(span.kind, span.words) for span in said} == {("sends", f"fault: {fault.words}")}
 
 
@@ -56,7 +56,7 @@ def test_a_message_that_is_none_is_refused_with_its_reason() -> None:
         world.run(0.5)
 
     course, _ = course_of(garbled)
-    (refused,) = [s for s in course.commanders.bands["app"].spans() if s.kind == "refused"]
+    (refused,) = [s for s in course.sources.bands["app"].spans() if s.kind == "refused"]
     assert refused.words.startswith("cmd/app: ")
     assert 0.2 < refused.end - refused.begin < 0.5
 

@@ -6,25 +6,21 @@ import fcntl
 import io
 import json
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 
-from acsard.calibration.guided.legs import Ask
 from acsard.checkup.findings import Finding
-from acsard.prompts import json_lines
-from acsard.prompts.calibration_prompts import interrupted_by
-from acsard.prompts.json_lines import LINE_BYTES, JsonAttendant, JsonLines, JsonPerson
+from acsard.prompts import json_prompt
+from acsard.prompts.json_prompt import LINE_BYTES, JsonPrompt
+from acsard.prompts.prompt import Ask, ended_by_signals
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
-
-Talking = TypeVar("Talking", bound=JsonLines)
 
 
 class Program:
@@ -48,7 +44,7 @@ class Program:
         os.write(self._to_child, raw + lines)
 
     @contextmanager
-    def hears(self, person: Talking) -> Iterator[Talking]:
+    def hears(self, person: JsonPrompt) -> Iterator[JsonPrompt]:
         """Send everything that the prompt prints on standard output to this program."""
         with redirect_stdout(self._told), person:
             yield person
@@ -92,7 +88,7 @@ def program(monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
 
 def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Program) -> None:
     program.answers = ["far", 0.1, -2, None, "1,75"]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         assert person.number(DISTANCE) == 1.75
     assert program.told("question") == [1, 2, 3, 4, 5]
     assert program.told("wrong") == ["a number of m from 0.5 to 3"] * 4
@@ -103,14 +99,14 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Progra
 
 def test_no_value_is_what_is_usual(program: Program) -> None:
     program.answers = [None]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         assert person.number(OPTIONAL) == 0.0
     assert program.said[0]["usual"] == 0.0
 
 
 def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program: Program) -> None:
     program.answers = ["go", "start"]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         program.say({"key": True})
         person.start("Go.", by_key=True)
         assert person.keys(0.05) == ""
@@ -124,7 +120,7 @@ def test_a_key_on_the_heels_of_the_start_stops(program: Program) -> None:
         program.say({"answer": number, "value": "start"}, {"key": True})
 
     program.answers = [both]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         person.start("Go.")
         assert person.keys(5.0) == " "
         assert person.keys(0.01) == ""
@@ -137,18 +133,18 @@ def test_what_is_no_answer_to_what_is_asked_leaves_the_question_open(program: Pr
         program.say({"answer": number, "value": "start", "more": 1})
 
     program.answers = [noise]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         person.start("Go.")
     assert program.told("question") == [1]
 
 
 def interrupted(program: Program, do: Callable[[], object]) -> None:
-    with interrupted_by([signal.SIGINT]), pytest.raises(KeyboardInterrupt):
+    with ended_by_signals(), pytest.raises(KeyboardInterrupt):
         do()
 
 
 def test_the_end_of_the_input_ends_it_also_while_nothing_is_asked(program: Program) -> None:
-    with program.hears(JsonPerson()) as person:
+    with program.hears(JsonPrompt()) as person:
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
 
@@ -160,7 +156,7 @@ def test_it_ends_although_nobody_is_there_to_be_told(
     reader, writer = os.pipe()
     os.close(reader)
     gone = open(writer, "wb", buffering=0)  # noqa: SIM115
-    with gone, program.hears(JsonPerson()) as person:
+    with gone, program.hears(JsonPrompt()) as person:
         monkeypatch.setattr("sys.stderr", io.TextIOWrapper(gone, write_through=True))
         program.answers = [lambda number: program.hang_up()]
         interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
@@ -172,7 +168,7 @@ def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
     fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
     os.write(writer, b"x" * 4096)
     with os.fdopen(reader), os.fdopen(writer, "w") as full:
-        with redirect_stdout(full), JsonPerson() as person:
+        with redirect_stdout(full), JsonPrompt() as person:
             hangs_up = threading.Timer(0.3, program.hang_up)
             hangs_up.start()
             interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
@@ -181,7 +177,7 @@ def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
 
 
 def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> None:
-    with program.hears(JsonPerson()) as person:
+    with program.hears(JsonPrompt()) as person:
 
         def nested(number: int) -> None:
             program.say(raw=b'{"x":' + b"[" * 30_000 + b"\n")
@@ -192,7 +188,7 @@ def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> N
 
 
 def test_a_line_without_an_end_ends_it(program: Program) -> None:
-    with program.hears(JsonPerson()) as person:
+    with program.hears(JsonPrompt()) as person:
 
         def flood(number: int) -> None:
             for _ in range(LINE_BYTES // 4096 + 1):
@@ -205,10 +201,10 @@ def test_a_line_without_an_end_ends_it(program: Program) -> None:
 def test_silence_ends_what_moves_and_signs_of_life_do_not(
     program: Program, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(json_lines, "HEARD_S", 0.25)
-    monkeypatch.setattr(json_lines, "LISTEN_S", 0.02)
+    monkeypatch.setattr(json_prompt, "HEARD_S", 0.25)
+    monkeypatch.setattr(json_prompt, "LISTEN_S", 0.02)
     program.answers = ["start"]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         person.start("Go.")
         for _ in range(10):
             program.say({})
@@ -220,22 +216,22 @@ def test_silence_ends_what_moves_and_signs_of_life_do_not(
 def test_a_question_waits_for_a_person_for_as_long_as_he_takes(
     program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(json_lines, "HEARD_S", 0.05)
-    monkeypatch.setattr(json_lines, "LISTEN_S", 0.01)
+    monkeypatch.setattr(json_prompt, "HEARD_S", 0.05)
+    monkeypatch.setattr(json_prompt, "LISTEN_S", 0.01)
 
     def late(number: int) -> None:
         threading.Timer(0.3, program.say, [{"answer": number, "value": 1.0}]).start()
 
     program.answers = ["start", late]
-    with program.hears(JsonAttendant()) as person:
+    with program.hears(JsonPrompt()) as person:
         person.start("Go.")
         assert person.number(DISTANCE) == 1.0
 
 
 def test_what_is_found_is_told_as_it_is_made_with_how_far_it_is(program: Program) -> None:
-    with program.hears(JsonPerson()) as person:
+    with program.hears(JsonPrompt()) as person:
         person.begin("port sim", simulated=True)
-        person.say("a motor turns")
+        person.doing("a motor turns")
         for _ in range(20):
             person.found(Finding("baud rate", "PASS", "115200 baud"))
     assert program.told("doing") == ["a motor turns"]
@@ -256,7 +252,7 @@ def test_the_lines_are_written_when_that_is_wanted(
     file = tmp_path / "acsard.toml"
     file.write_text("# mine\n")
     program.answers = [answer]
-    with program.hears(JsonLines()) as lines:
+    with program.hears(JsonPrompt()) as lines:
         assert lines.offer(str(file), OFFERED) == (answer == "write")
     assert str(file) in program.said[0]["words"]
     assert file.read_text().startswith("# mine\n")
@@ -269,7 +265,7 @@ def test_what_cannot_be_written_is_not_asked_for_and_says_why(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
     monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
-    with program.hears(JsonLines()) as lines:
+    with program.hears(JsonPrompt()) as lines:
         assert not lines.offer(None, OFFERED)
         assert not lines.offer(None, OFFERED, "the daemon runs with another")
     assert program.told("question") == []

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from acsard.calibration.error_budget.drive_log import motion
+from acsard.calibration.error_budget.step_errors import Driving, Floats, Steps, rounding
 from acsard.core.config.settings import DriveConfig
 from acsard.core.motion.kinematics import Kinematics
-from acsard.error_budget.drive_log import Stood, motion
-from acsard.error_budget.step_errors import Driving, Floats, Step, mirrored, rounding
-from tests.unit.error_budget.drives import Told, late, rounded
+from tests.unit.calibration.error_budget.drives import Told, late, rounded
 
 PERIOD, COUNT = 0.01, 4000
 
@@ -89,40 +89,39 @@ def told() -> Told:
 
 
 def test_the_steps_are_the_way(told: Told) -> None:
-    steps = driving(told).plain()
-    assert len(steps) == pytest.approx(100, abs=1)
+    rows = driving(told).plain().rows
+    assert len(rows) == pytest.approx(100, abs=1)
     first, last = told.lines[0], told.lines[-1]
     rolled = (np.subtract(last.positions, first.positions)).mean() * 0.05
-    assert sum(step.distance for step in steps) == pytest.approx(rolled)
-    assert sum(step.turn for step in steps) == pytest.approx(last.yaw - first.yaw)
+    assert rows[:, 0].sum() == pytest.approx(rolled)
+    assert rows[:, 1].sum() == pytest.approx(last.yaw - first.yaw)
 
 
 def test_rounding_is_in_every_step_that_moves(told: Told) -> None:
-    steps = driving(told).rounded()
-    assert all(step.along > 0.0 for step in steps if abs(step.distance) > 0.01)
+    rows = driving(told).rounded().rows
+    assert rows[np.abs(rows[:, 0]) > 0.01, 2].all()
 
 
 def test_the_time_of_lines_is_in_blocks() -> None:
-    steps = driving(late(1, 10.0, "batches")).late()
-    assert 10 <= sum(step.along > 0.0 for step in steps) <= 21
+    assert 10 <= np.count_nonzero(driving(late(1, 10.0, "batches")).late().rows[:, 2]) <= 21
 
 
 def test_nothing_is_missed_where_all_lines_came(told: Told) -> None:
-    assert driving(told).missed() == []
+    assert not driving(told).missed().rows[:, 2:].any()
 
 
 def test_wheels_of_a_side_that_agree_contradict_nobody(told: Told) -> None:
-    assert driving(told).contradicted() == []
+    assert not driving(told).contradicted().rows[:, 2:].any()
 
 
 def test_where_a_gyro_turns_no_wheel_errs_in_the_heading(told: Told) -> None:
     steps = driving(told, gyro=True).rounded()
-    assert not any(step.yaw for step in steps)
-    assert all(step.by_gyro is not None for step in steps)
+    assert steps.by_gyro
+    assert steps.rows[:, 2].any()
+    assert not steps.rows[:, 3].any()
 
 
-def test_mirrored_it_turns_left_by_as_much_and_errs_to_the_other_side() -> None:
-    step = Step(0.1, -0.2, 1.0, 2.0, Stood(0.3, 0.4))
-    assert mirrored(step) == Step(0.1, 0.2, 1.0, 2.0, Stood(0.3, -0.4))
-    assert mirrored(mirrored(step)) == mirrored(step)
-    assert math.copysign(1.0, mirrored(step).turn) == 1.0
+def test_to_the_left_a_step_turns_by_as_much_and_errs_to_the_other_side() -> None:
+    right = [0.1, -0.2, 1.0, 2.0, 0.3, 0.4, 5.0, 6.0, 7.0]
+    left = [0.1, 0.2, 1.0, 2.0, 0.3, -0.4, 5.0, 6.0, 7.0]
+    assert Steps(np.array([right, left])).to_the_left().rows.tolist() == [left, left]

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from rich.console import RenderableType
 from rich.table import Table
 
+from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.core.motion.uncertainty import COARSE_COUNTS
-from acsard.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.terminal.tables import table
 
 MEANING: dict[Cause, str] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.error_budget.drive_log import places
+from acsard.calibration.error_budget.drive_log import places
 
 PERIOD = 0.01
 NONE = np.zeros(0)

@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from acsard.calibration.guided.legs import Ask, GuideError
-from acsard.prompts.calibration_prompts import Nobody, Person, attending
+from acsard.host.terminal_modes import one_by_one
+from acsard.prompts.prompt import Ask, NobodyError
+from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
@@ -46,7 +47,8 @@ def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
 def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(
     types: Types, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with attending() as person:
+    with one_by_one():
+        person = TerminalPrompt()
         for line in ("far\n", "0.1\n", "-2\n", "\n", "1,75\n"):
             types(line)
         assert person.number(DISTANCE) == 1.75
@@ -54,21 +56,26 @@ def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(
 
 
 def test_enter_alone_is_what_is_usual(types: Types) -> None:
-    with attending() as person:
+    with one_by_one():
+        person = TerminalPrompt()
         types("\n")
         assert person.number(OPTIONAL) == 0.0
 
 
 @pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
-def test_q_leaves_wherever_it_is_asked(types: Types, asked: Callable[[Person], object]) -> None:
-    with attending() as person:
+def test_q_leaves_wherever_it_is_asked(
+    types: Types, asked: Callable[[TerminalPrompt], object]
+) -> None:
+    with one_by_one():
+        person = TerminalPrompt()
         types("q\n")
         with pytest.raises(KeyboardInterrupt):
             asked(person)
 
 
 def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
-    with attending() as person:
+    with one_by_one():
+        person = TerminalPrompt()
         types("x ")
         types("\n")
         types(" ")
@@ -78,7 +85,8 @@ def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
 
 def test_keys_come_one_by_one_and_the_terminal_is_left_as_it_was(types: Types) -> None:
     before = termios.tcgetattr(sys.stdin)
-    with attending() as person:
+    with one_by_one():
+        person = TerminalPrompt()
         assert termios.tcgetattr(sys.stdin) != before
         types(" a")
         assert person.keys(5.0) == " a"
@@ -86,6 +94,6 @@ def test_keys_come_one_by_one_and_the_terminal_is_left_as_it_was(types: Types) -
 
 
 def test_nobody_measures_nothing() -> None:
-    assert Nobody().number(OPTIONAL) == 0.0
-    with pytest.raises(GuideError, match=re.escape("leave --yes out")):
-        Nobody().number(DISTANCE)
+    assert NoPrompt().number(OPTIONAL) == 0.0
+    with pytest.raises(NobodyError, match=re.escape("leave --yes out")):
+        NoPrompt().number(DISTANCE)

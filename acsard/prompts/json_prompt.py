@@ -22,14 +22,20 @@ from typing import TYPE_CHECKING, Self, TypeVar
 import msgspec
 from msgspec import Struct
 
-from acsard.calibration.guided.legs import Ask
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
-from acsard.prompts.calibration_prompts import number_of
-from acsard.web.job_lines import Doing, Found, JobMessage, Progress, Question, Result, Subject
+from acsard.prompts.json_messages import (
+    Doing,
+    Found,
+    JobMessage,
+    Progress,
+    Question,
+    Result,
+    Subject,
+)  # fmt: skip
+from acsard.prompts.prompt import Ask
 
 if TYPE_CHECKING:
-    from acsard.checkup.checkup_report import Report
     from acsard.checkup.findings import Finding
 
 T = TypeVar("T")
@@ -41,7 +47,7 @@ its last line.
 The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
 after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
 three times would be as late. On a computer that is too busy for this, the leg has ended before,
-because the daemon was silent for 0.5 s (client/riding.py). When a person drives by
+because the daemon was silent for 0.5 s (calibration/guided/leg_driver.py). When a person drives by
 hand, each command is a sign of life, and the source's timeout applies.
 """
 
@@ -69,8 +75,8 @@ class Line(Struct, frozen=True):
     key: bool = False
 
 
-class JsonLines:
-    """Conversation over standard input and output. It ends when the context is left."""
+class JsonPrompt:
+    """Prompt over standard input and output. The conversation ends when the context is left."""
 
     def __init__(self) -> None:
         self._input, self._left = sys.stdin.fileno(), False
@@ -78,6 +84,7 @@ class JsonLines:
         self._news = threading.Condition()
         self._open, self._answer = 0, Line()
         self._pressed = False
+        self._found = 0
         self._moves = False
         """True while something may move that a person has started and must be able to stop."""
         self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
@@ -97,28 +104,57 @@ class JsonLines:
         """Announce the subject; this is the first line."""
         self._tell(Subject(subject, simulated))
 
-    def told(self, text: str) -> None:
+    def say(self, text: str) -> None:
         """Send a text that stays visible."""
         self._tell(JobMessage(text))
+
+    def doing(self, text: str) -> None:
+        """Send the present activity."""
+        self._tell(Doing(text))
 
     def progress(self, share: float) -> None:
         """Send the progress, 0 to 1."""
         self._tell(Progress(round(share, 3)))
 
-    def shows(self, text: str) -> None:
+    def found(self, finding: Finding) -> None:
+        """Send a finding as it is made, and the progress."""
+        self._found += 1
+        self._tell(Found(finding))
+        self.progress(min(0.99, self._found / CHECK_STEPS))
+
+    def result(self, text: str) -> None:
         """Send the result as a terminal shows it. From now on nothing moves."""
         self._moves = False
+        self.progress(1.0)
         self._tell(Result(text.strip("\n")))
 
-    def choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
-        """Ask for one of the answers, and repeat the question after any other one."""
+    def ask(self, question: str, answers: Sequence[str]) -> str:
+        """Return one of the answers."""
+        return self._choose(question, answers)
 
-        def chosen(value: str | float | None) -> str:
-            if value not in answers:
-                raise ValueError(f"one of: {', '.join(answers)}")
-            return str(value)
+    def start(self, text: str, by_key: bool = False) -> None:
+        """Return when the leg may begin."""
+        self._choose(text, ("start",), leg=True, by_key=by_key)
 
-        return self._ask(chosen, words=words, answers=answers, **more)
+    def number(self, ask: Ask) -> float:
+        """Return the number that the person read off."""
+
+        def read(value: str | float | None) -> float:
+            return ask.number("" if value is None else str(value))
+
+        return self._ask(
+            read, words=ask.words, unit=ask.unit, least=ask.least, most=ask.most, usual=ask.usual
+        )
+
+    def keys(self, wait_s: float) -> str:
+        """Return a key if one was pressed since the last answer or call, else "".
+
+        Waits up to `wait_s` s for one.
+        """
+        with self._news:
+            self._news.wait_for(lambda: self._pressed, wait_s)
+            pressed, self._pressed = self._pressed, False
+            return KEY if pressed else ""
 
     def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
         """Offer to write these keys into the configuration file.
@@ -132,14 +168,24 @@ class JsonLines:
             file = writable(config)
             require_changeable(file, keys)
         except MendableError as error:
-            self.told(f"Nothing can be written from here: {error}")
+            self.say(f"Nothing can be written from here: {error}")
             return False
-        wanted = self.choose(f"Write these lines into {file}? Comments stay.", ("write", "leave"))
+        wanted = self.ask(f"Write these lines into {file}? Comments stay.", ("write", "leave"))
         self._moves = False
         if wanted == "write":
             change(file, keys)
-            self.told(f"{file}: written")
+            self.say(f"{file}: written")
         return wanted == "write"
+
+    def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
+        """Ask for one of the answers, and repeat the question after any other one."""
+
+        def chosen(value: str | float | None) -> str:
+            if value not in answers:
+                raise ValueError(f"one of: {', '.join(answers)}")
+            return str(value)
+
+        return self._ask(chosen, words=words, answers=answers, **more)
 
     def _tell(self, message: Struct) -> None:
         print(msgspec.json.encode(message).decode(), flush=True)
@@ -172,16 +218,6 @@ class JsonLines:
             return got
 
     # Input
-
-    def pressed(self, wait_s: float) -> bool:
-        """Return whether a key was pressed since the last answer or call.
-
-        Waits up to `wait_s` s for one.
-        """
-        with self._news:
-            self._news.wait_for(lambda: self._pressed, wait_s)
-            pressed, self._pressed = self._pressed, False
-            return pressed
 
     def _listen(self) -> None:
         """Read the input until the conversation ends; any other end interrupts the verb."""
@@ -236,61 +272,3 @@ class JsonLines:
             signal.pthread_kill(main, signal.SIGINT)
         with suppress(OSError):
             print(f"acsard: {why}", file=sys.stderr, flush=True)
-
-
-class JsonAttendant(JsonLines):
-    """JSON prompt of a calibration; implements `attendant.Attendant`."""
-
-    def say(self, text: str) -> None:
-        """Send a text."""
-        self.told(text)
-
-    def start(self, text: str, by_key: bool = False) -> None:
-        """Return when the leg may begin."""
-        self.choose(text, ("start",), leg=True, by_key=by_key)
-
-    def number(self, ask: Ask) -> float:
-        """Return the number that the person read off."""
-
-        def read(value: str | float | None) -> float:
-            number = number_of("" if value is None else str(value), ask.usual)
-            if not ask.least <= number <= ask.most:
-                raise ValueError(f"a number of {ask.unit} from {ask.least:g} to {ask.most:g}")
-            return number
-
-        return self._ask(
-            read, words=ask.words, unit=ask.unit, least=ask.least, most=ask.most, usual=ask.usual
-        )
-
-    def keys(self, wait_s: float) -> str:
-        """Return a key if one was pressed, else ""."""
-        return KEY if self.pressed(wait_s) else ""
-
-
-class JsonPerson(JsonLines):
-    """JSON prompt of a check; has the methods of `person.Screen`."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._found = 0
-
-    def say(self, text: str) -> None:
-        """Send the present activity."""
-        self._tell(Doing(text))
-
-    def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Return one of the answers."""
-        return self.choose(question, answers)
-
-    def found(self, finding: Finding) -> None:
-        """Send a finding as it is made, and the progress."""
-        self._found += 1
-        self._tell(Found(finding))
-        self.progress(min(0.99, self._found / CHECK_STEPS))
-
-    def result(self, found: Report, where: str) -> None:
-        """Send the summary of all findings."""
-        from acsard.checkup.checkup_report import summary
-
-        self.progress(1.0)
-        self.shows(summary(found, where))

@@ -10,12 +10,12 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
+from acsard.calibration.error_budget.budget import Budget, Cause, Heard, Share, budget
+from acsard.calibration.error_budget.drive_log import Line
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.motion.uncertainty import GYRO_SCALE
-from acsard.error_budget.budget import Budget, Cause, Heard, Share, budget
-from acsard.error_budget.drive_log import Line
-from tests.unit.error_budget import drives
-from tests.unit.error_budget.drives import Told
+from tests.unit.calibration.error_budget import drives
+from tests.unit.calibration.error_budget.drives import Told
 
 CONFIG = Config()
 

@@ -19,6 +19,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.calibration.error_budget.drive_log import Line, Motion, motion
+from acsard.calibration.error_budget.step_errors import Driving, Steps, rounding
 from acsard.core.config.settings import Config, OdometryConfig
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.noise import columns
@@ -26,8 +28,6 @@ from acsard.core.motion.path import Path
 from acsard.core.motion.twist_uncertainty import DECIMAL, TwistUncertainty
 from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
 from acsard.core.values import REST
-from acsard.error_budget.drive_log import Line, Motion, motion
-from acsard.error_budget.step_errors import Driving, Step, mirrored, rounding
 
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
@@ -45,7 +45,8 @@ STEP_S = 0.1
 MOST_STEPS = 20_000
 """Maximum number of steps until 100 m are driven. A slow drive gets longer steps."""
 
-STRAIGHT, SPIN = Step(0.05, 0.0), Step(0.0, 0.05)
+STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
+SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
 """Steps for which the declared errors are computed while the robot does not drive."""
 
 ZERO = (0.0,) * 6
@@ -151,8 +152,8 @@ def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: floa
     """Return the budget of a robot that stands, from the settings alone."""
     lines, shares = heard.lines, []
     for cause, kind in _declared(config.odometry, kinematics):
-        place = _driven(kind, kinematics, 0, [STRAIGHT], metres)
-        turn = _driven(kind, kinematics, 0, [SPIN], math.inf, math.tau)
+        place = _driven(kind, kinematics, 0, STRAIGHT, metres)
+        turn = _driven(kind, kinematics, 0, SPIN, math.inf, math.tau)
         shares.append(Share(cause, _mm(place), _deg(turn), "settings"))
     if not columns(config.odometry, kinematics):
         shares.append(Share("parameters", None, None, "unknown"))
@@ -202,9 +203,9 @@ class _Driven:
         heard, none = self._heard, _only(self._config.odometry)
         if heard.counted:
             # Counts are cumulative, so late and missing lines cause no error.
-            yield self._share("time", "measured", none, [])
+            yield self._share("time", "measured", none, driving.plain())
             yield self._share("quantisation", "measured", none, driving.plain(), counts)
-            yield self._share("gaps", "measured", none, [])
+            yield self._share("gaps", "measured", none, driving.plain())
             return
         told: Basis = "measured" if heard.whole else "unknown"
         yield self._share("time", told, none, driving.late())
@@ -226,13 +227,13 @@ class _Driven:
             kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
         yield self._share("parameters", basis, kind, driving.plain())
         if heard.gyro:
-            known = odometry.covariance == "model" and driving.tells_gyro
+            known = odometry.covariance == "model" and self._motion.yaw_variance is not None
             told: Basis = "measured" if known else "unknown"
             steps = driving.turned_by_gyro()
             yield self._share("gyro", told, _only(odometry), steps, scale=GYRO_SCALE)
 
     def _share(
-        self, cause: Cause, basis: Basis, odometry: OdometryConfig, steps: Sequence[Step],
+        self, cause: Cause, basis: Basis, odometry: OdometryConfig, steps: Steps,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
         if basis == "unknown":
@@ -243,9 +244,10 @@ class _Driven:
                 _driven(odometry, self._kinematics, counts, steps, self._metres, scale=scale)
             )
         if self.turned >= LEAST_RAD:
-            left = [mirrored(step) for step in steps]
-            driven = _driven(odometry, self._kinematics, counts, left, math.inf, math.tau, scale)
-            degrees = _deg(driven)
+            left = steps.to_the_left()
+            degrees = _deg(
+                _driven(odometry, self._kinematics, counts, left, math.inf, math.tau, scale)
+            )
         return Share(cause, millimetres, degrees, basis)
 
 
@@ -258,27 +260,24 @@ def _declared(
 
 
 def _driven(
-    odometry: OdometryConfig, kinematics: Kinematics, counts: int, steps: Sequence[Step],
-    metres: float, turns: float = math.inf, scale: float = 0.0,
-) -> PoseUncertainty | None:  # fmt: skip
-    """Return the error after `metres` m or `turns` rad of these steps, repeated; None without
-    steps.
+    odometry: OdometryConfig, kinematics: Kinematics, counts: int, steps: Steps, metres: float,
+    turns: float = math.inf, scale: float = 0.0,
+) -> PoseUncertainty:  # fmt: skip
+    """Return the error after `metres` m or `turns` rad of these steps, repeated.
 
     `scale` is the relative standard deviation of the gyro's scale.
     """
-    if not steps:
-        return None
     pose, path = PoseUncertainty(odometry, kinematics, counts), Path()
     rolled = turned = 0.0
-    for step in cycle(steps):
-        dx, dy, heading = path.advance(step.distance, step.turn)
-        pose.advance(step.distance, step.turn, dx, dy, heading, step.by_gyro, scale=scale)
-        if step.along or step.yaw:
-            pose.doubt(step.along, step.yaw)
-        if step.stood is not None:
-            lost = step.stood
-            pose.stand(lost.distance, lost.turn, lost.along, lost.yaw)
-        rolled, turned = rolled + abs(step.distance), turned + abs(step.turn)
+    for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
+        dx, dy, heading = path.advance(distance, turn)
+        variance = by_gyro if steps.by_gyro else None
+        pose.advance(distance, turn, dx, dy, heading, variance, scale=scale)
+        if along or yaw:
+            pose.doubt(along, yaw)
+        if any(missed):
+            pose.stand(*missed)
+        rolled, turned = rolled + abs(distance), turned + abs(turn)
         if rolled >= metres or turned >= turns:
             break
     return pose
@@ -302,14 +301,12 @@ def _only(
     return made
 
 
-def _mm(driven: PoseUncertainty | None) -> float:
-    if driven is None:
-        return 0.0
+def _mm(driven: PoseUncertainty) -> float:
     return 1e3 * math.sqrt(driven.covariance.xx + driven.covariance.yy)
 
 
-def _deg(driven: PoseUncertainty | None) -> float:
-    return 0.0 if driven is None else math.degrees(math.sqrt(driven.covariance.yawyaw))
+def _deg(driven: PoseUncertainty) -> float:
+    return math.degrees(math.sqrt(driven.covariance.yawyaw))
 
 
 def _millimetres(share: Share) -> float:

@@ -7,16 +7,17 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
+from acsard.calibration.guided.leg_driver import HELD_UP, LegDriver, Phase
 from acsard.calibration.guided.legs import Leg, Move
 from acsard.client.commander import OPENED_S
 from acsard.client.follower import QUIET_S
-from acsard.client.riding import HELD_UP, Phase, Riding
 from acsard.core.config.settings import DriveConfig
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import REST, Twist
 
-LEG = Leg("", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
-TURN = Leg("", (Move(5.0, 0.0, 0.5),), by_key=True)
+US, OTHER = "joe/1/aa", "joe/2/bb"
+LEG = Leg("", "", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
+TURN = Leg("", "", (Move(5.0, 0.0, 0.5),), by_key=True)
 
 TICK = 0.02
 RADIUS, TRACK = 0.05, 0.30
@@ -33,6 +34,7 @@ def telling(twist: Twist) -> RobotState:
         stamp=Time(), mode="driving", reason="commanded by app", x=0.0, y=0.0, yaw=0.0,
         linear=twist.linear, angular=twist.angular, wheels=[right, left, left, right], link="up",
         source="app", sources=[SourceState("app", 50, 0.01, "")], refused="", counters={},
+        sender=US,
     )  # fmt: skip
 
 
@@ -41,7 +43,7 @@ class World:
 
     def __init__(self, leg: Leg) -> None:
         self.now = 100.0
-        self.riding = Riding(leg, "app", DriveConfig(), self.now)
+        self.driver = LegDriver(leg, "app", DriveConfig(), self.now, US)
         self.said: list[Twist] = []
         self.tells: Late = lambda state: state
         self.speaks = True
@@ -51,9 +53,9 @@ class World:
             self.now += TICK
             done = self.said[-1] if self.said else REST
             if self.speaks:
-                self.riding.state(self.tells(telling(done)), self.now)
-                self.riding.wheels(abs(done.linear) + abs(done.angular), self.now)
-            self.said.append(self.riding.step(self.now))
+                self.driver.state(self.tells(telling(done)), self.now)
+                self.driver.wheels(abs(done.linear) + abs(done.angular), self.now)
+            self.said.append(self.driver.step(self.now))
         return self
 
     def until_moving(self) -> World:
@@ -72,17 +74,17 @@ def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -
     assert world.said[0] == REST
     assert times[Twist(0.3, 0.0)] == pytest.approx(1.0, abs=2 * TICK)
     assert times[Twist(0.0, 0.5)] == pytest.approx(2.0, abs=2 * TICK)
-    assert (world.riding.phase, world.said[-1]) == (Phase.DONE, REST)
-    assert world.riding.progress(world.now) == 1.0
+    assert (world.driver.phase, world.said[-1]) == (Phase.DONE, REST)
+    assert world.driver.progress(world.now) == 1.0
 
 
 def test_nothing_moves_until_zeros_count() -> None:
     world = World(LEG)
     waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]
-    world.tells = changed(sources=waiting)
+    world.tells = changed(sources=waiting, mode="ready", source="", sender="")
     world.run(OPENED_S + 0.5)
     assert set(world.said) == {REST}
-    assert "send a zero first" in world.riding.halted
+    assert "send a zero first" in world.driver.halted
 
 
 STOPS: dict[str, Late] = {
@@ -92,10 +94,16 @@ STOPS: dict[str, Late] = {
     "the robot is inactive": changed(mode="inactive"),
     "the robot is leaving": changed(mode="leaving"),
     "teleop commands the robot now": changed(source="teleop"),
-    "1 more of its senders": changed(
-        sources=[SourceState("app", 50, 0.01, "1 more of its senders")]
+    "send a zero first": changed(
+        mode="ready", source="", sources=[SourceState("app", 50, 0.01, "send a zero first")]
     ),
-    "it waits for a command|a command": changed(sources=[SourceState("app", 50, 3.0, "")]),
+    "the daemon hears no command of source app": changed(
+        sources=[SourceState("app", 50, 3.0, "a command")]
+    ),
+    "no command of source app has arrived for 0.4 s": changed(
+        sources=[SourceState("app", 50, 3.0, "")]
+    ),
+    "app is not one of commands.sources": changed(sources=[SourceState("nav", 50, 0.01, "")]),
     "where 0.30 are commanded": changed(wheels=[0.0] * 4),
     "sends no feedback": changed(wheels=[]),
 }
@@ -103,65 +111,63 @@ STOPS: dict[str, Late] = {
 
 @pytest.mark.parametrize("why", STOPS)
 def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.tells = STOPS[why]
     world.run(3.0)
     stopped = world.said.index(REST, world.said.index(Twist(0.3, 0.0)))
     assert set(world.said[stopped:]) == {REST}
-    assert world.riding.phase is Phase.HALTED
-    assert any(part in world.riding.halted for part in why.split("|"))
+    assert world.driver.phase is Phase.HALTED
+    assert why in world.driver.halted
     world.tells = lambda state: state
     assert set(world.run(3.0).said[stopped:]) == {REST}
 
 
-US, OTHER = "joe/1/aa", "joe/2/bb"
 TWO = [SourceState("app", 50, 0.01, "1 more of its senders: the first until it is silent")]
 
 
 def of_two(leg: Leg, sender: str) -> World:
     """Return a world whose daemon receives two calibrations and follows this one."""
     world = World(leg)
-    world.riding = Riding(leg, "app", DriveConfig(), world.now, US)
     world.tells = changed(sources=TWO, sender=sender)
     return world
 
 
 def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
-    assert of_two(LEG, US).run(5.0).riding.phase is Phase.DONE
+    assert of_two(LEG, US).run(5.0).driver.phase is Phase.DONE
 
 
 def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> None:
     world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
     assert set(world.said) == {REST}
-    assert world.riding.halted.startswith(f"another program drives the robot as app, {OTHER}")
-    assert "end it, or wait" in world.riding.halted
+    assert world.driver.halted.startswith(f"another program drives the robot as app, {OTHER}")
+    assert "end it, or wait" in world.driver.halted
 
 
 def test_one_whose_robot_another_takes_on_the_way_says_so_at_once() -> None:
     world = of_two(LEG, US).until_moving()
     world.tells = changed(sources=TWO, sender=OTHER)
     world.run(TICK)
-    assert OTHER in world.riding.halted
+    assert OTHER in world.driver.halted
 
 
 def test_a_program_that_leaves_while_zeros_go_out_is_waited_for() -> None:
     world = of_two(LEG, OTHER).run(1.0)
     world.tells = changed(sender=US)
-    assert world.run(5.0).riding.phase is Phase.DONE
+    assert world.run(5.0).driver.phase is Phase.DONE
 
 
 def test_a_daemon_that_falls_silent_stops_it() -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
-    assert world.riding.halted == "no word from the daemon"
+    assert world.driver.halted == "no word from the daemon"
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
-    assert world.riding.step(world.now + QUIET_S + TICK) == REST
-    assert world.riding.halted == HELD_UP
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
+    assert world.driver.step(world.now + QUIET_S + TICK) == REST
+    assert world.driver.halted == HELD_UP
 
 
 def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> None:
@@ -173,79 +179,79 @@ def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> N
     world.now += 1.5
     world.run(TICK)
     assert world.said[-1] == REST
-    assert world.riding.halted == HELD_UP
+    assert world.driver.halted == HELD_UP
     assert set(world.run(3.0).said[-100:]) == {REST}
 
 
 def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
     world = World(TURN).until_moving()
     world.now += 1.5
-    world.riding.key(" ", world.now)
-    assert world.riding.halted == HELD_UP
+    world.driver.key(" ", world.now)
+    assert world.driver.halted == HELD_UP
 
 
 def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
-    world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
     world.run(0.3)
     world.tells = lambda state: state
-    assert not world.run(3.0).riding.halted
+    assert not world.run(3.0).driver.halted
 
 
 def test_progress_is_the_share_of_the_time() -> None:
     world = World(LEG).until_moving()
-    told = [world.run(0.5).riding.progress(world.now) for _ in range(5)]
+    told = [world.run(0.5).driver.progress(world.now) for _ in range(5)]
     assert told == pytest.approx([share / 6 for share in range(1, 6)], abs=0.02)
 
 
 def test_a_key_stops_it_in_the_same_step() -> None:
     world = World(LEG).until_moving()
-    world.riding.key(" ", world.now)
-    assert world.riding.step(world.now) == REST
-    assert world.riding.phase is Phase.HALTED
+    world.driver.key(" ", world.now)
+    assert world.driver.step(world.now) == REST
+    assert world.driver.phase is Phase.HALTED
 
 
 def test_the_hand_that_lies_on_enter_while_zeros_go_out_stops_nothing() -> None:
     world = World(LEG).run(0.1)
-    world.riding.key("\n", world.now)
+    world.driver.key("\n", world.now)
     world.until_moving()
-    assert not world.riding.halted
+    assert not world.driver.halted
 
 
 @pytest.mark.parametrize("leg", [LEG, TURN], ids=["leg", "turn"])
 def test_any_other_key_meanwhile_keeps_it_from_moving_at_all(leg: Leg) -> None:
     world = World(leg).run(0.1)
-    world.riding.key(" ", world.now)
+    world.driver.key(" ", world.now)
     world.run(3.0)
     assert set(world.said) == {REST}
-    assert world.riding.phase is Phase.HALTED
+    assert world.driver.phase is Phase.HALTED
 
 
 def test_a_turn_that_a_key_ends_ends_well_by_it() -> None:
     world = World(TURN).until_moving()
     world.run(1.0)
-    world.riding.key(" ", world.now)
-    assert world.riding.step(world.now) == REST
-    assert world.run(1.0).riding.phase is Phase.DONE
+    world.driver.key(" ", world.now)
+    assert world.driver.step(world.now) == REST
+    assert world.run(1.0).driver.phase is Phase.DONE
 
 
 def test_a_turn_that_nobody_ends_is_no_measurement() -> None:
     world = World(TURN).run(8.0)
     assert world.said[-1] == REST
-    assert "no key was pressed" in world.riding.halted
+    assert "no key was pressed" in world.driver.halted
 
 
 def test_a_gyro_that_sees_less_than_the_wheels_do_is_no_disobedience() -> None:
     world = World(LEG)
     world.tells = changed(angular=0.2, linear=0.3)
-    assert world.run(5.0).riding.phase is Phase.DONE
+    assert world.run(5.0).driver.phase is Phase.DONE
 
 
 def test_wheels_that_never_come_to_rest_are_told() -> None:
-    world = World(Leg("", (Move(0.5, 0.3),))).until_moving()
+    world = World(Leg("", "", (Move(0.5, 0.3),))).until_moving()
     for _ in range(500):
         world.now += TICK
-        world.riding.state(telling(REST), world.now)
-        world.riding.wheels(1.0, world.now)
-        world.riding.step(world.now)
-    assert "come to rest" in world.riding.halted
+        world.driver.state(telling(REST), world.now)
+        world.driver.wheels(1.0, world.now)
+        world.driver.step(world.now)
+    assert "come to rest" in world.driver.halted

@@ -1,27 +1,29 @@
 """The robot on the bus during a calibration: it drives legs, and its messages are recorded.
 
-`riding.py` decides which command to send.
+`leg_driver.py` decides which command to send.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
+from acsard.calibration.guided.leg_driver import LegDriver, Recorder
 from acsard.calibration.guided.legs import GuideError, Leg
 from acsard.calibration.runs import Run
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S
-from acsard.client.riding import Recorder, Riding
 from acsard.client.synchronous import Client
+from acsard.client.watch import Watch
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError, Decoder
-from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped, RobotState
+from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped
 from acsard.core.messages.topics import by_key
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
+from acsard.prompts.prompt import Prompt
 
 SOURCE = "app"
 
@@ -40,16 +42,6 @@ CDR does not name its type, and a payload that is too short for odometry is a po
 """
 
 Take = Callable[[Any, float], object]
-
-
-class Prompt(Protocol):
-    """Interface of the prompt as a leg uses it."""
-
-    def keys(self, wait_s: float) -> str:
-        """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
-
-    def progress(self, share: float) -> None:
-        """Show which share of the leg is done, 0 to 1."""
 
 
 class Sensor:
@@ -99,8 +91,8 @@ class Robot:
         self._client, self._prompt = client, prompt
         self._joints, self._geometry = config.joints.as_tuple(), config.drive
         self._sensors: list[tuple[Sensor, str]] = []
-        self._wheels = self._own("wheel_states", JointState)
-        self._states = self._own("state", RobotState)
+        self._wheels = Sensor(client.session, client.key("wheel_states"), (JointState,))
+        self._watch = Watch(client, time.monotonic())
 
     def gyro(self, key: str) -> None:
         """Record turn rates from a key. Raises `GuideError` if none arrive."""
@@ -122,39 +114,42 @@ class Robot:
         recorder = Recorder(self._joints)
         self._drain()
         sender = self._client.sender
-        riding = Riding(leg, SOURCE, self._geometry, time.monotonic(), sender)
+        driver = LegDriver(leg, SOURCE, self._geometry, time.monotonic(), sender)
         try:
-            self._drive(riding, recorder)
+            self._drive(driver, recorder)
         finally:
             for _ in range(ZEROS):
                 self._client.send(0.0, 0.0)
-        if riding.halted:
-            raise GuideError(f"{riding.halted}. Zero was commanded, and nothing is written")
+        if driver.halted and self._watch.unreadable:
+            raise GuideError("the daemon's state cannot be read: is it of another version?")
+        if driver.halted:
+            raise GuideError(f"{driver.halted}. Zero was commanded, and nothing is written")
         return recorder.run()
 
-    def _drive(self, riding: Riding, recorder: Recorder) -> None:
+    def _drive(self, driver: LegDriver, recorder: Recorder) -> None:
         begun = sent = shown = time.monotonic()
         last = None
-        while not riding.over:
+        while not driver.over:
             for key in self._prompt.keys(LOOK_S):
-                riding.key(key, time.monotonic())
+                driver.key(key, time.monotonic())
             now = time.monotonic()
-            self._hear(riding, recorder, now)
-            command = riding.step(now)
+            self._hear(driver, recorder, now)
+            command = driver.step(now)
             period = OPENING_PERIOD_S if now - begun < OPENING_S else SEND_PERIOD_S
             if command != last or now - sent >= period:
                 self._client.send(command.linear, command.angular)
                 last, sent = command, now
             if now - shown > SHOWN_S:
-                self._prompt.progress(riding.progress(now))
+                self._prompt.progress(driver.progress(now))
                 shown = now
         self._prompt.progress(1.0)
 
-    def _hear(self, riding: Riding, recorder: Recorder, now: float) -> None:
-        self._states.hear(riding.state, now)
+    def _hear(self, driver: LegDriver, recorder: Recorder, now: float) -> None:
+        for state in self._watch.look(now):
+            driver.state(state, now)
 
         def turned(message: JointState, came: float) -> None:
-            riding.wheels(recorder.wheels(message, came), came)
+            driver.wheels(recorder.wheels(message, came), came)
 
         self._wheels.hear(turned, now)
         for sensor, name in self._sensors:
@@ -162,11 +157,9 @@ class Robot:
 
     def _drain(self) -> None:
         """Discard the messages that arrived before the leg."""
-        for sensor in (self._wheels, self._states, *(one for one, _ in self._sensors)):
+        for sensor in (self._wheels, *(one for one, _ in self._sensors)):
             sensor.hear(lambda message, now: None, 0.0)
-
-    def _own(self, name: str, cls: type) -> Sensor:
-        return Sensor(self._client.session, self._client.key(name), (cls,))
+        self._watch.look(time.monotonic())
 
     def _full(self, key: str) -> str:
         """Return a key of the table below this robot's id, and any other key as it is written."""

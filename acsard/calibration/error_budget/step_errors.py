@@ -15,31 +15,19 @@ and that is known.
 
 from __future__ import annotations
 
-import math
+from collections import Counter
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
-from msgspec.structs import replace
 
+from acsard.calibration.error_budget.drive_log import BLOCK_S, Line, Motion
+from acsard.core.link.quantization_step import Search
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.twist_uncertainty import DECIMAL
 from acsard.core.values import WheelSpeeds
-from acsard.error_budget.drive_log import BLOCK_S, Line, Motion, Stood
 
 Floats = npt.NDArray[np.float64]
-
-COARSE = 2.5 * DECIMAL
-"""Smallest step in rad/s between multiples that can be distinguished from arbitrary two-decimal
-values."""
-
-FIT, SHARE = 0.0055, 0.99
-"""Largest deviation of a rounded multiple in rad/s, and the share of values that must be within
-it."""
-
-CHANCE = 1e-3
-"""Accepted probability that arbitrary speeds look like multiples of the step between two of
-them."""
 
 TOGETHER = 0.8
 """Share of lines with equal values from which two wheels are assumed to have the same error."""
@@ -65,10 +53,10 @@ def rounding(speeds: Floats, period: float) -> Rounding:
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
     alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
-    lattice = _lattice(speeds)
-    if lattice:
-        off = (speeds - lattice * np.round(speeds / lattice)) * period
-        return Rounding(np.zeros_like(speeds), off, alike, lattice, lattice * period)
+    quantum = _quantum(speeds)
+    if quantum:
+        off = (speeds - quantum * np.round(speeds / quantum)) * period
+        return Rounding(np.zeros_like(speeds), off, alike, quantum, quantum * period)
     variance = np.column_stack([_runs(column) for column in speeds.T])
     scale = (DECIMAL * period) ** 2 / 12
     return Rounding(variance * scale, np.zeros_like(speeds), alike, DECIMAL, 0.0)
@@ -93,39 +81,34 @@ def _runs(values: Floats) -> Floats:
     return found
 
 
-def _lattice(speeds: Floats) -> float:
+def _quantum(speeds: Floats) -> float:
     """Return the speed in rad/s of which all speeds are multiples, or 0 if there is none."""
-    values = np.unique(np.append(np.abs(speeds), 0.0))
-    step = float(np.min(np.diff(values), initial=math.inf))
-    if not COARSE <= step < math.inf or (2 * FIT / step) ** (len(values) - 2) > CHANCE:
+    seen = Counter(np.abs(speeds[speeds != 0.0]).tolist())
+    if not seen:
         return 0.0
-    apart = np.diff(values)
-    # Most neighbours are one step apart. Their mean is precise enough to number the distant values.
-    step = float(apart[apart < 1.5 * step].mean())
-    for _ in range(2):
-        number = np.round(values / step)
-        step = float(values @ number / (number @ number))
-    off = np.abs(values - step * np.round(values / step))
-    return step if float(np.mean(off <= FIT)) >= SHARE else 0.0
+    search = Search(seen)
+    while not search.go_on():
+        pass
+    return search.found.quantum if search.found is not None else 0.0
 
 
-NEVER: dict[int, Stood] = {}
+class Steps(Struct, frozen=True):
+    """The steps of a drive with the errors of one cause.
 
-
-class Step(Struct, frozen=True):
-    """A step of a drive: distance in m, turn in rad, and its errors.
-
-    `along` (m2) and `yaw` (rad2) are variances that are independent of other steps. `stood` is an
-    error that is common to all steps. `by_gyro` (rad2) is the variance of a turn that a gyro
-    measured, None for a turn by the wheels.
+    A row has the distance in m and the turn in rad; the variances (m2, rad2) that are independent
+    of other steps; the motion that the pose missed in each step in the same sense (m, rad) with its
+    variances (m2, rad2); and the variance (rad2) of a turn that a gyro measured.
     """
 
-    distance: float
-    turn: float
-    along: float = 0.0
-    yaw: float = 0.0
-    stood: Stood | None = None
-    by_gyro: float | None = None
+    rows: Floats
+    by_gyro: bool = False
+    """Whether a gyro measured the turns. Otherwise the wheels did."""
+
+    def to_the_left(self) -> Steps:
+        """Return the steps with every turn to the left, and its errors as well."""
+        rows = self.rows.copy()
+        rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
+        return Steps(rows, self.by_gyro)
 
 
 class Driving:
@@ -141,20 +124,15 @@ class Driving:
         self._weights = np.array([[one.linear for one in twists], [one.angular for one in twists]])
         """Motion of the robot for 1 rad of each wheel: a row of m and a row of rad."""
 
-    def plain(self) -> list[Step]:
+    def plain(self) -> Steps:
         """Return the steps without an error."""
         return self._steps()
 
-    @property
-    def tells_gyro(self) -> bool:
-        """Whether the data shows the noise of the gyro."""
-        return self._motion.yaw_variance is not None
-
-    def turned_by_gyro(self) -> list[Step]:
+    def turned_by_gyro(self) -> Steps:
         """Return the steps with the gyro noise that odometry assumes."""
         return self._steps(gyro=self._motion.yaw_variance)
 
-    def late(self) -> list[Step]:
+    def late(self) -> Steps:
         """Return the steps with the errors of late lines.
 
         Correlated errors are summed before they are squared.
@@ -165,29 +143,26 @@ class Driving:
         squares[starts] = np.add.reduceat(late, starts, axis=0) ** 2
         return self._steps(squares)
 
-    def missed(self) -> list[Step]:
-        """Return the steps with the errors of gaps; empty if there was no gap."""
-        moved = self._motion
-        seen = not moved.stood and not moved.bridged.any()
-        return [] if seen else self._steps(moved.bridged, moved.stood)
+    def missed(self) -> Steps:
+        """Return the steps with the errors of gaps."""
+        return self._steps(self._motion.bridged, self._motion.stood)
 
-    def rounded(self) -> list[Step]:
+    def rounded(self) -> Steps:
         """Return the steps with the rounding errors of lines.
 
         An encoder's own resolution is not included.
         """
         found = self._rounding
         if found.count:
-            return self._steps(stood=_biased(found.offset[1:] @ self._weights.T))
+            return self._steps(missed=self._of_wheels(found.offset[1:]))
         roots = np.sqrt(found.variance[1:])
         variances = [
             np.einsum("ki,ij,kj->k", roots * row, found.alike, roots * row) for row in self._weights
         ]
         return self._steps(np.column_stack(variances))
 
-    def contradicted(self) -> list[Step]:
-        """Return the steps with the errors that contradicting wheels imply; empty without
-        contradiction.
+    def contradicted(self) -> Steps:
+        """Return the steps with the errors that contradicting wheels imply.
 
         If the front and the rear wheel of a side disagree and one is right, their mean is off by
         half the difference.
@@ -195,50 +170,27 @@ class Driving:
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
         right, left = (front_right - rear_right) / 2, (front_left - rear_left) / 2
-        off = np.column_stack([right, left, left, right])
-        return self._steps(stood=_biased(off @ self._weights.T)) if off.any() else []
+        return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
+
+    def _of_wheels(self, off: Floats) -> Floats:
+        """Return the motion that the pose missed by angles of the wheels, which are certain."""
+        moved = off @ self._weights.T
+        return np.hstack([moved, np.zeros_like(moved)])
 
     def _steps(
-        self, variances: Floats | None = None, stood: dict[int, Stood] = NEVER,
+        self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
-    ) -> list[Step]:  # fmt: skip
-        """Sum the lines' errors into steps; `variances` has rows of (m2, rad2), one for each
-        line."""
-        moved, each = self._motion, self._each
-        starts = np.arange(0, len(moved.distance), each)
-        distance, turn = (np.add.reduceat(all_, starts) for all_ in (moved.distance, moved.turn))
-        of = np.zeros((len(starts), 2))
-        if variances is not None:
-            of = np.add.reduceat(variances, starts, axis=0)
-        heading = np.zeros(len(starts)) if gyro is None else np.add.reduceat(gyro, starts)
-        lost: dict[int, Stood] = {}
-        for line, one in stood.items():
-            lost[line // each] = _both(lost.get(line // each, Stood()), one)
-        rows = zip(distance.tolist(), turn.tolist(), of.tolist(), heading.tolist(), strict=True)
-        if not self._gyro:
-            return [
-                Step(d, w, row[0], row[1], lost.get(i)) for i, (d, w, row, _) in enumerate(rows)
-            ]
-        # The gyro determines the heading, so wheel errors do not affect it.
-        for i, one in lost.items():
-            lost[i] = replace(one, turn=0.0, yaw=0.0)
-        return [Step(d, w, row[0], 0.0, lost.get(i), h) for i, (d, w, row, h) in enumerate(rows)]
-
-
-def mirrored(step: Step) -> Step:
-    """Return the step as a turn to the left."""
-    if step.turn >= 0.0:
-        return step
-    stood = step.stood
-    if stood is not None:
-        stood = replace(stood, turn=-stood.turn)
-    return replace(step, turn=-step.turn, stood=stood)
-
-
-def _biased(off: Floats) -> dict[int, Stood]:
-    """Return errors that keep their sign, from rows of (m, rad) for each line."""
-    return {k: Stood(*row) for k, row in enumerate(off.tolist()) if any(row)}
-
-
-def _both(a: Stood, b: Stood) -> Stood:
-    return Stood(a.distance + b.distance, a.turn + b.turn, a.along + b.along, a.yaw + b.yaw)
+    ) -> Steps:  # fmt: skip
+        """Sum the lines' errors into steps; the arguments have one row for each line."""
+        moved, count = self._motion, len(self._motion.distance)
+        errors = [
+            np.zeros((count, width)) if given is None else given.reshape(count, width)
+            for given, width in ((variances, 2), (missed, 4), (gyro, 1))
+        ]
+        if self._gyro:
+            # The gyro determines the heading, so wheel errors do not affect it.
+            errors[0] = errors[0] * (1, 0)
+            errors[1] = errors[1] * (1, 0, 1, 0)
+        rows = np.column_stack([moved.distance, moved.turn, *errors])
+        starts = np.arange(0, count, self._each)
+        return Steps(np.add.reduceat(rows, starts, axis=0), self._gyro)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acsard.calibration.guided.leg_driver import Recorder, Sample, times
 from acsard.calibration.log_table import LogError
-from acsard.client.riding import Recorder, Sample, times
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages.schema import (
     Header,

@@ -148,19 +148,6 @@ class Line(Struct, frozen=True):
     """Variance of the heading, rad2."""
 
 
-class Stood(Struct, frozen=True):
-    """Motion of the robot during a gap in which the pose did not change.
-
-    `distance` (m) and `turn` (rad) are the estimated motion; `along` (m2) and `yaw` (rad2) are its
-    variances.
-    """
-
-    distance: float = 0.0
-    turn: float = 0.0
-    along: float = 0.0
-    yaw: float = 0.0
-
-
 class Motion(Struct, frozen=True):
     """Motion between consecutive lines and its errors.
 
@@ -184,9 +171,9 @@ class Motion(Struct, frozen=True):
     bridged: Floats
     """Variances due to missing lines across which odometry continued the pose, rows of (m2,
     rad2)."""
-    stood: dict[int, Stood]
-    """Gaps across which odometry did not move the pose, by the index of the line that ends each
-    gap."""
+    stood: Floats
+    """Motion across gaps in which odometry did not move the pose, rows of (m, rad, m2, rad2): the
+    estimated motion and its variances. A row is zero without such a gap before its line."""
     missing: int
     unseen: float
     """Total duration of the gaps, s."""
@@ -213,7 +200,7 @@ def motion(lines: list[Line], sent: Floats, kinematics: Kinematics, whole: bool)
     )  # fmt: skip
     seen = _Gaps(t, twists, rolled, found, whole)
     late = _late(t, twists, found)
-    late[[k for k in seen.stood if k < len(late)]] = 0.0
+    late[seen.stood.any(axis=1)] = 0.0
     return Motion(
         float(t[-1] - t[0]), found.period, np.array([one.linear for one in rolled]),
         np.array(turns), growth, late, float(np.sqrt(np.mean(found.late**2))), seen.bridged,
@@ -269,7 +256,7 @@ class _Gaps:
         self, t: Floats, twists: list[Twist], rolled: list[Twist], found: Places, whole: bool
     ) -> None:
         self.bridged = np.zeros((len(rolled), 2))
-        self.stood: dict[int, Stood] = {}
+        self.stood = np.zeros((len(rolled), 4))
         self.missing, self.unseen = 0, 0.0
         gaps = Gaps()
         gaps.interrupt(twists[0])
@@ -281,7 +268,7 @@ class _Gaps:
                 self.unseen += dt
                 self.missing += missing
                 along, yaw = gaps.unseen(dt, before, after)
-                self.stood[k] = Stood(dt * mean.linear, dt * mean.angular, along, yaw)
+                self.stood[k] = dt * mean.linear, dt * mean.angular, along, yaw
                 gaps.interrupt(after)
             elif missing and whole:
                 self.unseen += missing * found.period
