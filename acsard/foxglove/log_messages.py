@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from acsard.core.messages.schema import Events, Happening
+from acsard.core.messages.schema import Events, LogEvent
 from acsard.core.ros.shapes import Log, log
 
 
@@ -11,7 +11,7 @@ class News:
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
-        self._told: list[Happening] = []
+        self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
         """Return the new events as log lines.

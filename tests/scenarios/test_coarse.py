@@ -36,7 +36,7 @@ def off(world: World) -> float:
 )
 def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -> None:
     world = driven(counts, reporting=True)
-    assert world.state.encoders == [counts] * 4
+    assert world.state.encoder_counts == [counts] * 4
     assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name in ("fault", "lines_implausible")]
     # a count of each wheel at either end, twice that through the heading, and the shape of the arcs
@@ -48,4 +48,4 @@ def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int)
     world = driven(counts, reporting=False)
     assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name == "fault"]
-    assert world.state.encoders == [0] * 4
+    assert world.state.encoder_counts == [0] * 4

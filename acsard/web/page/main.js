@@ -171,7 +171,7 @@ function stated({ detail }) {
   const { linear, angular } = state; // null without feedback from the board
   views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
   views.text("turn", `${figure(angular, 2)} of ${figure(wished?.angular, 2)} rad/s`);
-  const late = state.figures.period_lateness?.last_minute;
+  const late = state.latencies.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
   plots.speed.add(heard, linear, null);
   plots.turn.add(heard, angular, null);

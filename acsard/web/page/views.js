@@ -90,7 +90,7 @@ export function banner(state, viewer, elsewhere) {
   const why = reason(state, elsewhere);
   text("reason", viewer ? why.replace("press Clear", "an operator clears it") : why);
   const doubt = document.getElementById("doubt");
-  const warned = [state.doubt, state.recording, state.latch_file, state.certificate.startsWith("valid") ? "" : state.certificate];
+  const warned = [state.wheel_fault, state.recording_error, state.latch_file_error, state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry];
   doubt.textContent = warned.filter(Boolean).join("; ");
   doubt.hidden = !doubt.textContent;
 }
