@@ -16,7 +16,7 @@ def driven(counts: int, reporting: bool) -> World:
     """Drive about for ten seconds and stop. The board reports by its own clock or when prompted."""
     world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
     world.bus.wanted = set()
-    with world.mcu.unprompted(0.01) if reporting else nullcontext():
+    with world.mcu.free_running(0.01) if reporting else nullcontext():
         world.run(0.5)
         for _ in range(4):
             world.drive(dice.choice((-1, 1)) * dice.uniform(0.3, 0.9), dice.uniform(-1, 1), 2.5)
