@@ -337,7 +337,7 @@ def test_a_stop_on_the_way_down_is_there_at_the_next_start() -> None:
     host.world.loop.leaving = True
     host.patrols(0.1)
     host.world.put("stop", b"")
-    assert host.world.state.mode == "leaving"
+    assert host.world.state.mode == "shutdown"
     host.restart()
     host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "stopped"
