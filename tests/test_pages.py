@@ -242,7 +242,7 @@ def test_every_link_leads_somewhere(page: str) -> None:
 def files_in(text: str) -> set[str]:
     """Return the words that are names of files or directories."""
     found = re.findall(r"(?<![\w/.<>-])((?:\.{1,2}/)?[\w.-]+/(?:[\w./-]*\w)?/?|[\w-]+\.\w+)", text)
-    kinds = (".py", ".js", ".toml", ".json5", ".yaml", ".c", ".md")
+    kinds = (".py", ".js", ".html", ".toml", ".json5", ".yaml", ".c", ".md")
     return {name for name in found if name.endswith((*kinds, "/", "acsard-stop"))}
 
 

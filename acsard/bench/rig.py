@@ -111,11 +111,11 @@ class Rig:
         *,
         words: Sequence[str] = ACSARD,
         port: str = "",
-        unprompted: float = 0.0,
+        free_running: float = 0.0,
         wire_baud_rate: int = 0,
     ) -> None:
         self._config, self._file, self._words, self._port = config, file, words, port
-        self._part = Part(effective(config), unprompted, wire_baud_rate)
+        self._part = Part(effective(config), free_running, wire_baud_rate)
         self._endpoint = config.bus.listen[0]
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self._kinematics = Kinematics(config.drive)

@@ -33,7 +33,9 @@ LOOK_S = 0.05
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
-        "accuracy", help="what makes odometry wrong now, and its mend", description=DESCRIPTION
+        "accuracy",
+        help="show the error of odometry now, its causes and their remedies",
+        description=DESCRIPTION,
     )
     parser.add_argument(
         "--seconds", type=_seconds, default=5.0, metavar="S", help="how long to look; 5 s"

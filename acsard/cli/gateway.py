@@ -13,7 +13,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb and its options."""
     parser = verbs.add_parser(
         "gateway",
-        help="let clients of other machines in by TLS, beside the daemon",
+        help="run the TLS gateway, which admits clients of other machines",
         description="Listen at the tls/ endpoints of bus.listen and hand on to the daemon what the "
         "certificates allow. `acsard run` starts one by itself; as a service it is "
         "acsard-gateway.service. Ends with 1 when it has to be opened anew.",

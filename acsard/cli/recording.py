@@ -32,7 +32,7 @@ each. FILE is a recording, or its number in that list; without it the newest.
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
-    parser = verbs.add_parser("recording", help="what was recorded, told or lived again",
+    parser = verbs.add_parser("recording", help="show, replay, export and draw the recordings",
                               description=DESCRIPTION)  # fmt: skip
     _directory(parser, None)
     parser.set_defaults(main=list_all)

@@ -26,7 +26,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the verb, its actions and their options."""
     parser = verbs.add_parser(
         "tls",
-        help="make certificates, so that other machines may join",
+        help="make TLS certificates, so that other machines may join",
         description="Certificates for a bus that leaves this machine. Needs the "
         "library cryptography; without it, it tells what to type.",
     )

@@ -59,7 +59,7 @@ LATE_NS = NS_PER_S // 10
 """Time by which the robot may follow a speed for longer than its source's timeout, because the
 command took this long to arrive."""
 
-NEVER = ("inactive", "stopped", "fault", "leaving")
+NEVER = ("inactive", "stopped", "fault", "shutdown")
 """Modes in which no command counts."""
 
 

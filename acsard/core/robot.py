@@ -61,7 +61,7 @@ UNHEARD_S = WATCHDOG_S - 0.05
 """Time, s, without a line that left, after which the robot starts over from rest. The MCU stops by
 itself at `WATCHDOG_S`, by its own clock, which may be a little fast."""
 
-HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
+HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
 
 NS_PER_MS = 1_000_000
@@ -312,7 +312,7 @@ class Robot:
         if inputs.guard_trip:
             trip = f"the guard replaced a line: {inputs.guard_trip}"
             self._fault(trip, inputs.now, events)
-        if inputs.leaving and self._life.mode is not Mode.LEAVING:
+        if inputs.leaving and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         if not inputs.requests:
             return ()
@@ -445,7 +445,7 @@ class Robot:
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
-            case Mode.LEAVING:
+            case Mode.SHUTDOWN:
                 return LEAVING
             case _:
                 assert_never(self._life.mode)

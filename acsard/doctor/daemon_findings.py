@@ -60,8 +60,8 @@ def link(running: Running) -> Iterator[Finding]:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
     if not problems and not late and not went:
         yield Finding("link", "ok", "up, and no line is lost")
-    if state.doubt:
-        yield Finding("wheels", "warning", state.doubt, mend)
+    if state.wheel_fault:
+        yield Finding("wheels", "warning", state.wheel_fault, mend)
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
@@ -195,7 +195,7 @@ def daemon(running: Running) -> Iterator[Finding]:
         yield Finding(
             "gateway", "warning", text, "take his certificate from [access], or his program"
         )
-    yield from latch_file(state.latch_file)
+    yield from latch_file(state.latch_file_error)
     yield from late(running)
 
 

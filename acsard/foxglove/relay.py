@@ -17,7 +17,7 @@ import zenoh
 from acsard.client import Client
 from acsard.client.synchronous import decoder
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.schema import Events, Happening
+from acsard.core.messages.schema import Events, LogEvent
 from acsard.core.messages.topics import by_key
 from acsard.core.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
 from acsard.core.ros.shapes import Log, log
@@ -39,7 +39,7 @@ class News:
 
     def __init__(self) -> None:
         self._total = self._stamp_ns = 0
-        self._told: list[Happening] = []
+        self._told: list[LogEvent] = []
 
     def of(self, events: Events) -> list[Log]:
         """Return the new events as log lines.

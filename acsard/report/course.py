@@ -164,7 +164,7 @@ class Lateness:
         return max([point.value for point in self.points()], default=0.0)
 
 
-MODES = ("fault", "stopped", "leaving", "waiting", "inactive", "driving", "ready")
+MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
 """Robot modes, in the order in which they win when short spans are merged."""
 
 LINKS = ("down", "stale", "booting", "up")

@@ -26,7 +26,7 @@ END = "#8668b8"
 
 COLOURS = {
     "driving": "#159a6b", "ready": "#8fb8de", "waiting": "#e0b400", "stopped": "#e08600",
-    "fault": "#d43d3d", "inactive": "#9a9a9a", "leaving": END,
+    "fault": "#d43d3d", "inactive": "#9a9a9a", "shutdown": END,
     "up": "#8fb8de", "booting": "#e0b400", "stale": "#e08600", "down": "#d43d3d",
     "drives": "#159a6b", "sends": "#8fb8de", "waits": "#e0b400", "refused": "#d43d3d",
     "info": "#2f7ed8", "warning": "#e08600", "error": "#d43d3d",

@@ -40,7 +40,7 @@ from acsard.web.limits import Seats
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
-from acsard.web.routes import FORM, JSON, Body, Route, services, values
+from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Route, services, values
 from acsard.web.settings import Setting, rows
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
@@ -316,15 +316,15 @@ ROUTES: tuple[Route, ...] = (
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),
-    Route("GET", "/api/recordings/{name}", "operator", Page.recording,
+    Route("GET", "/api/recordings/{name}", RECORDINGS, Page.recording,
         "one recording as a file",
         gives={200: Body("MCAP.", media="application/octet-stream")}),
-    Route("POST", "/api/recordings/{name}/report", "operator", Page.draw,
+    Route("POST", "/api/recordings/{name}/report", RECORDINGS, Page.draw,
         "draws the report of a recording, or reports the progress; ask again until 200",
         gives={200: Body("It is drawn, and at `href`.", ReportState),
                202: Body("It is being drawn, or another one is.", ReportState),
                503: Body("It cannot be drawn, and why.", ReportState)}),
-    Route("GET", "/report/{name}", "operator", Page.report,
+    Route("GET", "/report/{name}", RECORDINGS, Page.report,
         "the report of a recording, once it is drawn",
         gives={200: Body("A page.", str, "text/html")}),
     *values(Page.value),

@@ -69,8 +69,11 @@ class Who(Struct, frozen=True):
     def require(self, least: Role, what: str) -> None:
         """Raise `RefusedError` unless the client has at least this role, the least for `what`."""
         if not self.may(least):
-            text = f"{what} is for {least}s; you are {self.role}: {MAY[self.role]}"
-            raise RefusedError("role", text)
+            raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
+
+    def barred(self, least: Role) -> str:
+        """Return why the client may not do something that needs the role `least`."""
+        return f"for {least}s; you are {self.role}"
 
 
 MAINTAINER = Who("maintainer", HERE)

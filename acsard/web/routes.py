@@ -21,6 +21,9 @@ from acsard.core.values import ROLES, Role, Verb
 Handler = Callable[[Any, Any], Awaitable[Any]]
 """Takes the page and the request, and returns the response."""
 
+RECORDINGS: Role = "operator"
+"""The least role that may fetch recordings and have them drawn."""
+
 JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}

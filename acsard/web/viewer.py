@@ -15,8 +15,9 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client.commander import Commander, Sender, Wish
+from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
-from acsard.core.values import Twist
+from acsard.core.values import Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
 from acsard.host.rate_limits import Bucket
@@ -43,7 +44,16 @@ from acsard.web.guide import Guide
 from acsard.web.keys import Keys
 from acsard.web.limits import MESSAGES, OVERRUNS
 from acsard.web.robots import Robots
+from acsard.web.routes import RECORDINGS
 from acsard.web.socket_sender import Outgoing
+
+ACTIONS: dict[str, Role] = {
+    **{str(verb): role for verb, role in SERVICE_ROLES.items()},
+    "drive": COMMAND_ROLE,
+    "recordings": RECORDINGS,
+    "begin": Begin.least,
+}
+"""The least role for each action of which the page shows a control."""
 
 HEARTBEAT_S = 10.0
 """Ping interval. The connection ends if the client has not answered after half of it."""
@@ -249,6 +259,11 @@ class Viewer:
             socket_messages.Limits(about.linear, about.angular),
             about.simulated,
             about.state_hz,
+            {
+                what: self.who.barred(least)
+                for what, least in ACTIONS.items()
+                if not self.who.may(least)
+            },
         )
         self._out.say(socket_messages.Hello(greeting))
 

@@ -322,7 +322,7 @@ def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
     world.loop.leaving = True
     world.hold(0.9, seconds=0.35)
     assert world.loop.at_rest
-    assert world.state.mode == "leaving"
+    assert world.state.mode == "shutdown"
     assert not world.call("activate").success
 
 

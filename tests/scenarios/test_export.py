@@ -124,7 +124,7 @@ def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> Non
 
 def test_every_state_is_the_same_but_for_what_the_daemon_measures_of_itself(both: Any) -> None:
     world, _, said = both
-    then = [replace(one, figures={}) for one in world.bus.published["state"]]
+    then = [replace(one, latencies={}) for one in world.bus.published["state"]]
     assert all(isinstance(one, RobotState) and one.counters["lines"] for one in then[20:])
     assert_same(then, said["state"])
 

@@ -28,7 +28,7 @@ class Drive:
         if batched:
             self.faults.enter_context(made.mcu.ftdi())
         if reports:
-            self.faults.enter_context(made.mcu.unprompted(0.01))
+            self.faults.enter_context(made.mcu.free_running(0.01))
         made.run(1.5)
         made.drive(0.0, 0.0, 0.2)
 

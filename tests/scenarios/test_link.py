@@ -229,7 +229,7 @@ def test_noise_costs_at_most_the_line_it_hits(world: World) -> None:
 
 def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.1)))
-    with world.mcu.unprompted(0.1):
+    with world.mcu.free_running(0.1):
         world.run(1.0)
         assert world.state.link == "up"
         world.drive(0.5, seconds=4.0)
@@ -275,7 +275,7 @@ def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> 
 def test_after_a_long_block_the_robot_starts_over_from_rest(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.port.blocked = True
-    with world.mcu.unprompted(0.05):
+    with world.mcu.free_running(0.05):
         world.hold(0.5, seconds=0.5)
         sent = len(world.port.sent)
         world.port.blocked = False
@@ -290,7 +290,7 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
 ) -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.05)))
     world.bus.wanted = set()
-    with world.mcu.unprompted(0.05):
+    with world.mcu.free_running(0.05):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
         world.events.clear()
@@ -315,7 +315,7 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
 
 def test_a_short_blocked_output_only_ramps_up_again() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.05)))
-    with world.mcu.unprompted(0.05):
+    with world.mcu.free_running(0.05):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
         world.port.blocked = True
@@ -329,7 +329,7 @@ def test_a_short_blocked_output_only_ramps_up_again() -> None:
 def test_an_output_that_is_blocked_from_the_opening_on_is_reported_before_the_link_is_up() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.2)), plugged=False)
     world.port.blocked = True
-    with world.mcu.unprompted(0.2):
+    with world.mcu.free_running(0.2):
         world.port.plug(world.mcu)
         world.run(4.0)
         assert (world.state.mode, world.state.link) == ("waiting", "booting")
@@ -345,7 +345,7 @@ def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_block
     world = World(plugged=False)
     world.run(0.1)
     world.port.blocked = True
-    with world.mcu.unprompted(0.02):
+    with world.mcu.free_running(0.02):
         world.port.plug(world.mcu)
         world.run(0.1)
         world.drive(0.5, seconds=0.1)

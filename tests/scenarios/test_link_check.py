@@ -140,7 +140,7 @@ def test_auto_drives_old_firmware_plainly_and_unharmed(
 @pytest.mark.slow
 def test_auto_drives_a_sketch_that_reports_by_its_own_clock() -> None:
     world = World(config(reply_period=0.1, trailing_comma=True))
-    with world.mcu.comma_latched(), world.mcu.unprompted(0.1):
+    with world.mcu.comma_latched(), world.mcu.free_running(0.1):
         world.run(1.0)
         world.drive(0.5, seconds=3.0)
         assert world.state.mode == "driving"
@@ -646,7 +646,7 @@ def test_no_board_that_measures_is_taken_for_an_echo(
         limits = replace(LimitsConfig(), angular_speed=1.0, **rates)
         world = World(replace(plain, limits=limits))
         world.bus.wanted = set()
-        with world.mcu.unprompted(period) if period else nullcontext():
+        with world.mcu.free_running(period) if period else nullcontext():
             world.mcu.unpadded_replies, world.mcu.ending = False, "\r\n"
             world.run(0.5)
             world.drive(0.3, seconds=0.5)

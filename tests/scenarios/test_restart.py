@@ -182,11 +182,11 @@ def test_no_restart_moves_a_latched_robot(count: int) -> None:
 def test_state_and_diagnostics_say_that_a_stop_would_be_lost() -> None:
     host = Host(random.Random(10))
     host.world.run(1.5)
-    assert host.world.state.latch_file == ""
+    assert host.world.state.latch_file_error == ""
     assert row(host.world, "latch file").level == 0
     host.file.trouble = "a stop cannot be kept over a restart: FILE: No space left on device"
     host.world.run(1.5)
-    assert host.world.state.latch_file == host.file.trouble
+    assert host.world.state.latch_file_error == host.file.trouble
     assert row(host.world, "latch file").level == 1
     assert row(host.world, "latch file").message == host.file.trouble
 
@@ -337,7 +337,7 @@ def test_a_stop_on_the_way_down_is_there_at_the_next_start() -> None:
     host.world.loop.leaving = True
     host.patrols(0.1)
     host.world.put("stop", b"")
-    assert host.world.state.mode == "leaving"
+    assert host.world.state.mode == "shutdown"
     host.restart()
     host.patrols(2 * CYCLE_S)
     assert host.world.state.mode == "stopped"

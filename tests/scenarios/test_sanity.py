@@ -306,7 +306,7 @@ def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost
     assert contradictions(config) == []
     world, dice = World(config), random.Random(3)
     world.bus.wanted = set()
-    with world.mcu.unprompted(0.25), world.mcu.lost_replies(3):
+    with world.mcu.free_running(0.25), world.mcu.lost_replies(3):
         world.run(3.0)
         world.send(0.0)
         world.run(0.1)

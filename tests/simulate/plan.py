@@ -137,7 +137,7 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             extras["board"] = [["comma_latched"], ["trailing_comma"]]
         case 4:
             mcu["reply_period"] = 0.1
-            extras["board"] = [["unprompted", 0.1]]
+            extras["board"] = [["free_running", 0.1]]
     commands = config["commands"]
     commands["neutral_first"] = dice.random() < 0.85
     commands["neutral_pause"] = dice.choice((0.5, 1.0, 2.0))

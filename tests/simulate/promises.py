@@ -20,7 +20,7 @@ from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 ZERO = (0.0, 0.0, 0.0, 0.0)
-MODES = {"leaving", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
+MODES = {"shutdown", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
 
 RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
@@ -387,7 +387,7 @@ class Witness:
                 raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
             up = self._most(f"{name}_acceleration", at_ns)
             down = self._most(f"{name}_deceleration", at_ns)
-            if self.mode in ("stopped", "fault", "leaving"):
+            if self.mode in ("stopped", "fault", "shutdown"):
                 down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
             gained = abs(new) - abs(old) if new * old >= 0 else abs(new)
             if gained > up * seconds + 2 * room:

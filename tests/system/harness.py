@@ -856,7 +856,7 @@ class Periods(NamedTuple):
             last["counters"].get(c, 0) - first["counters"].get(c, 0) for c in counters
         )
         elapsed = 100.0 * (seconds(last["stamp"]) - seconds(first["stamp"]))
-        latest = last["figures"]["period_lateness"]["since_start"]["max"] / 10_000
+        latest = last["latencies"]["period_lateness"]["since_start"]["max"] / 10_000
         return cls(elapsed, sent, superseded, missed, commands, latest)
 
     @property

@@ -53,9 +53,9 @@ FIELDS = {
     "cmd_vel_out": {"header", "twist"},
     "state": {
         "stamp", "mode", "reason", "x", "y", "yaw", "linear", "angular", "wheels", "link",
-        "source", "sources", "refused", "counters", "certificate", "figures", "gyro",
-        "track", "encoders", "doubt", "sender", "recording", "latch", "latch_file",
-        "feedback_age",
+        "source", "sources", "refused", "counters", "certificate_expiry", "latencies",
+        "gyro", "effective_track", "encoder_counts", "wheel_fault", "sender", "recording_error",
+        "latch", "latch_file_error", "feedback_age",
     },
     "diagnostics": {"header", "status"},
     "events": {"stamp", "total", "events"},

@@ -164,7 +164,7 @@ ALIKE = (
     "link",
     "source",
     "sender",
-    "doubt",
+    "wheel_fault",
 )
 
 

@@ -75,7 +75,7 @@ def test_a_day_is_told_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) 
     assert (started["port"], started["rate"]) == (str(peer.path), 100.0)
     assert modes[:2] == ["waiting -> ready", "ready -> driving"]
     assert modes[-2] in ("driving -> stopped", "ready -> stopped")
-    assert modes[-1] == "stopped -> leaving"
+    assert modes[-1] == "stopped -> shutdown"
     assert commander["text"].startswith("nobody -> app (")
     assert refused["text"].startswith("wrong_shape: cmd/app: needs both")
     assert refused["level"] == "warning"

@@ -152,12 +152,12 @@ def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
     full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes per file
     with recording(tmp_path, before=full) as (daemon, bus):
         with bus.commanding(0.3):
-            until(lambda: "File too large" in bus.state()["recording"], 30.0, "it is said")
+            until(lambda: "File too large" in bus.state()["recording_error"], 30.0, "it is said")
             assert bus.state()["mode"] == "driving"
             row = next(r for r in bus.get("diagnostics")["status"] if "recording" in r["name"])
             assert row["level"] == 1
         assert any(e["level"] == "warning" for e in daemon.events("recording"))
-        until(lambda: bus.state()["recording"] == "", 30.0, "it is tried again")
+        until(lambda: bus.state()["recording_error"] == "", 30.0, "it is tried again")
     for path in files(tmp_path):
         assert replayed(tmp_path, path) > 0
 
@@ -167,7 +167,7 @@ def test_a_directory_that_cannot_be_made_is_said_and_the_robot_runs(tmp_path: Pa
         Daemon(tmp_path, words=["--record", "/proc/nowhere"]) as daemon,
         Bus(daemon.endpoint) as bus,
     ):
-        until(lambda: "/proc/nowhere" in bus.state()["recording"], 10.0, "it is said")
+        until(lambda: "/proc/nowhere" in bus.state()["recording_error"], 10.0, "it is said")
         bus.linked()
         with bus.commanding(0.3):
             until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")

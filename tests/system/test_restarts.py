@@ -244,7 +244,7 @@ def test_a_state_directory_that_takes_no_file_starts_the_robot_stopped_and_says_
         state = bus.state()
         assert state["mode"] == "stopped"
         assert "a stop cannot be kept over a restart: /sys/acsard/" in state["reason"]
-        assert state["latch_file"].startswith("a stop cannot be kept")
+        assert state["latch_file_error"].startswith("a stop cannot be kept")
         until(lambda: daemon.events("latch_file"), 5.0, "the log says so")
         release(bus, "stop")
         bus.comes_to("ready")

@@ -74,7 +74,7 @@ def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_com
     assert shown.code == 0, shown.err
     state = json.loads(shown.out)
     assert state["mode"] == "ready"
-    assert state["certificate"] == "valid for 730 days", (
+    assert state["certificate_expiry"] == "valid for 730 days", (
         "the daemon may not read it: the gateway tells"
     )
 

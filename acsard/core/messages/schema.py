@@ -203,8 +203,8 @@ class Spread(Message, frozen=True):
     max: float
 
 
-class Figure(Message, frozen=True):
-    """A duration that the daemon measures of itself."""
+class Latency(Message, frozen=True):
+    """A duration that the daemon measures of itself, such as from a command to its line."""
 
     since_start: Spread
     last_minute: Spread
@@ -232,27 +232,27 @@ class RobotState(Message, frozen=True):
     refused: str
     """The last refused command and the reason; empty if no command was refused."""
     counters: dict[str, int]
-    certificate: str = ""
+    certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
-    figures: dict[str, Figure] = {}
+    latencies: dict[str, Latency] = {}
     """Durations of the control loop by the names in `daemon/latencies.py`, up to a second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """Use of the gyro in odometry, a value of `values.GyroDoes`."""
-    encoders: list[int] = []
+    encoder_counts: list[int] = []
     """Counts per wheel turn, inferred from the speeds, in the order of `wheels`; 0 if unknown."""
-    doubt: str = ""
+    wheel_fault: str = ""
     """The wheel that is left out of the pose, or the side that slips, in words; else empty."""
     sender: str = ""
     """Public name of the followed sender of `source`."""
-    track: str = ""
+    effective_track: str = ""
     """Effective track divided by the wheel separation, as learned from the gyro and as
     configured, and which of them is in use, in words; empty until one is learned.
     """
-    recording: str = ""
+    recording_error: str = ""
     """Why nothing is recorded at present although recording is on, in words; else empty."""
     latch: LatchNumber = 0
     """Number of the fault, else of the stop, else of "inactive"; 0 while none is latched."""
-    latch_file: str = ""
+    latch_file_error: str = ""
     """Why a stop would not survive a restart, in words; empty if it would, and in the simulator."""
     feedback_age: float | None = None
     """Seconds since the last good line of the microcontroller; null before the first one."""
@@ -297,7 +297,7 @@ class DiagnosticArray(Message, frozen=True):
     status: list[DiagnosticStatus]
 
 
-class Happening(Message, frozen=True):
+class LogEvent(Message, frozen=True):
     """An event as in the log."""
 
     stamp: Time
@@ -325,7 +325,7 @@ class Events(Message, frozen=True):
     the end. Of the last N rows, where N is the growth of `total`, those that a reader does not
     have yet are new.
     """
-    events: list[Happening]
+    events: list[LogEvent]
 
 
 class ServiceReply(Message, frozen=True):

@@ -121,8 +121,8 @@ def test_the_check_is_used_where_it_is_known(
         ((), {}, "PASS", False),
         (("sparse_replies",), {}, "FAIL", False),
         (("sparse_replies",), {"reply_period": 0.1}, "WARN", False),
-        (("unprompted",), {}, "FAIL", True),
-        (("unprompted",), {"reply_period": 0.1}, "PASS", True),
+        (("free_running",), {}, "FAIL", True),
+        (("free_running",), {"reply_period": 0.1}, "PASS", True),
     ],
 )
 def test_the_pace_is_judged_by_what_the_host_waits_for(

@@ -309,7 +309,7 @@ def test_from_rest_nothing_moves_without_a_command(guard: Guarded) -> None:
 
 
 @pytest.mark.parametrize(
-    "mode", ["inactive", "waiting", "ready", "stopped", "fault", "leaving", "", "Driving"]
+    "mode", ["inactive", "waiting", "ready", "stopped", "fault", "shutdown", "", "Driving"]
 )
 def test_a_wheel_grows_only_in_mode_driving(guard: Guarded, mode: str) -> None:
     assert objection(guard, outputs(line(1.0), mode=mode)) == GROWS
@@ -447,7 +447,7 @@ def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is
     ("mode", "ramp_ms"),
     [
         ("ready", 2000), ("waiting", 2000), ("inactive", 2000),
-        ("stopped", 500), ("fault", 500), ("leaving", 500),
+        ("stopped", 500), ("fault", 500), ("shutdown", 500),
     ],
 )  # fmt: skip
 def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(

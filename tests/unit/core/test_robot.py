@@ -921,14 +921,14 @@ def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> Non
     path = [bench.step(GO).applied.linear for _ in range(20)]
     assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
     assert path[17:] == [0.0, 0.0, 0.0]
-    assert (bench.mode(), bench.out.reason) == ("leaving", "the daemon is going down")
+    assert (bench.mode(), bench.out.reason) == ("shutdown", "the daemon is going down")
 
 
 def test_leaving_is_one_event() -> None:
     bench = Bench().driving()
     bench.leaving = True
     (event,) = bench.step().events
-    assert event == Event("mode", "driving -> leaving: the daemon is going down")
+    assert event == Event("mode", "driving -> shutdown: the daemon is going down")
     assert names(bench.step()) == []
 
 
@@ -944,7 +944,7 @@ def test_a_leaving_robot_never_drives_again() -> None:
     bench.leaving = True
     for _ in range(100):
         bench.step(GO)
-    assert (bench.mode(), bench.out.applied) == ("leaving", REST)
+    assert (bench.mode(), bench.out.applied) == ("shutdown", REST)
 
 
 # lines that did not leave
@@ -1117,7 +1117,7 @@ def test_a_stop_on_the_way_down_is_latched_for_the_next_start() -> None:
     bench = Bench().linked()
     bench.leaving = True
     assert bench.answer("stop") == Answer(7, True, "stopped and latched; the daemon is going down")
-    assert bench.out.mode == "leaving"
+    assert bench.out.mode == "shutdown"
     assert bench.out.latches.stop is not None
 
 

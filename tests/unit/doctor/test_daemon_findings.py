@@ -177,7 +177,7 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
 
 
 def test_a_wheel_that_is_left_out_is_told() -> None:
-    *_, finding = found({}, {}, doubt="rear left: its encoder stands")
+    *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Events, Happening, Time
+from acsard.core.messages.schema import Events, LogEvent, Time
 from acsard.foxglove.relay import News
 
 KEPT = 20
@@ -14,7 +14,7 @@ KEPT = 20
 def events(total: int, of: str = "first") -> Events:
     """Return the daemon's events after this many of them."""
     kept = range(max(0, total - KEPT), total)
-    told = [Happening(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
+    told = [LogEvent(Time(n), f"mode{n}", "warning", f"{of} {n}", "ann", 1) for n in kept]
     return Events(Time(total), total, told)
 
 
@@ -55,7 +55,7 @@ def test_an_answer_that_is_older_than_what_came_by_itself_tells_nothing() -> Non
 
 def test_one_that_goes_on_brings_nothing_old_back() -> None:
     news, fault = News(), events(1).events[0]
-    missed = Happening(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
+    missed = LogEvent(Time(5), "periods_missed", "warning", "3 more periods", "", 1)
     news.of(Events(Time(5), 2, [fault, missed]))
     later = replace(missed, stamp=Time(8), text="9 more periods")
     assert names(news, Events(Time(8), 4, [fault, later])) == ["periods_missed"]

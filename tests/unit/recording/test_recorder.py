@@ -153,7 +153,7 @@ def test_a_disk_that_takes_nothing_is_said_tried_again_and_costs_only_records(
     bench.drive(2.0)
     assert "record: File exists" in bench.recorder.status.trouble
     assert bench.recorder.status.missing > 100
-    assert bench.world.state.recording == bench.recorder.status.trouble
+    assert bench.world.state.recording_error == bench.recorder.status.trouble
     where.unlink()
     bench.drive(10.0)
     assert bench.recorder.status.trouble == ""

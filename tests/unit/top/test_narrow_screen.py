@@ -18,9 +18,9 @@ FULL = of(
     mode="waiting",
     reason=REASON,
     refused="source nav: NaN or infinity in its twist",
-    certificate="valid for 12 days",
+    certificate_expiry="valid for 12 days",
     gyro="used",
-    track="learned 1.603 ± 0.032 in use, configured 1.000",
+    effective_track="learned 1.603 ± 0.032 in use, configured 1.000",
     counters=STATE.counters
     | {"lines_superseded": 12_345, "bus_overrun": 7, "line_malformed": 30, "command_stale": 4},
 )

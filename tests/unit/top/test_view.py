@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rich.cells import cell_len
 
-from acsard.core.messages.schema import Figure, RobotState, SourceState, Spread, Time
+from acsard.core.messages.schema import Latency, RobotState, SourceState, Spread, Time
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
 from acsard.top.screen_data import MODES, ScreenData
@@ -133,8 +133,8 @@ def test_a_hostile_text_changes_nothing_but_its_own_place() -> None:
         ENOUGH,
         replace(
             STATE, mode=ENOUGH, reason=ENOUGH, link=ENOUGH, source=ENOUGH, refused=ENOUGH,
-            certificate=ENOUGH, sources=[source], counters={f"line_{ENOUGH}": 1},
-            figures={ENOUGH: MEASURED},
+            certificate_expiry=ENOUGH, sources=[source], counters={f"line_{ENOUGH}": 1},
+            latencies={ENOUGH: MEASURED},
         ),
         info=replace(INFO, port=ENOUGH, version=ENOUGH),
     )  # fmt: skip
@@ -170,8 +170,8 @@ states = st.builds(
         integer,
         max_size=9,
     ),
-    certificate=anything,
-    figures=st.dictionaries(st.sampled_from(NAMES), st.builds(Figure, spread, spread)),
+    certificate_expiry=anything,
+    latencies=st.dictionaries(st.sampled_from(NAMES), st.builds(Latency, spread, spread)),
 )  # fmt: skip
 
 

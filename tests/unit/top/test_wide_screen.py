@@ -7,7 +7,7 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Figure, SourceState, Time
+from acsard.core.messages.schema import Latency, SourceState, Time
 from acsard.daemon.latencies import NAMES
 from acsard.top.wide_screen import FIGURES
 from tests.unit.top.screens import (
@@ -111,7 +111,7 @@ def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
 
 def test_the_track_that_was_learned_stands_beside_the_configured_one() -> None:
     told = "learned 1.603 ± 0.032 (only shown), configured 1.000 in use"
-    assert line_with("track", of(gyro="used", track=told)).split(maxsplit=1)[1] == told
+    assert line_with("track", of(gyro="used", effective_track=told)).split(maxsplit=1)[1] == told
     assert not any("track" in line for line in lines_of(of(gyro="used")))
 
 
@@ -134,9 +134,9 @@ def test_the_link_is_told_with_its_port() -> None:
 def test_the_certificate_is_told_when_there_is_one() -> None:
     assert "certificate" not in "".join(lines_of(SEEN))
     assert "certificate valid for 700 days" in line_with(
-        "link ", of(certificate="valid for 700 days")
+        "link ", of(certificate_expiry="valid for 700 days")
     )
-    ended = of(certificate="ended 3 days ago: nobody can join any more")
+    ended = of(certificate_expiry="ended 3 days ago: nobody can join any more")
     assert "certificate ended 3 days ago" in line_with("link ", ended)
 
 
@@ -149,6 +149,6 @@ def test_each_figure_is_told_for_the_last_minute_and_since_the_start() -> None:
 
 
 @pytest.mark.parametrize("figures", [{}, dict.fromkeys(NAMES, UNMEASURED)])
-def test_a_figure_without_a_measurement_is_a_dash(figures: dict[str, Figure]) -> None:
+def test_a_figure_without_a_measurement_is_a_dash(figures: dict[str, Latency]) -> None:
     for name in NAMES:
-        assert line_with(name, of(figures=figures)).split()[-6:] == ["-"] * 6
+        assert line_with(name, of(latencies=figures)).split()[-6:] == ["-"] * 6

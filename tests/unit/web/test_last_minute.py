@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Figure, RobotState, Spread, Time, Twist, Vector3
+from acsard.core.messages.schema import Latency, RobotState, Spread, Time, Twist, Vector3
 from acsard.core.values import NS_PER_S
 from acsard.web.last_minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
 
@@ -15,7 +15,7 @@ SPREAD = Spread(10, 5.0, 20.0, 80.0)
 STATE = RobotState(
     Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
     [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {},
-    figures={"period_lateness": Figure(SPREAD, SPREAD)},
+    latencies={"period_lateness": Latency(SPREAD, SPREAD)},
 )  # fmt: skip
 
 WISHED = Twist(Vector3(0.3, 0.0, 0.0), Vector3(0.0, 0.0, -0.6))
@@ -65,7 +65,7 @@ def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns
 
 def test_what_nobody_heard_or_measured_is_none() -> None:
     minute = Minute()
-    unknown = replace(STATE, linear=None, angular=None, wheels=[], figures={})
+    unknown = replace(STATE, linear=None, angular=None, wheels=[], latencies={})
     minute.add(0, unknown, None)
     told = minute.plotted(1)
     assert told.age == [0]

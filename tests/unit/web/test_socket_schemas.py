@@ -23,7 +23,8 @@ from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 GREETING = socket_messages.Greeting(
-    "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0
+    "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0,
+    {"set": "for maintainers; you are operator"},
 )  # fmt: skip
 
 SAID: tuple[Struct, ...] = (

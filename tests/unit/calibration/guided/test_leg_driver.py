@@ -92,7 +92,7 @@ STOPS: dict[str, Late] = {
     "the robot is fault": changed(mode="fault"),
     "the robot is waiting": changed(mode="waiting"),
     "the robot is inactive": changed(mode="inactive"),
-    "the robot is leaving": changed(mode="leaving"),
+    "the robot is shutdown": changed(mode="shutdown"),
     "teleop commands the robot now": changed(source="teleop"),
     "send a zero first": changed(
         mode="ready", source="", sources=[SourceState("app", 50, 0.01, "send a zero first")]

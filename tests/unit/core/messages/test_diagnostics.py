@@ -45,7 +45,7 @@ def test_every_status_names_the_robot_it_is_of() -> None:
     assert len({one.name for one in found}) == len(found)
 
 
-@pytest.mark.parametrize("mode", ["inactive", "waiting", "stopped", "fault", "leaving"])
+@pytest.mark.parametrize("mode", ["inactive", "waiting", "stopped", "fault", "shutdown"])
 @pytest.mark.parametrize("link", ["up", "stale", "booting", "down"])
 def test_no_row_comes_or_goes_while_the_robot_lives(mode: str, link: str) -> None:
     outputs = replace(OUTPUTS, mode=mode, link=link, source="", reason="words")
@@ -85,7 +85,7 @@ def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() ->
         ("ready", OK),
         ("waiting", OK),
         ("inactive", OK),
-        ("leaving", OK),
+        ("shutdown", OK),
         ("stopped", WARN),
         ("fault", ERROR),
     ],

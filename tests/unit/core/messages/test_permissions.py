@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 
 from acsard.core.messages.permissions import (
-    COMMAND_ROLE,
-    SERVICE_ROLES,
     USES,
     has,
     keys_for,
@@ -17,8 +12,6 @@ from acsard.core.messages.permissions import (
 )
 from acsard.core.messages.topics import FOLLOWED, PUBLISHED, TOPICS
 from acsard.core.values import ROLES, Role
-
-WEB_PAGE = Path(__file__).parents[4] / "acsard" / "web" / "page"
 
 
 @pytest.mark.parametrize("role", ["", *ROLES])
@@ -69,18 +62,3 @@ def test_a_published_key_is_granted_with_its_twin_in_json() -> None:
 )
 def test_the_least_role_of_a_key(key: str, role: Role) -> None:
     assert least_role(key) == role
-
-
-def test_the_page_s_controls_name_the_role_that_the_table_has() -> None:
-    html = (WEB_PAGE / "index.html").read_text()
-    named = dict(re.findall(r'<\w+ id="(\w+)"[^>]* data-least="(\w+)"', html))
-    verbs = {"clear": "clear", "activate": "activate", "deactivate": "deactivate"}
-    verbs["reset"] = "reset_odometry"
-    expected = {name: SERVICE_ROLES[verb] for name, verb in verbs.items()}  # type: ignore[index]
-    assert named == expected | dict.fromkeys(("stick", "limit"), COMMAND_ROLE)
-
-
-def test_the_page_orders_the_roles_as_the_daemon_does() -> None:
-    script = (WEB_PAGE / "roles.js").read_text()
-    (listed,) = re.findall(r"const ROLES = \[(.*)\];", script)
-    assert re.findall(r'"(\w+)"', listed) == list(ROLES)

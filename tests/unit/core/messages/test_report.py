@@ -28,9 +28,9 @@ from acsard.core.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
     Events,
-    Figure,
-    Happening,
     JointState,
+    Latency,
+    LogEvent,
     Message,
     Odometry,
     Quaternion,
@@ -349,8 +349,8 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
         sources=[SourceState("app", 50, 0.01, ""), SourceState("nav", 10, None, "a command")],
         refused="source nav: held up",
         counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
-        figures={
-            "period_lateness": Figure(
+        latencies={
+            "period_lateness": Latency(
                 Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0)
             )
         },
@@ -371,7 +371,7 @@ def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> N
     state, array = report.current("state", seen), report.current("diagnostics", seen)
     assert isinstance(state, RobotState)
     assert isinstance(array, DiagnosticArray)
-    assert state.encoders == [20, 0, 0, 400]
+    assert state.encoder_counts == [20, 0, 0, 400]
     (row,) = (one for one in array.status if one.name == "acsard: serial link")
     shown = {key: value for key, value in values(row).items() if key.startswith("counts")}
     assert shown == {"counts_front_right": "20", "counts_rear_right": "400"}
@@ -448,7 +448,7 @@ def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> No
     assert told.events[0].text == "the 6. takes over"
     assert told.events[0].count == 2
     assert told.events[0].stamp == Time.from_ns(OUTPUTS.now.wall_ns)
-    assert told.events[-1] == Happening(told.stamp, "stop", "info", "stopped", "phone", 1)
+    assert told.events[-1] == LogEvent(told.stamp, "stop", "info", "stopped", "phone", 1)
     assert told.stamp == Time.from_ns(quiet.now.wall_ns)
     assert report.current("events", never) == told
 
@@ -653,12 +653,12 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
         "learned_multiplier_std": "0.090",
     }
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
-    assert state.track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
-    assert row.message == f"{WORDS['used']}; effective track: {state.track}"
+    assert state.effective_track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
+    assert row.message == f"{WORDS['used']}; effective track: {state.effective_track}"
     state, (row,) = with_gyro(replace(learned, track_use="used"))
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
-    assert state.track == "learned 1.800 ± 0.090 in use, configured 1.500"
-    assert with_gyro(GyroStatus("used"))[0].track == ""
+    assert state.effective_track == "learned 1.800 ± 0.090 in use, configured 1.500"
+    assert with_gyro(GyroStatus("used"))[0].effective_track == ""
 
 
 # suspect wheels
@@ -674,7 +674,7 @@ def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
         assert isinstance(state, RobotState)
         assert isinstance(array, DiagnosticArray)
         (row,) = [one for one in array.status if one.name == "acsard: wheels"]
-        assert (state.doubt, row.level) == (said.text, level)
+        assert (state.wheel_fault, row.level) == (said.text, level)
         assert row.message == (said.text or "front and rear agree")
     assert {pair.key: pair.value for pair in row.values} == {
         "left_out": "rear_left",
@@ -704,11 +704,11 @@ def test_a_certificate_that_ends_is_said_in_time(days: int, level: int, words: s
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert state.certificate.startswith(words)
+    assert state.certificate_expiry.startswith(words)
     array = made.current("diagnostics", lambda: SNAPSHOT)
     assert isinstance(array, DiagnosticArray)
     (status,) = [one for one in array.status if one.name == "acsard: certificate"]
-    assert (status.level, status.message) == (level, state.certificate)
+    assert (status.level, status.message) == (level, state.certificate_expiry)
 
 
 def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
@@ -716,7 +716,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert "`acsard doctor`" in state.certificate
+    assert "`acsard doctor`" in state.certificate_expiry
 
 
 def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
@@ -724,4 +724,4 @@ def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert state.certificate == ""
+    assert state.certificate_expiry == ""

@@ -63,7 +63,7 @@ def test_every_message_that_crosses_the_bus_is_found_by_its_name() -> None:
     assert all(cls.__name__ == name for name, cls in MESSAGES.items())
     parts = {"Time", "Header", "Vector3", "Quaternion", "Pose", "PoseWithCovariance"}
     parts |= {"TwistWithCovariance", "Transform", "TransformStamped", "SourceState", "KeyValue"}
-    parts |= {"DiagnosticStatus", "HardwareInterface", "TopicInfo", "Spread", "Figure", "Happening"}
+    parts |= {"DiagnosticStatus", "HardwareInterface", "TopicInfo", "Spread", "Latency", "LogEvent"}
     assert set(MESSAGES) == {cls.__name__ for cls in STRUCTS} - parts
 
 

@@ -537,7 +537,7 @@ def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start()
     life.leave()
     assert stop(life, 1.0) == "stopped and latched; the daemon is going down"
     assert life.fault("a wheel is dead", at(2.0))
-    assert mode(life) is Mode.LEAVING
+    assert mode(life) is Mode.SHUTDOWN
     assert life.latches.stop is not None
     assert life.latches.fault is not None
     with pytest.raises(RefusedError, match="going down"):

@@ -334,7 +334,7 @@ def test_without_watchdog_the_motors_run_on() -> None:
 def test_a_watchdog_that_anything_feeds_runs_on_with_broken_lines_and_not_in_silence() -> None:
     for fed in (False, True):
         mcu = FakeMcu(TRUE)
-        with mcu.fed_by_anything() if fed else nullcontext():
+        with mcu.watchdog_fed_by_bad_lines() if fed else nullcontext():
             mcu.receive(0, LINE)
             for n in range(1, 10):
                 mcu.receive(n * 100 * MS, LINE[:12] + b"\r\n")
@@ -580,7 +580,7 @@ def test_a_comma_latched_mcu_takes_the_wheels_of_a_damaged_line_one_by_one() -> 
 
 def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         found = drive(mcu, 0, 40, b"ap02.50,bn08.75,cp15.00,dp00.00\r\n")
     expected = b"ap2.50,bn8.75,cp15.00,dp0.00,\r\n"
     assert len(found) == 3
@@ -592,7 +592,7 @@ def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() 
 
 def test_an_unprompted_mcu_reports_also_when_nothing_is_said_to_it() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.05):
+    with mcu.free_running(0.05):
         found = replies(mcu, 1000 * MS)
     assert len(found) == 19
 
@@ -617,7 +617,7 @@ def test_after_the_block_without_watchdog_a_silent_host_is_noticed_again() -> No
 
 def test_an_unprompted_mcu_reports_again_after_its_reset() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         mcu.reset(0)
         mcu.advance(RESET_NS)
         assert b"ap0.00" in mcu.advance(RESET_NS + 1000 * MS)
@@ -625,16 +625,16 @@ def test_an_unprompted_mcu_reports_again_after_its_reset() -> None:
 
 def test_entering_unprompted_twice_does_not_double_its_rate() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         mcu.advance(50 * MS)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         out = mcu.advance(1050 * MS)
     assert out.count(b"\n") <= 10
 
 
 def test_an_unprompted_mcu_says_nothing_while_it_boots() -> None:
     mcu = FakeMcu(replace(TRUE, sim=SimConfig(boot_time=1.0)))
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         assert mcu.advance(900 * MS) == b""
 
 
