@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Protocol
 
 from msgspec import Struct
 
@@ -87,16 +86,6 @@ class Turn(Struct, frozen=True, gc=False):
     """The angle that the wheels would report for this turn, including their skid, rad."""
     slips: bool = False
     """Whether the wheels slip: lately they reported another turn than the gyro."""
-
-
-class Heading(Protocol):
-    """A source of the robot's turn besides its wheels: a `Gyro`."""
-
-    owes: bool
-
-    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None: ...
-
-    def taken_back(self, turn: float) -> float: ...
 
 
 class Gyro:

@@ -21,26 +21,24 @@ from itertools import takewhile
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
+from acsard.core.motion.consistency import ConsistencyChecks
 from acsard.core.motion.gap_filling import NOWHERE, Rolled, Rolling, Step, count_of, plus
 from acsard.core.motion.gap_variance import Gaps
-from acsard.core.motion.gyro import Heading, Turn
+from acsard.core.motion.gyro import Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import Track
 from acsard.core.motion.noise import columns, in_use
 from acsard.core.motion.path import Path
 from acsard.core.motion.twist_uncertainty import TwistUncertainty
 from acsard.core.motion.uncertainty import COARSE_COUNTS, PoseUncertainty
-from acsard.core.motion.wheel_faults.verdict import Witness
 from acsard.core.values import (
     REST,
     STILL,
     Estimate,
-    Event,
     Pose,
     Twist,
     TwistVariances,
     WheelSpeeds,
-    WheelsStatus,
 )
 
 REST_S = 0.2
@@ -85,7 +83,7 @@ class Odometry:
         self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
         self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
         self._gaps = Gaps()
-        self._witness = Witness(kinematics, encoder_counts, response_time)
+        self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, response_time)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
         """The last lines, for recomputation."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
@@ -124,6 +122,7 @@ class Odometry:
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)
+        self.checks.forgive()
 
     @property
     def pose(self) -> Pose:
@@ -135,16 +134,6 @@ class Odometry:
         ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
 
-    @property
-    def doubt(self) -> WheelsStatus:
-        """The wheels that the pose ignores, and those that slip."""
-        return self._witness.status
-
-    @property
-    def events(self) -> list[Event]:
-        """Events of the last line about wheel faults."""
-        return self._witness.events
-
     def skip(self, feedback: Feedback) -> None:
         """Pass over an impossible line and leave its motion to the next one.
 
@@ -153,49 +142,39 @@ class Odometry:
         """
         self._rolling.skip(feedback)
 
-    def fold(
-        self, feedback: Feedback, gyro: Heading | None = None, told: WheelSpeeds | None = None
-    ) -> Estimate:
+    def fold(self, feedback: Feedback, told: WheelSpeeds | None = None) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances. At rest nothing does: a count back
-        and forth waits until its direction is clear. If `gyro` provides the turn since the line
+        and forth waits until its direction is clear. If a gyro provides the turn since the line
         before, the wheels provide only the distance. `told` is the commanded wheel speeds, by which
         a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
         recomputed.
         """
-        speeds, dt, before = feedback.speeds, feedback.dt, self.twist
-        said, witness = speeds.as_tuple(), self._witness
+        speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
         steps = feedback.steps
         if steps is not self._steps_of or (feedback.counted and steps is not self._steps_seen):
             self._see(feedback)
-        turn, by_wheels = None, 0.0
-        if gyro is not None:
-            by_wheels = self._wheels_turn(rolled)
-            still = witness.believed(said) == NOWHERE
-            turn = gyro.turn(feedback.at.mono_ns, rolled.known, by_wheels, still)
-        by_gyro = None if turn is None else turn.wheels
-        if witness.hear(rolled.seen, speeds, rolled.seconds, told, by_gyro):
-            self._take_back(gyro)
-        slips = witness.slips or (turn is not None and turn.slips)
-        believed = witness.believed(said)
+        if checks.look(feedback, rolled, told):
+            self._take_back()
+        turn, slips = checks.turn, checks.slips
+        believed = checks.wheels.believed(speeds.as_tuple())
         linear, angular = self._kinematics.moved(believed)
         twist = Twist(linear, angular / self._share)
         self._still = self._still + dt if believed == NOWHERE else 0.0
         at_rest = self._still > REST_S
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
-        pieces = self._settled(rolled, at_rest)
-        on_trial = gyro is not None and gyro.owes
-        turned = self._move(pieces, turn, speeds, on_trial, slips)
-        if gyro is not None and on_trial and turned != by_wheels:
-            gyro.taken_back(turned - by_wheels)
+        turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
         self._go_on(rolled.bridged, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
         self.twist, self.speeds = twist, speeds
+        track = checks.learn(turned)
+        if track is not None:
+            self.turn_by(track)
         return Estimate(
             feedback.at,
             self._path.pose,
@@ -222,13 +201,6 @@ class Odometry:
             self._steps_seen = line.steps
         self._uncertainty.show_count(count_of(line))
 
-    def _wheels_turn(self, rolled: Rolled) -> float:
-        """Return the turn since the last believed line by the wheels, rad."""
-        turned = rolled.turned
-        for piece in rolled.pieces:
-            turned = plus(turned, piece)
-        return self._kinematics.moved(self._witness.believed(turned))[1]
-
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
         """Return the wheel angles to advance by.
 
@@ -246,12 +218,13 @@ class Odometry:
         self._held = NOWHERE
         return (turned, *rolled.pieces)
 
-    def _take_back(self, gyro: Heading | None) -> None:
+    def _take_back(self) -> None:
         """Recompute the last lines in which a wheel, now found faulty, was wrong.
 
         The pose jumps by the error, except for the part that a gyro has corrected or will correct.
         """
-        lies = list(takewhile(lambda step: self._witness.lied(step.speeds), reversed(self._steps)))
+        lied = self.checks.wheels.lied
+        lies = list(takewhile(lambda step: lied(step.speeds), reversed(self._steps)))
         if not lies:
             return
         self._path.set(lies[-1].pose)
@@ -263,8 +236,8 @@ class Odometry:
             if step.on_trial:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
-        if gyro is not None and on_trial:
-            self._path.turn(-gyro.taken_back(on_trial))
+        if on_trial:
+            self._path.turn(-self.checks.taken_back(on_trial))
 
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
@@ -274,7 +247,7 @@ class Odometry:
         A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
         one.
         """
-        believed, kinematics = self._witness.believed, self._kinematics
+        believed, kinematics = self.checks.wheels.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]
         if gyro is not None:
             return [(math.fsum([distance for distance, _ in moved]), gyro.angle)]
@@ -285,7 +258,6 @@ class Odometry:
         pieces: tuple[Motors, ...],
         turn: Turn | None,
         speeds: WheelSpeeds,
-        on_trial: bool,
         slips: bool,
     ) -> float:
         """Advance by wheel angles in rad, one arc for each piece; return the turn, rad."""
@@ -298,6 +270,7 @@ class Odometry:
             self.travelled += abs(distance)
             dx, dy, heading = path.advance(distance, angle)
             self._uncertainty.advance(distance, angle, dx, dy, heading, variance, slips)
+        on_trial = self.checks.on_trial
         self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._share))
         return turned
 

@@ -1,11 +1,11 @@
 """Decides which wheel is faulty and which side slips: the wheels of a side check each other.
 
-If they contradict each other (`residual.py`), and one of them shows the sign of a faulty encoder
-and an independent reference contradicts it (`suspect.py`), the pose ignores that wheel and the
-other one stands in. It counts again when both have agreed for a while. Every other contradiction is
-slip, and so is a fault until it is proven. A side always keeps one wheel. A wheel that is blocked
-or dragged looks like one with a dead encoder and is ignored too, because the other wheel shows the
-way driven.
+If they contradict each other (`wheel_residual.py`), and one of them shows the sign of a faulty
+encoder and an independent reference contradicts it (`suspect_wheel.py`), the pose ignores that
+wheel and the other one stands in. It counts again when both have agreed for a while. Every other
+contradiction is slip, and so is a fault until it is proven. A side always keeps one wheel. A wheel
+that is blocked or dragged looks like one with a dead encoder and is ignored too, because the other
+wheel shows the way driven.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import math
 
 from acsard.core.link.codec import Motors
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.wheel_faults.residual import MEMORY_S, Residual
-from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Stuck, Suspect, has_lied
+from acsard.core.motion.suspect_wheel import WORDS, Known, Lie, Stuck, Suspect, has_lied
+from acsard.core.motion.wheel_residual import MEMORY_S, Residual
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
@@ -157,7 +157,7 @@ class _Side:
         self.event = Event("wheels_doubted", self.text, "warning", kind="left out")
 
 
-class Witness:
+class WheelFaults:
     """The checks of all wheels: the wheels to ignore, and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, response_time: float) -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Stuck, Suspect, has_lied
+from acsard.core.motion.suspect_wheel import WORDS, Known, Lie, Stuck, Suspect, has_lied
 
 DT = 0.01
 FINE = math.tau / 3200

@@ -12,7 +12,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.sanity import Sanity
-from acsard.core.motion.wheel_faults.verdict import Witness
+from acsard.core.motion.wheel_faults import WheelFaults
 from acsard.core.values import STILL, WHEELS, WheelSpeeds
 from tests.unit.core.motion.liars import (
     AT,
@@ -43,7 +43,7 @@ class Bench:
 
     def __init__(self, counts: int = 3200) -> None:
         kinematics = Kinematics(DriveConfig())
-        self.witness = Witness(kinematics, counts, FeedbackConfig().response_time)
+        self.witness = WheelFaults(kinematics, counts, FeedbackConfig().response_time)
         self.events: list[str] = []
 
     def run(
@@ -122,7 +122,7 @@ def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
 def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
     robot, plain = odometry(3200), Plain()
     for told in [TEN] * 200 + [only(0, 0.0)] * 50:
-        robot.fold(Feedback(AT, told, PERIOD), None, TEN)
+        robot.fold(Feedback(AT, told, PERIOD), TEN)
         plain.fold(Feedback(AT, told, PERIOD))
     assert abs(plain.pose.yaw) > 0.3
     assert abs(robot.pose.yaw) < 1e-3
@@ -132,7 +132,7 @@ def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
 def test_the_wheels_angles_are_what_the_encoders_said() -> None:
     robot = odometry()
     for says in [TEN] * 100 + [only(0, 0.0)] * 100:
-        estimate = robot.fold(Feedback(AT, says, PERIOD), None, TEN)
+        estimate = robot.fold(Feedback(AT, says, PERIOD), TEN)
     assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
     assert estimate.speeds == only(0, 0.0)
 
@@ -140,12 +140,12 @@ def test_the_wheels_angles_are_what_the_encoders_said() -> None:
 def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
     robot = odometry(3200)
     for says in [TEN] * 100 + [only(0, 0.0)] * 2:
-        robot.fold(Feedback(AT, says, PERIOD), None, TEN)
+        robot.fold(Feedback(AT, says, PERIOD), TEN)
     robot.set_pose(robot.pose)
     before = robot.pose
-    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), None, TEN)
-    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), None, TEN)
-    assert robot.doubt.left_out == ("front_right",)
+    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    assert robot.checks.wheels.status.left_out == ("front_right",)
     assert apart(before, robot.pose)[0] == pytest.approx(0.01, abs=1e-3)
 
 
@@ -196,12 +196,12 @@ def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> No
 def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
     calm, slipping = odometry(3200), odometry(3200)
     for says in [TEN] * 200:
-        sure = calm.fold(Feedback(AT, says, PERIOD), None, TEN)
-        slipping.fold(Feedback(AT, says, PERIOD), None, TEN)
+        sure = calm.fold(Feedback(AT, says, PERIOD), TEN)
+        slipping.fold(Feedback(AT, says, PERIOD), TEN)
     begun = sure.covariance.yawyaw
     for _ in range(100):
-        sure = calm.fold(Feedback(AT, TEN, PERIOD), None, TEN)
-        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), None, TEN)
+        sure = calm.fold(Feedback(AT, TEN, PERIOD), TEN)
+        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), TEN)
     assert unsure.twist_variances.linear > 90 * sure.twist_variances.linear
     assert unsure.twist_variances.lateral == pytest.approx(100 * sure.twist_variances.lateral)
     assert unsure.twist_variances.angular > 90 * sure.twist_variances.angular
@@ -210,10 +210,12 @@ def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
 
 def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
     calm, slipping = odometry(3200), odometry(3200)
+    calm.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False))
+    slipping.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True))
     for _ in range(100):
         line = Feedback(AT, TEN, PERIOD)
-        sure = calm.fold(line, Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False)))
-        unsure = slipping.fold(line, Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True)))
+        sure = calm.fold(line)
+        unsure = slipping.fold(line)
     ratio = unsure.twist_variances.linear / sure.twist_variances.linear
     assert ratio == pytest.approx(100.0)
     assert unsure.covariance.xx > 90 * sure.covariance.xx
@@ -252,12 +254,12 @@ class Fall:
                 continue
             fault = sanity.watch(wishing[i], line.speeds, PERIOD)
             plain.fold(line)
-            robot.fold(line, None, wishing[i])
+            robot.fold(line, wishing[i])
             if off is None and i >= begun and abs(lying[i, wheel] - true[i, wheel]) > 2.0:
                 off = i
-            if out is None and robot.doubt.left_out:
+            if out is None and robot.checks.wheels.status.left_out:
                 out = i
-                self.wrong += robot.doubt.left_out != (WHEELS[wheel],) or i < begun
+                self.wrong += robot.checks.wheels.status.left_out != (WHEELS[wheel],) or i < begun
             if fault:
                 break
         self.plain, self.mine = apart(healthy.pose, plain.pose), apart(healthy.pose, robot.pose)
@@ -332,9 +334,9 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
     lying = LIES[kind](said(angles, counts), wheel, begun)
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(lying, counts), wishes(told), strict=True)):
-        robot.fold(line, None, wish)
-        if robot.doubt.left_out:
-            assert robot.doubt.left_out == (WHEELS[wheel],)
+        robot.fold(line, wish)
+        if robot.checks.wheels.status.left_out:
+            assert robot.checks.wheels.status.left_out == (WHEELS[wheel],)
             assert i >= begun
             return (i - begun + 1) * PERIOD
     return math.inf
@@ -375,10 +377,10 @@ def healthy(
         robot.fold(Feedback(AT, one, PERIOD))
         plain.fold(Feedback(AT, one, PERIOD))
     for line, wish in zip(lines(speeds), wishes(told), strict=True):
-        robot.fold(line, None, wish)
+        robot.fold(line, wish)
         plain.fold(line)
         if line.speeds != STILL:
-            was, slips = slips, bool(robot.doubt.slipping)
+            was, slips = slips, bool(robot.checks.wheels.status.slipping)
             alarms += slips and not was
     return alarms, robot.pose == plain.pose
 
@@ -423,8 +425,8 @@ def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float
     )  # fmt: skip
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(said(angles, counts)), wishes(told), strict=True)):
-        robot.fold(line, None, wish)
-        if i >= begun and robot.doubt.slipping:
+        robot.fold(line, wish)
+        if i >= begun and robot.checks.wheels.status.slipping:
             return (i - begun + 1) * PERIOD
     return math.inf
 
