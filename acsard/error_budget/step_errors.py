@@ -22,8 +22,8 @@ import numpy.typing as npt
 from msgspec import Struct
 from msgspec.structs import replace
 
+from acsard.core.motion.error_model import DECIMAL
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.twist_uncertainty import DECIMAL
 from acsard.core.values import WheelSpeeds
 from acsard.error_budget.drive_log import BLOCK_S, Line, Motion, Stood
 

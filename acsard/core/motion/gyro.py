@@ -36,9 +36,6 @@ SILENT_NS = NS_PER_S // 5
 LATEST_NS = NS_PER_S // 4
 """Delay of a stamp above which the sender's clock was set, ns."""
 
-DRIFT = 0.01
-"""Relative drift between the gyro's clock and ours that is allowed."""
-
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Least and greatest delay of the gyro against the wheels, ns."""
 
@@ -108,7 +105,7 @@ class Gyro:
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples later than the last line."""
-        self._promptest = MinimumDelay(DRIFT)
+        self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
@@ -214,7 +211,7 @@ class Gyro:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
         if late > LATEST_NS:
-            self._promptest = MinimumDelay(DRIFT)
+            self._promptest = MinimumDelay()
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
 

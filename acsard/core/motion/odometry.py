@@ -8,7 +8,7 @@ One step of dt, with left and right the mean wheel speeds of a side (kinematics,
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
 Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. They
-agree as dyaw -> 0. `uncertainty.py` and `twist_uncertainty.py` compute the errors of the pose and
+agree as dyaw -> 0. `uncertainty.py` computes the errors of the pose, and `error_model.py` those
 of the twist.
 """
 
@@ -18,18 +18,19 @@ import math
 from collections import deque
 from itertools import takewhile
 
+from msgspec import Struct
+
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
+from acsard.core.link.quantization_step import on
 from acsard.core.motion.consistency import ConsistencyChecks
-from acsard.core.motion.gap_filling import NOWHERE, Rolled, Rolling, Step, count_of, plus
-from acsard.core.motion.gap_variance import Gaps
-from acsard.core.motion.gyro import Turn
+from acsard.core.motion.error_model import ErrorModel, TwistUncertainty
+from acsard.core.motion.gap_filling import NOWHERE, Gaps, Rolled, Rolling, plus
+from acsard.core.motion.gyro import REST_S, Turn
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import Track
-from acsard.core.motion.noise import columns, in_use
+from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.path import Path
-from acsard.core.motion.twist_uncertainty import TwistUncertainty
 from acsard.core.motion.uncertainty import COARSE_COUNTS, PoseUncertainty
 from acsard.core.values import (
     REST,
@@ -41,11 +42,27 @@ from acsard.core.values import (
     WheelSpeeds,
 )
 
-REST_S = 0.2
-"""Seconds with four wheels at 0.00 after which the robot is at rest."""
-
 TAKEN_BACK = 128
 """Largest number of lines that are recomputed when a wheel proves faulty."""
+
+
+class Step(Struct, frozen=True, gc=False):
+    """The part of the way that one line added."""
+
+    pose: Pose
+    """The pose before the line."""
+    pieces: tuple[Motors, ...]
+    """How far the wheels turned in it, rad."""
+    gyro: Turn | None
+    """The turn by a gyro, None without one."""
+    speeds: WheelSpeeds
+    """The speeds in the line."""
+    turn: float
+    """Change of the heading, rad."""
+    on_trial: bool
+    """Whether a gyro on trial will correct the turn when the gyro is proven."""
+    share: float = 1.0
+    """The track by which the wheels turned the robot, as a share of the configured one."""
 
 
 class Odometry:
@@ -68,9 +85,7 @@ class Odometry:
             response_time: Response time of a slow wheel, s.
             quiet: Duration of silence after which the daemon commands rest, s.
         """
-        self._kinematics, self._declared = kinematics, odometry
-        self._track, self._share = in_use(odometry), 1.0
-        """The track in use, None if none is learned; and its share of the configured one."""
+        self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
@@ -80,8 +95,9 @@ class Odometry:
         self._steps_of, self._coarsest = NOWHERE, 0.0
         """Quantization steps of the last line, and the largest known one of them, rad/s."""
         self._path = Path()
-        self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
-        self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
+        self._errors = ErrorModel(odometry, kinematics)
+        self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
+        self._twist_uncertainty = TwistUncertainty(self._errors, encoder_counts)
         self._gaps = Gaps()
         self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, response_time)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
@@ -101,18 +117,16 @@ class Odometry:
         """Distance since the start, forwards and backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use these variances from now on."""
-        self._uncertainty.use(odometry)
-        self._twist_uncertainty.use(odometry)
+        """Use these variances from now on, and those of the start at the next `set_pose`."""
+        self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
         """Use this effective track from now on for the turns that the wheels provide."""
         if track != self._track:
-            self._track, self._share = track, track.share
-            parameters = columns(self._declared, self._kinematics, track)
-            apart = self._kinematics.track * track.share
-            self._uncertainty.bent_by(parameters, apart)
-            self._twist_uncertainty.bent_by(parameters, apart)
+            self._track = track
+            self._errors.turn_by(track)
+            self._uncertainty.bend()
+            self._twist_uncertainty.bend()
 
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, as certain as at the start.
@@ -161,7 +175,7 @@ class Odometry:
         turn, slips = checks.turn, checks.slips
         believed = checks.wheels.believed(speeds.as_tuple())
         linear, angular = self._kinematics.moved(believed)
-        twist = Twist(linear, angular / self._share)
+        twist = Twist(linear, angular / self._track.share)
         self._still = self._still + dt if believed == NOWHERE else 0.0
         at_rest = self._still > REST_S
         if rolled.unknown > 0.0:
@@ -199,7 +213,7 @@ class Odometry:
             return
         if all(line.speeds.as_tuple()):
             self._steps_seen = line.steps
-        self._uncertainty.show_count(count_of(line))
+        self._uncertainty.show_count(_count_of(line))
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
         """Return the wheel angles to advance by.
@@ -265,13 +279,13 @@ class Odometry:
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
             self._positions = plus(self._positions, piece)
-        for distance, angle in self._arcs(pieces, turn, self._share):
+        for distance, angle in self._arcs(pieces, turn, self._track.share):
             turned += angle
             self.travelled += abs(distance)
             dx, dy, heading = path.advance(distance, angle)
             self._uncertainty.advance(distance, angle, dx, dy, heading, variance, slips)
         on_trial = self.checks.on_trial
-        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._share))
+        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._track.share))
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
@@ -308,3 +322,12 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
+
+
+def _count_of(line: Feedback) -> float:
+    """Return the angle of the coarsest encoder's count that a line shows, rad, 0 if unknown."""
+    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
+    return max([
+        step * turned / speed for turned, speed, step in rows
+        if speed and 0.0 < step < math.inf and on(speed, step)
+    ], default=0.0)  # fmt: skip

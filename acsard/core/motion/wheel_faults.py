@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 from acsard.core.link.codec import Motors
+from acsard.core.motion.error_model import PERIOD, SMOOTHED
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.suspect_wheel import WORDS, Known, Lie, Stuck, Suspect, has_lied
 from acsard.core.motion.wheel_residual import MEMORY_S, Residual
@@ -21,9 +22,6 @@ from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
 """rad. Range in which the angle of a count is learned if none is configured. A wheel that turns
 slowly reports one count or none per line."""
-
-PERIOD, SMOOTHED = 0.01, 0.05
-"""Assumed period of the lines, s, and weight of a new one in their mean."""
 
 RECUR, SOUGHT = 3, 1000
 """Number of times that a small angle must recur within this number of lines to be a count. Damage
