@@ -280,10 +280,10 @@ class Robot:
             self.counters["wheels_turned"] += 1
             events.append(Event("wheels_turned", self._sanity.turned, "warning"))
         estimate = self._odometry.fold(line, self._speeds)
-        found = self._odometry.checks.events
-        if found:
-            self.counters.update([e.name for e in found if e.name == "wheels_doubted"])
-            events += found
+        checks = self._odometry.checks
+        if checks.wheels.events:
+            self.counters["wheels_doubted"] += len(checks.wheels.events)
+        events += checks.events
         return estimate
 
     # Requests.
