@@ -77,11 +77,11 @@ class ConsistencyChecks:
         if self.gyro is not None:
             self.gyro.forgive()
 
-    def look(self, line: Feedback, rolled: Rolled, told: WheelSpeeds | None) -> bool:
+    def look(self, line: Feedback, rolled: Rolled, commanded: WheelSpeeds | None) -> bool:
         """Take a line and the wheel angles since the line before.
 
-        `told` is the commanded wheel speeds. Return whether a wheel has proved faulty, so that the
-        lines before must be recomputed without it.
+        `commanded` is the commanded wheel speeds. Return whether a wheel has proved faulty, so that
+        the lines before must be recomputed without it.
         """
         wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
         if gyro is not None:
@@ -94,7 +94,7 @@ class ConsistencyChecks:
             self.on_trial = gyro.owes
             by_gyro = None if turn is None else turn.wheels
         self.turn = turn
-        found = wheels.hear(rolled.seen, line.speeds, rolled.seconds, told, by_gyro)
+        found = wheels.look(rolled.seen, line.speeds, rolled.seconds, commanded, by_gyro)
         self.slips = wheels.slips or (turn is not None and turn.slips)
         return found
 

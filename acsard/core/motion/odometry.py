@@ -156,21 +156,21 @@ class Odometry:
         """
         self._rolling.skip(feedback)
 
-    def fold(self, feedback: Feedback, told: WheelSpeeds | None = None) -> Estimate:
+    def fold(self, feedback: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances. At rest nothing does: a count back
         and forth waits until its direction is clear. If a gyro provides the turn since the line
-        before, the wheels provide only the distance. `told` is the commanded wheel speeds, by which
-        a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
-        recomputed.
+        before, the wheels provide only the distance. `commanded` is the commanded wheel speeds, by
+        which a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines
+        are recomputed.
         """
         speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
         steps = feedback.steps
         if steps is not self._steps_of or (feedback.counted and steps is not self._steps_seen):
             self._see(feedback)
-        if checks.look(feedback, rolled, told):
+        if checks.look(feedback, rolled, commanded):
             self._take_back()
         turn, slips = checks.turn, checks.slips
         believed = checks.wheels.believed(speeds.as_tuple())
@@ -237,13 +237,13 @@ class Odometry:
 
         The pose jumps by the error, except for the part that a gyro has corrected or will correct.
         """
-        lied = self.checks.wheels.lied
-        lies = list(takewhile(lambda step: lied(step.speeds), reversed(self._steps)))
-        if not lies:
+        was_faulty = self.checks.wheels.was_faulty
+        wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
+        if not wrong:
             return
-        self._path.set(lies[-1].pose)
+        self._path.set(wrong[-1].pose)
         on_trial = 0.0
-        for step in reversed(lies):
+        for step in reversed(wrong):
             arcs = self._arcs(step.pieces, step.gyro, step.share)
             for distance, angle in arcs:
                 self._path.advance(distance, angle)

@@ -772,8 +772,8 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
     told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
     dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
     for n in range(60):
-        honest.fold(Feedback(AT, told, 0.01), told=told)
-        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), told=told)
+        honest.fold(Feedback(AT, told, 0.01), commanded=told)
+        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), commanded=told)
         if n == 51:
             assert not liar.checks.wheels.status.left_out
             for robot in (liar, honest):

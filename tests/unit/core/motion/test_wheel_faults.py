@@ -43,7 +43,7 @@ class Bench:
 
     def __init__(self, counts: int = 3200) -> None:
         kinematics = Kinematics(DriveConfig())
-        self.witness = WheelFaults(kinematics, counts, FeedbackConfig().response_time)
+        self.faults = WheelFaults(kinematics, counts, FeedbackConfig().response_time)
         self.events: list[str] = []
 
     def run(
@@ -64,16 +64,16 @@ class Bench:
                 front_right * PERIOD, front_left * PERIOD, rear_left * PERIOD, rear_right * PERIOD
             )  # fmt: skip
             by_gyro = None if turn is None else turn * PERIOD
-            if self.witness.hear(turned, says, PERIOD, told, by_gyro):
+            if self.faults.look(turned, says, PERIOD, told, by_gyro):
                 found = min(found, (line + 1) * PERIOD)
-            self.events += [event.kind for event in self.witness.events]
+            self.events += [event.kind for event in self.faults.events]
         return found
 
 
 def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
     bench = Bench(counts)
     bench.run(told, told, seconds=2.0)
-    assert bench.witness.status.text == ""
+    assert bench.faults.status.text == ""
     return bench
 
 
@@ -87,16 +87,16 @@ def test_a_wheel_that_lies_is_left_out_within_fifty_milliseconds_and_named(
 ) -> None:
     bench = driven()
     assert bench.run(only(wheel, says), TEN) <= 0.05
-    assert bench.witness.status.left_out == (WHEELS[wheel],)
-    assert bench.witness.status.text.startswith(f"{WHEELS[wheel]} wheel is left out")
+    assert bench.faults.status.left_out == (WHEELS[wheel],)
+    assert bench.faults.status.text.startswith(f"{WHEELS[wheel]} wheel is left out")
     said = only(wheel, says).as_tuple()
-    assert bench.witness.believed(said) == pytest.approx((10.0,) * 4, 1e-3)
+    assert bench.faults.believed(said) == pytest.approx((10.0,) * 4, 1e-3)
 
 
 def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
     bench = driven()
     bench.run(only(1, 0.0), TEN)
-    front_right, front_left, *rear = bench.witness.believed((1, 2, 3, 4))
+    front_right, front_left, *rear = bench.faults.believed((1, 2, 3, 4))
     assert (front_right, rear) == (1, [3, 4])
     assert front_left == pytest.approx(3, rel=1e-3)
 
@@ -104,18 +104,18 @@ def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
 def test_a_wheel_of_each_side_can_be_left_out_and_never_both_of_one() -> None:
     bench = driven()
     bench.run(WheelSpeeds(0.0, 0.0, 10.0, 10.0), TEN)
-    assert bench.witness.status.left_out == ("front_left", "front_right")
+    assert bench.faults.status.left_out == ("front_left", "front_right")
     bench.run(STILL, TEN)
-    assert bench.witness.status.left_out == ("front_left", "front_right")
+    assert bench.faults.status.left_out == ("front_left", "front_right")
 
 
 def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
     bench = driven()
     bench.run(only(2, 0.0), TEN)
     bench.run(STILL, STILL, seconds=5.0)
-    assert bench.witness.status.left_out == ("rear_left",), "who stands agrees with everybody"
+    assert bench.faults.status.left_out == ("rear_left",), "who stands agrees with everybody"
     bench.run(TEN, TEN, seconds=2.0)
-    assert not bench.witness.status.left_out
+    assert not bench.faults.status.left_out
     assert bench.events == ["left out", "again"]
 
 
@@ -163,19 +163,19 @@ def test_hands_that_push_with_nothing_commanded_leave_no_wheel_out(
         for line in range(500):
             noisy = WheelSpeeds(*(s + 0.1 * (line % 2) * (s != 0.0) for s in says.as_tuple()))
             assert bench.run(noisy, STILL, PERIOD) == math.inf
-        assert bench.witness.status.left_out == ()
+        assert bench.faults.status.left_out == ()
 
 
 def test_with_a_gyro_the_wheel_in_the_air_is_left_out_though_nothing_is_commanded() -> None:
     bench = Bench()
     assert bench.run(only(3, 0.0, 5.0), STILL, turn=0.0) <= 0.05
-    assert bench.witness.status.left_out == ("rear_right",)
+    assert bench.faults.status.left_out == ("rear_right",)
 
 
 def test_a_wheel_that_spins_in_the_air_counts_and_is_told_as_slip() -> None:
     bench = driven()
     assert bench.run(only(0, 12.5), TEN, seconds=10.0) == math.inf
-    assert bench.witness.status.slipping == ("right",)
+    assert bench.faults.status.slipping == ("right",)
 
 
 # slip
@@ -186,11 +186,11 @@ def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> No
     bench = driven()
     bench.run(only(wheel, 11.0), TEN, seconds=0.2)
     side = WHEELS[wheel].partition("_")[2]
-    assert bench.witness.status.slipping == (side,)
+    assert bench.faults.status.slipping == (side,)
     bench.run(TEN, TEN, seconds=0.4)
-    assert bench.witness.slips
+    assert bench.faults.slips
     bench.run(TEN, TEN, seconds=0.5)
-    assert not bench.witness.slips
+    assert not bench.faults.slips
 
 
 def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
