@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections import Counter
 from typing import assert_never
 
-from msgspec.structs import replace
-
 from acsard.core.config.live import changed
 from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
@@ -26,9 +24,7 @@ from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
 from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
 from acsard.core.motion.event_throttle import EventThrottle
-from acsard.core.motion.gyro import Gyro
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import LearnedTrack
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.limits import Limiter
 from acsard.core.motion.modes import LEAVING, Mode, RefusedError
@@ -41,7 +37,6 @@ from acsard.core.values import (
     Answer,
     Estimate,
     Event,
-    GyroStatus,
     Inputs,
     Instant,
     Latches,
@@ -91,9 +86,6 @@ class Robot:
             config.feedback.response_time,
             self.session.quiet_ns / NS_PER_S,
         )
-        self._gyro = Gyro() if config.odometry.gyro else None
-        multiplier = config.drive.wheel_separation_multiplier
-        self._track = LearnedTrack(multiplier) if config.odometry.learned_track else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
@@ -135,9 +127,7 @@ class Robot:
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if self._arbiter.forgiven_ns:
             counters["clock_adjustments_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
-        gyro = GyroStatus() if self._gyro is None else self._gyro.status
-        if self._track is not None:
-            gyro = replace(gyro, track_use=self._track.use)
+        checks = self._odometry.checks
         return Snapshot(
             pose=self._odometry.pose,
             measured=None if silent else self._odometry.twist,
@@ -147,8 +137,8 @@ class Robot:
             refused=self._refused,
             refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
             feedback_age_s=session.feedback_age_s(now_ns),
-            gyro=gyro,
-            doubt=self._odometry.doubt,
+            gyro=checks.gyro_status,
+            doubt=checks.wheels.status,
             check=session.negotiation.in_force,
             encoders=session.count_recovery.counts,
             sender=self._choice.sender,
@@ -260,8 +250,8 @@ class Robot:
             self._linked_once = True
             self._life.link(up=True)
         now = inputs.now
-        if self._gyro is not None:
-            self._gyro.hear(inputs.gyro)
+        if inputs.gyro:
+            self._odometry.checks.hear(inputs.gyro)
         if not feedback:
             return ()
         return tuple(
@@ -289,22 +279,12 @@ class Robot:
         if self._sanity.turned:
             self.counters["uncommanded_motion"] += 1
             events.append(Event("uncommanded_motion", self._sanity.turned, "warning"))
-        estimate = self._odometry.fold(line, self._gyro, self._speeds)
-        if self._gyro is not None:
-            events += self._gyro.events
-            self._learn(self._gyro, events)
-        if self._odometry.events:
-            self.counters["wheel_faults"] += len(self._odometry.events)
-            events += self._odometry.events
+        estimate = self._odometry.fold(line, self._speeds)
+        checks = self._odometry.checks
+        if checks.wheels.events:
+            self.counters["wheel_faults"] += len(checks.wheels.events)
+        events += checks.events
         return estimate
-
-    def _learn(self, gyro: Gyro, events: list[Event]) -> None:
-        """Use the effective track that the gyro has taught, if configured and known."""
-        if self._track is not None:
-            self._track.look(gyro.learned)
-            self._odometry.turn_by(self._track.used)
-            if self._track.event is not None:
-                events.append(self._track.event)
 
     # Requests.
 
@@ -361,8 +341,6 @@ class Robot:
         """Set the pose, and drop the corrections that were due to the pose before."""
         self._odometry.set_pose(pose)
         self.session.count_recovery.forgive()
-        if self._gyro is not None:
-            self._gyro.forgive()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 

@@ -116,8 +116,7 @@ class Run:
         robot, self.heard = made.loop.robot, list[Received]()
         self.lines = Timed(robot._odometry, "fold")
         self.parts = {"odometry": self.lines, "session": Timed(robot.session, "update")}
-        if robot._gyro is not None:
-            self.parts["gyro"] = Timed(robot._gyro, "hear")
+        self.parts["gyro"] = Timed(robot._odometry.checks, "hear")
         self.took = dict.fromkeys((*self.parts, "step", "simplest"), 0)
         simplest = Simplest()
 

@@ -22,10 +22,9 @@ from msgspec.structs import replace
 from acsard.calibration.error_budget.drive_log import Line, Motion, motion
 from acsard.calibration.error_budget.step_errors import Driving, Steps, rounding
 from acsard.core.config.settings import Config, OdometryConfig
+from acsard.core.motion.error_model import DECIMAL, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.noise import columns
 from acsard.core.motion.path import Path
-from acsard.core.motion.twist_uncertainty import DECIMAL, TwistUncertainty
 from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
 from acsard.core.values import REST
 
@@ -157,7 +156,7 @@ def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: floa
         shares.append(Share(cause, _mm(place), _deg(turn), "settings"))
     if not columns(config.odometry, kinematics):
         shares.append(Share("parameters", None, None, "unknown"))
-    spread = TwistUncertainty(_only(config.odometry), kinematics, 0).of(REST, 0.0)
+    spread = TwistUncertainty(ErrorModel(_only(config.odometry), kinematics), 0).of(REST, 0.0)
     counts = config.mcu.encoder_counts if heard.counted else 0
     return Budget(
         lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
@@ -267,7 +266,7 @@ def _driven(
 
     `scale` is the relative standard deviation of the gyro's scale.
     """
-    pose, path = PoseUncertainty(odometry, kinematics, counts), Path()
+    pose, path = PoseUncertainty(ErrorModel(odometry, kinematics), counts), Path()
     rolled = turned = 0.0
     for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
         dx, dy, heading = path.advance(distance, turn)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from acsard.core.motion.gap_variance import Gaps
+from acsard.core.motion.gap_filling import Gaps
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.uncertainty import GYRO_SCALE
 from acsard.core.values import Twist, WheelSpeeds

@@ -23,8 +23,8 @@ from msgspec import Struct
 
 from acsard.calibration.error_budget.drive_log import BLOCK_S, Line, Motion
 from acsard.core.link.quantization_step import Search
+from acsard.core.motion.error_model import DECIMAL
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.twist_uncertainty import DECIMAL
 from acsard.core.values import WheelSpeeds
 
 Floats = npt.NDArray[np.float64]

@@ -159,11 +159,11 @@ class Timeline:
         self._slots = FreeRunningTimes((*known, 1 / rate_hz))
         self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
         self._prompts = PromptedTimes(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
-        self._habit = ReplyStyle(mcu.reply_period > 0)
+        self._style = ReplyStyle(mcu.reply_period > 0)
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
-        self._told = Placed("reads", 0)
+        self._last_placed = Placed("reads", 0)
         """The place of the last good line."""
         self._later = 0.0
         """How much later a reply is due by its line than by the slots, mean in ns."""
@@ -182,7 +182,7 @@ class Timeline:
     def left(self, made_ns: int) -> None:
         """Note that a command line left that was made at `made_ns`."""
         self._prompts.left(made_ns)
-        self._habit.left()
+        self._style.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """Take a read of `size` bytes that completes `lines` lines.
@@ -195,11 +195,11 @@ class Timeline:
         end_ns = self._end_ns = max(before, end_ns)
         self._at, self._rest = at, lines
         self._share_ns = (end_ns - before) / lines
-        habit, slots = self._habit, self._slots
-        if habit.speaks is not False:
+        style, slots = self._style, self._slots
+        if style.speaks is not False:
             slots.read(end_ns, lines, size < FULL_READ)
-        habit.read(lines, (end_ns - before) / self._usual_ns)
-        if habit.speaks is False:
+        style.read(lines, (end_ns - before) / self._usual_ns)
+        if style.speaks is False:
             slots.forget()
         self._prompts.read(end_ns, lines)
 
@@ -209,7 +209,7 @@ class Timeline:
         A prompted board still made it as a reply.
         """
         self._rest -= 1
-        if not self._habit.speaks:
+        if not self._style.speaks:
             self._prompts.skip()
 
     def place(
@@ -238,13 +238,13 @@ class Timeline:
             came_ns -= wire_ns(following, self._baud_rate)
         came_ns = max(came_ns, self._heard_ns)
         since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
-        told = self._told_by(asked_ns, came_ns)
-        dt, bridged = self._since_last(told)
+        placed = self._placed(asked_ns, came_ns)
+        dt, bridged = self._since_last(placed)
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
         # A prompted board makes no line unless it is asked, so a silence of the host leaves no line
         # missing.
-        clocked = told.clock != "reads" or self._prompts.lossy
+        clocked = placed.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
@@ -253,16 +253,16 @@ class Timeline:
         if self._forgotten or self.restarted or not known or dt >= BRIDGED_S:
             gap = 0.0 if first else max(since, dt)
             self._share_ns = min(self._share_ns, wire_ns(length, self._baud_rate))
-            self._told = self._told_by_reads() if told.clock == "reads" else told
+            self._last_placed = self._placed_by_reads() if placed.clock == "reads" else placed
             dt = bridged = since = 0.0
         self._forgotten = False
-        at = self._sampled(came_ns, self._told, length)
+        at = self._sampled(came_ns, self._last_placed, length)
         since = 0.0 if silent else since
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
-    def _told_by(self, asked_ns: int | None, came_ns: int) -> Placed:
+    def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
         """Return the place of the next line on the best available clock."""
-        speaks, answered = self._habit.speaks, None
+        speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
             answered = self._prompts.place(asked_ns)
             ours = asked_ns is not None or speaks is False or self._prompts.thinks
@@ -275,38 +275,38 @@ class Timeline:
                 return answered
         slot = self._slots.place(self._rest)
         if slot is None:
-            return self._told_by_reads()
+            return self._placed_by_reads()
         if answered is not None:
             self._compare(answered, slot)
         return slot if slot.due_ns <= came_ns else replace(slot, due_ns=came_ns)
 
-    def _told_by_reads(self) -> Placed:
+    def _placed_by_reads(self) -> Placed:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
-    def _since_last(self, told: Placed) -> tuple[float, float]:
+    def _since_last(self, placed: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it that no line reported, s.
 
         If different clocks placed the two lines, the host times of both decide, so changes of the
         clock do not add up.
         """
-        last = self._told
-        back = told.due_ns < last.due_ns
-        self._told = replace(told, due_ns=last.due_ns) if back else told
-        by_clock = told.dt if told.clock == last.clock else None
+        last = self._last_placed
+        back = placed.due_ns < last.due_ns
+        self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
+        by_clock = placed.dt if placed.clock == last.clock else None
         if by_clock is not None and not last.early:
-            return by_clock, told.bridged
-        late_ns = self._late_ns(told.clock) - self._late_ns(last.clock)
-        dt = max(0.0, (told.due_ns - last.due_ns - late_ns) / NS_PER_S)
+            return by_clock, placed.bridged
+        late_ns = self._late_ns(placed.clock) - self._late_ns(last.clock)
+        dt = max(0.0, (placed.due_ns - last.due_ns - late_ns) / NS_PER_S)
         if by_clock is not None:
-            return dt, told.bridged
+            return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
-        missing = dt > 1.5 * period and self._habit.speaks is not False
+        missing = dt > 1.5 * period and self._style.speaks is not False
         return dt, dt - period if missing else 0.0
 
     def _compare(self, answered: Placed, slot: Placed) -> None:
         """Update the mean by which replies are due later by their lines than by the slots."""
         later_ns = answered.due_ns - slot.due_ns
-        if slot.dt is None or self._told.clock != "slots":
+        if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 
@@ -320,9 +320,9 @@ class Timeline:
     def _usual_ns(self) -> float:
         return self._slots.usual or self._period_ns
 
-    def _sampled(self, came_ns: int, told: Placed, length: int) -> Instant:
+    def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
         """Return when the sample of a line was taken: before its own bytes were on the wire."""
-        mono_ns = min(came_ns, told.due_ns) - wire_ns(length, self._baud_rate)
+        mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
         if last is not None and mono_ns < last.mono_ns + APART_NS:

@@ -331,66 +331,66 @@ def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> 
         bench.timeline.read(at, LENGTH, 1, 0)
         dt = bench.timeline.place(SPEEDS, None, 0, LENGTH, False).dt
         total += dt if number >= 150 else 0.0
-    assert bench.timeline._told.clock == "prompts"
+    assert bench.timeline._last_placed.clock == "prompts"
     assert total == pytest.approx(0.8, abs=0.0003)
 
 
-def stall(habit: ReplyStyle, lines: int, periods: float, left: int) -> None:
+def stall(style: ReplyStyle, lines: int, periods: float, left: int) -> None:
     for _ in range(left):
-        habit.left()
-    habit.read(lines, periods)
+        style.left()
+    style.read(lines, periods)
 
 
 def test_while_we_send_every_period_nobody_can_tell() -> None:
-    habit = ReplyStyle(speaks=False)
+    style = ReplyStyle(speaks=False)
     for _ in range(1000):
-        stall(habit, 1, 1.0, 1)
-    assert habit.speaks is None
+        stall(style, 1, 1.0, 1)
+    assert style.speaks is None
 
 
 @pytest.mark.parametrize(("lines", "speaks"), [(15, True), (12, True), (1, False), (2, False)])
 def test_a_stall_of_ours_tells_by_the_lines_that_came_in_it(lines: int, speaks: bool) -> None:
-    habit = ReplyStyle(speaks=False)
-    stall(habit, lines, 15.2, 1)
-    assert habit.speaks is speaks
+    style = ReplyStyle(speaks=False)
+    stall(style, lines, 15.2, 1)
+    assert style.speaks is speaks
 
 
 def test_short_stalls_tell_together() -> None:
-    habit = ReplyStyle(speaks=False)
-    stall(habit, 3, 3.0, 1)
-    assert habit.speaks is None
-    stall(habit, 3, 3.0, 1)
-    assert habit.speaks is True
+    style = ReplyStyle(speaks=False)
+    stall(style, 3, 3.0, 1)
+    assert style.speaks is None
+    stall(style, 3, 3.0, 1)
+    assert style.speaks is True
 
 
 def test_lines_that_an_adapter_still_holds_belong_to_the_stall_they_were_made_in() -> None:
-    habit = ReplyStyle(speaks=False)
-    stall(habit, 13, 15.2, 11)
-    assert habit.speaks is None, "neither is clearly nearer"
-    stall(habit, 2, 0.3, 0)
-    assert habit.speaks is True
+    style = ReplyStyle(speaks=False)
+    stall(style, 13, 15.2, 11)
+    assert style.speaks is None, "neither is clearly nearer"
+    stall(style, 2, 0.3, 0)
+    assert style.speaks is True
 
 
 def test_a_silence_that_fits_neither_tells_nothing() -> None:
-    habit = ReplyStyle(speaks=False)
-    stall(habit, 1, 40.0, 13)
-    assert habit.speaks is None
+    style = ReplyStyle(speaks=False)
+    stall(style, 1, 40.0, 13)
+    assert style.speaks is None
 
 
 def test_later_evidence_counts() -> None:
-    habit = ReplyStyle(speaks=False)
-    stall(habit, 15, 15.0, 1)
-    stall(habit, 1, 15.0, 1)
-    assert habit.speaks is False
+    style = ReplyStyle(speaks=False)
+    stall(style, 15, 15.0, 1)
+    stall(style, 1, 15.0, 1)
+    assert style.speaks is False
 
 
 def test_what_is_configured_is_not_doubted() -> None:
-    habit = ReplyStyle(speaks=True)
-    stall(habit, 1, 15.0, 1)
-    assert habit.speaks is True
+    style = ReplyStyle(speaks=True)
+    stall(style, 1, 15.0, 1)
+    assert style.speaks is True
 
 
 def test_nothing_is_expected_after_a_long_silence() -> None:
-    habit = ReplyStyle(speaks=False)
-    stall(habit, 1, 200.0, 1)
-    assert habit.speaks is None
+    style = ReplyStyle(speaks=False)
+    stall(style, 1, 200.0, 1)
+    assert style.speaks is None

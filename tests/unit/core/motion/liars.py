@@ -2,7 +2,7 @@
 
 Each wheel has its own motor lag, tyre and load, and starts anywhere within one count of its
 encoder. A line reports counts over its period in two decimals. The module
-`core/motion/wheel_faults/verdict.py` is judged by these drives, so this one uses only numpy and
+`core/motion/wheel_faults.py` is judged by these drives, so this one uses only numpy and
 shares no code with it. The seed determines everything that a robot does.
 """
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.wheel_faults.residual import MEMORY_S, UNEQUAL, Residual
+from acsard.core.motion.wheel_residual import MEMORY_S, UNEQUAL, Residual
 
 DT = 0.01
 KEEP = MEMORY_S / (MEMORY_S + DT)

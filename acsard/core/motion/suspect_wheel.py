@@ -6,6 +6,9 @@ is further than the other wheel from an independent reference. That is the turn 
 the command: a healthy wheel is between its command and the speed that a slow wheel would have
 reached by now. Without a reference nothing is decided: a person who pushes the robot may turn one
 wheel and not the other.
+
+`Suspect` judges a wheel that contradicts the other one of its side. `Stuck` watches every wheel,
+because a stuck encoder agrees with the other wheel until the command changes.
 """
 
 from __future__ import annotations
@@ -15,11 +18,11 @@ from typing import Literal
 
 from msgspec import Struct
 
-LIE_S, LIE_LINES = 0.025, 2
+FAULT_S, FAULT_LINES = 0.025, 2
 """Seconds and lines for which the sign must last: three lines at 100 Hz, so one bad reading is not
 enough."""
 
-LIE_COUNTS, LIE_ANGLE = 3.5, 0.05
+FAULT_COUNTS, FAULT_ANGLE = 3.5, 0.05
 """Counts and rad by which the other wheel must have turned further meanwhile."""
 
 FOLLOWED_COUNTS, FOLLOWED_ANGLE = 1.5, 0.01
@@ -46,9 +49,9 @@ STUCK = 0.3
 """Least difference for a stuck wheel, as a share of the faster wheel's turn. A smaller one is slip
 next to a wheel at a steady speed."""
 
-Lie = Literal["dead", "reversed", "stuck"]
+WheelFault = Literal["dead", "reversed", "stuck"]
 
-WORDS: dict[Lie, str] = {
+WORDS: dict[WheelFault, str] = {
     "dead": "says it stands while the other wheel of its side turns",
     "reversed": "says the opposite of the other wheel of its side",
     "stuck": "says one and the same speed",
@@ -107,7 +110,7 @@ class Suspect:
 
     def forget(self) -> None:
         """Start over: the wheel shows no sign."""
-        self.lie: Lie | None = None
+        self.sign: WheelFault | None = None
         self._lines = 0
         self._seconds = self._apart = 0.0
         self._command, self._gyro = _Ballot(), _Ballot()
@@ -122,23 +125,23 @@ class Suspect:
         `own` and `other` are the turns of both wheels and `count` is the angle of a count, rad.
         `same` means that the wheel repeats the speed of the line before.
         """
-        lie = self._sign(own, other, same, count)
-        if lie != self.lie:
+        sign = self._sign(own, other, same, count)
+        if sign != self.sign:
             self.forget()
-            self.lie = lie
+            self.sign = sign
         self._lines += 1
         self._seconds += dt
         self._apart += other - own
-        return lie is not None
+        return sign is not None
 
-    def _sign(self, own: float, other: float, same: bool, count: float) -> Lie | None:
+    def _sign(self, own: float, other: float, same: bool, count: float) -> WheelFault | None:
         """Return the sign.
 
         An earlier sign is kept where all signs look alike: through zero and at rest.
         """
-        if self.lie == "stuck" and same:
+        if self.sign == "stuck" and same:
             return "stuck"
-        if reverses(own, other, count) or (self.lie == "reversed" and own * other == 0.0):
+        if reverses(own, other, count) or (self.sign == "reversed" and own * other == 0.0):
             return "reversed"
         if stands(own, other):
             return "dead"
@@ -155,26 +158,26 @@ class Suspect:
         if known.gyro is not None:
             self._gyro.add(own, other, known.gyro, known.gyro)
 
-    def lies(self, count: float) -> bool:
+    def is_faulty(self, count: float) -> bool:
         """Return whether this wheel is faulty, and not the other.
 
         `count` rad is the angle of a count.
         """
-        enough = LIE_COUNTS * count + LIE_ANGLE
-        if self._lines < LIE_LINES or self._seconds < LIE_S or abs(self._apart) < enough:
+        enough = FAULT_COUNTS * count + FAULT_ANGLE
+        if self._lines < FAULT_LINES or self._seconds < FAULT_S or abs(self._apart) < enough:
             return False
         if self._gyro.apart >= enough and abs(self._gyro.vote) >= VOTE:
             return self._gyro.vote > 0.0 and self._plain(self._gyro)
-        if self.lie == "stuck" and self._ignores(count):
+        if self.sign == "stuck" and self._ignores(count):
             return True
         if self._command.apart >= enough:
             return self._command.vote >= VOTE and self._plain(self._command)
         nothing = self._first is None
-        return self.lie == "stuck" and nothing and self._seconds >= HAND_S
+        return self.sign == "stuck" and nothing and self._seconds >= HAND_S
 
     def _plain(self, ballot: _Ballot) -> bool:
         """Return whether a tyre cannot explain the difference to a wheel at a steady speed."""
-        return self.lie != "stuck" or ballot.share >= STUCK
+        return self.sign != "stuck" or ballot.share >= STUCK
 
     def _ignores(self, count: float) -> bool:
         """Return whether the command has changed and only the other wheel has followed."""
@@ -225,9 +228,9 @@ class Stuck:
         followed = self._followed if leaves > 0.0 else -self._followed
         other = self._other if leaves > 0.0 else -self._other
         return (
-            self._seconds >= LIE_S
+            self._seconds >= FAULT_S
             and followed >= STUCK_COUNTS * count + FOLLOWED_ANGLE
-            and other >= LIE_COUNTS * count + LIE_ANGLE
+            and other >= FAULT_COUNTS * count + FAULT_ANGLE
         )
 
 
@@ -238,14 +241,14 @@ def stands(own: float, other: float) -> bool:
 
 def reverses(own: float, other: float, count: float) -> bool:
     """Return whether a wheel reports the opposite of the other one, apart from encoder counts."""
-    return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + LIE_COUNTS * count
+    return own * other < 0.0 and abs(own + other) <= REVERSED * abs(other) + FAULT_COUNTS * count
 
 
-def has_lied(lie: Lie, own: float, other: float, now: float) -> bool:
+def was_faulty(fault: WheelFault, own: float, other: float, now: float) -> bool:
     """Return whether an earlier line with these speeds may belong to the same fault.
 
     `now` is the present speed.
     """
-    if lie == "reversed":
+    if fault == "reversed":
         return own * other < 0.0
-    return stands(own, other) if lie == "dead" else own == now
+    return stands(own, other) if fault == "dead" else own == now

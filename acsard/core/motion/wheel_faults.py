@@ -1,11 +1,11 @@
 """Decides which wheel is faulty and which side slips: the wheels of a side check each other.
 
-If they contradict each other (`residual.py`), and one of them shows the sign of a faulty encoder
-and an independent reference contradicts it (`suspect.py`), the pose ignores that wheel and the
-other one stands in. It counts again when both have agreed for a while. Every other contradiction is
-slip, and so is a fault until it is proven. A side always keeps one wheel. A wheel that is blocked
-or dragged looks like one with a dead encoder and is ignored too, because the other wheel shows the
-way driven.
+If they contradict each other (`wheel_residual.py`), and one of them shows the sign of a faulty
+encoder and an independent reference contradicts it (`suspect_wheel.py`), the pose ignores that
+wheel and the other one stands in. It counts again when both have agreed for a while. Every other
+contradiction is slip, and so is a fault until it is proven. A side always keeps one wheel. A wheel
+that is blocked or dragged looks like one with a dead encoder and is ignored too, because the other
+wheel shows the way driven.
 """
 
 from __future__ import annotations
@@ -13,17 +13,15 @@ from __future__ import annotations
 import math
 
 from acsard.core.link.codec import Motors
+from acsard.core.motion.error_model import PERIOD, SMOOTHED
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.wheel_faults.residual import MEMORY_S, Residual
-from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Stuck, Suspect, has_lied
+from acsard.core.motion.suspect_wheel import WORDS, Known, Stuck, Suspect, WheelFault, was_faulty
+from acsard.core.motion.wheel_residual import MEMORY_S, Residual
 from acsard.core.values import STILL, WHEELS, Event, WheelSpeeds, WheelsStatus
 
 COARSEST, FINEST = math.tau / 16, math.tau / 2000
 """rad. Range in which the angle of a count is learned if none is configured. A wheel that turns
 slowly reports one count or none per line."""
-
-PERIOD, SMOOTHED = 0.01, 0.05
-"""Assumed period of the lines, s, and weight of a new one in their mean."""
 
 RECUR, SOUGHT = 3, 1000
 """Number of times that a small angle must recur within this number of lines to be a count. Damage
@@ -35,7 +33,7 @@ COMMANDED = 0.3
 SLIP_S = 0.5
 """Seconds after the last contradiction for which a side still counts as slipping."""
 
-SLIP_TOLD_S = 0.1
+SLIP_REPORTED_S = 0.1
 """Seconds of contradiction after which a slip is logged."""
 
 BACK_S = 0.5
@@ -61,7 +59,7 @@ class _Side:
         self._stuck = (Stuck(), Stuck())
         self.out: int | None = None
         """Index of the ignored wheel: 0 for the front one, 1 for the rear one, None without one."""
-        self._lie: Lie = "dead"
+        self._fault: WheelFault = "dead"
         self.slip_s = self._odd_s = self._agreed_s = 0.0
         self.event: Event | None = None
         """The event of the last line, if any."""
@@ -75,7 +73,9 @@ class _Side:
     def text(self) -> str:
         """The trouble of the side in words, "" without any."""
         if self.out is not None:
-            return f"{self.left_out} wheel is left out: it {WORDS[self._lie]}, look at its encoder"
+            return (
+                f"{self.left_out} wheel is left out: it {WORDS[self._fault]}, look at its encoder"
+            )
         if self.slip_s > 0.0:
             return f"{self.name} wheels slip: front and rear turn differently"
         return ""
@@ -124,40 +124,40 @@ class _Side:
             own, other = angles[i], angles[1 - i]
             if suspect.looks(own, other, same[i], dt, count):
                 suspect.compare(own, other, dt, known)
-                if suspect.lies(count):
-                    self._leave_out(i, suspect.lie or "dead")
+                if suspect.is_faulty(count):
+                    self._leave_out(i, suspect.sign or "dead")
                     return True
         if not self.residual.slips:
             self._pass(dt)
             return False
-        self.slip_s, told = SLIP_S, self._odd_s >= SLIP_TOLD_S
+        self.slip_s, reported = SLIP_S, self._odd_s >= SLIP_REPORTED_S
         self._odd_s += dt
-        if self._odd_s >= SLIP_TOLD_S and not told:
+        if self._odd_s >= SLIP_REPORTED_S and not reported:
             self.event = Event("wheel_fault", self.text, "warning", kind="slip")
         return False
 
-    def lied(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
+    def was_faulty(self, before: WheelSpeeds, now: WheelSpeeds) -> bool:
         """Return whether the ignored wheel may already have been wrong in an earlier line."""
         if self.out is None:
             return False
         own, other = self.wheels[self.out], self.wheels[1 - self.out]
         said = before.as_tuple()
-        return has_lied(self._lie, said[own], said[other], now.as_tuple()[own])
+        return was_faulty(self._fault, said[own], said[other], now.as_tuple()[own])
 
     def _pass(self, dt: float) -> None:
         self.slip_s = max(0.0, self.slip_s - dt)
         if not self.slip_s:
             self._odd_s = 0.0
 
-    def _leave_out(self, i: int, lie: Lie) -> None:
-        self._lie, self.residual.learns = lie, False
+    def _leave_out(self, i: int, fault: WheelFault) -> None:
+        self._fault, self.residual.learns = fault, False
         self.out, self.slip_s, self._odd_s, self.suspected = i, 0.0, 0.0, False
         for suspect in self._suspects:
             suspect.forget()
         self.event = Event("wheel_fault", self.text, "warning", kind="left out")
 
 
-class Witness:
+class WheelFaults:
     """The checks of all wheels: the wheels to ignore, and whether any slips."""
 
     def __init__(self, kinematics: Kinematics, counts: int, response_time: float) -> None:
@@ -209,28 +209,28 @@ class Witness:
         front_right, front_left, rear_left, rear_right = said
         return front_right, front_left, rear_left, rear_right
 
-    def hear(
+    def look(
         self,
         turned: Motors,
         speeds: WheelSpeeds,
         dt: float,
-        told: WheelSpeeds | None = None,
+        commanded: WheelSpeeds | None = None,
         turn: float | None = None,
     ) -> bool:
         """Take a line: the turned angles, rad, in `dt` s, and its speeds.
 
-        `told` is the commanded speeds, rad/s; `turn` is the turn that the wheels would report by a
-        trusted gyro, rad. Return whether a wheel is ignored from now on; then call `lied` for the
-        lines before.
+        `commanded` is the commanded speeds, rad/s; `turn` is the turn that the wheels would report
+        by a trusted gyro, rad. Return whether a wheel is ignored from now on; then call
+        `was_faulty` for the lines before.
         """
         if self.events:
             self.events = []
         if dt <= 0.0:
             return False
-        if told is not None:
+        if commanded is not None:
             share = dt / (self._response + dt)
-            self._slow_left += (told.front_left - self._slow_left) * share
-            self._slow_right += (told.front_right - self._slow_right) * share
+            self._slow_left += (commanded.front_left - self._slow_left) * share
+            self._slow_right += (commanded.front_right - self._slow_right) * share
         if self._seeking:
             self._seek(speeds, dt)
         keep, count = MEMORY_S / (MEMORY_S + dt), self._count
@@ -247,7 +247,7 @@ class Witness:
         stood, self._stands = self._stands, True in same
         self._found = None
         if stood or self._stands:
-            self._found = self._standing(turned, same if stood else NONE, dt, told)
+            self._found = self._standing(turned, same if stood else NONE, dt, commanded)
         if self._found is None and left and right and not self._busy:
             return False
         for i, side in enumerate(self._sides):
@@ -258,26 +258,28 @@ class Witness:
             if agree:
                 side.agree(dt)
                 continue
-            known = self._known(i, dt, turned, told, turn if other_agrees else None)
+            known = self._known(i, dt, turned, commanded, turn if other_agrees else None)
             if side.contradict(turned, (same[front], same[rear]), dt, count, known):
                 self._found = side
         self._sum_up()
         return self._found is not None
 
     def _standing(
-        self, turned: Motors, same: Same, dt: float, told: WheelSpeeds | None
+        self, turned: Motors, same: Same, dt: float, commanded: WheelSpeeds | None
     ) -> _Side | None:
         """Return the side with a stuck encoder, None without one."""
-        if told is None:
+        if commanded is None:
             return None
         left, right, count = self._left, self._right, self._count
-        of_left = left.stands_still(turned, same, dt, count, self._slow_left, told.front_left)
-        of_right = right.stands_still(turned, same, dt, count, self._slow_right, told.front_right)
+        of_left = left.stands_still(turned, same, dt, count, self._slow_left, commanded.front_left)
+        of_right = right.stands_still(
+            turned, same, dt, count, self._slow_right, commanded.front_right
+        )
         return right if of_right else left if of_left else None
 
-    def lied(self, before: WheelSpeeds) -> bool:
+    def was_faulty(self, before: WheelSpeeds) -> bool:
         """Return whether the wheel that the last line proved faulty was wrong in that line too."""
-        return self._found is not None and self._found.lied(before, self._last)
+        return self._found is not None and self._found.was_faulty(before, self._last)
 
     def _seek(self, speeds: WheelSpeeds, dt: float) -> None:
         """Learn the angle of a count.
@@ -296,7 +298,7 @@ class Witness:
                 self._seeking = self._count > FINEST
 
     def _known(
-        self, i: int, dt: float, turned: Motors, told: WheelSpeeds | None, turn: float | None
+        self, i: int, dt: float, turned: Motors, commanded: WheelSpeeds | None, turn: float | None
     ) -> Known:
         """Return the reference for the left (0) or right (1) side, apart from its own wheels.
 
@@ -309,9 +311,9 @@ class Witness:
                 (front_left + rear_left) / 2, (front_right + rear_right) / 2, turn
             )[i]
         slow = self._slow_right if i else self._slow_left
-        wish = 0.0 if told is None else told.front_right if i else told.front_left
-        commanded = min(abs(slow), abs(wish)) >= COMMANDED and slow * wish > 0.0
-        return Known(slow * dt, wish * dt, commanded, by_gyro)
+        wish = 0.0 if commanded is None else commanded.front_right if i else commanded.front_left
+        clear = min(abs(slow), abs(wish)) >= COMMANDED and slow * wish > 0.0
+        return Known(slow * dt, wish * dt, clear, by_gyro)
 
     def _sum_up(self) -> None:
         left, right = self._sides

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.motion.wheel_faults.suspect import WORDS, Known, Lie, Stuck, Suspect, has_lied
+from acsard.core.motion.suspect_wheel import WORDS, Known, Stuck, Suspect, WheelFault, was_faulty
 
 DT = 0.01
 FINE = math.tau / 3200
@@ -25,7 +25,7 @@ def felt(speed: float) -> Known:
 
 def lies(
     own: float, other: float, known: Known, lines: int = 4, same: bool = False
-) -> tuple[bool, Lie | None]:
+) -> tuple[bool, WheelFault | None]:
     """Return whether the wheel is found faulty after these lines, and its kind of fault.
 
     Speeds are in rad/s.
@@ -34,12 +34,14 @@ def lies(
     for _ in range(lines):
         if suspect.looks(own * DT, other * DT, same, DT, FINE):
             suspect.compare(own * DT, other * DT, DT, known)
-    return suspect.lie is not None and suspect.lies(FINE), suspect.lie
+    return suspect.sign is not None and suspect.is_faulty(FINE), suspect.sign
 
 
 @pytest.mark.parametrize("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
 @pytest.mark.parametrize(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
-def test_a_sign_that_command_or_gyro_deny_is_a_lie(own: float, lie: Lie, known: Known) -> None:
+def test_a_sign_that_command_or_gyro_deny_is_a_lie(
+    own: float, lie: WheelFault, known: Known
+) -> None:
     assert lies(own, 10.0, known) == (True, lie)
 
 
@@ -77,9 +79,9 @@ def test_a_wheel_that_says_the_same_while_its_command_and_the_other_change_is_st
         command = Known((speed + 2.0) * DT, (speed - 1.0) * DT, True, None)
         assert suspect.looks(10.0 * DT, speed * DT, True, DT, FINE)
         suspect.compare(10.0 * DT, speed * DT, DT, command)
-        if suspect.lies(FINE):
+        if suspect.is_faulty(FINE):
             break
-    assert suspect.lie == "stuck"
+    assert suspect.sign == "stuck"
     assert 3 <= lines < 15
 
 
@@ -97,13 +99,13 @@ def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
     ],
 )  # fmt: skip
 def test_a_line_before_belongs_to_the_lie_if_it_has_its_sign(
-    lie: Lie, own: float, other: float, lied: bool
+    lie: WheelFault, own: float, other: float, lied: bool
 ) -> None:
-    assert has_lied(lie, own, other, 7.0) is lied
+    assert was_faulty(lie, own, other, 7.0) is lied
 
 
 def test_every_lie_has_its_words() -> None:
-    assert set(WORDS) == set(Lie.__args__)  # type: ignore[attr-defined]
+    assert set(WORDS) == set(WheelFault.__args__)  # type: ignore[attr-defined]
 
 
 SLOW_S = 0.25

@@ -12,7 +12,7 @@ from acsard.core.link.feedback import Feedback
 from acsard.core.motion.gyro import Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.sanity import Sanity
-from acsard.core.motion.wheel_faults.verdict import Witness
+from acsard.core.motion.wheel_faults import WheelFaults
 from acsard.core.values import STILL, WHEELS, WheelSpeeds
 from tests.unit.core.motion.liars import (
     AT,
@@ -43,7 +43,7 @@ class Bench:
 
     def __init__(self, counts: int = 3200) -> None:
         kinematics = Kinematics(DriveConfig())
-        self.witness = Witness(kinematics, counts, FeedbackConfig().response_time)
+        self.faults = WheelFaults(kinematics, counts, FeedbackConfig().response_time)
         self.events: list[str] = []
 
     def run(
@@ -64,16 +64,16 @@ class Bench:
                 front_right * PERIOD, front_left * PERIOD, rear_left * PERIOD, rear_right * PERIOD
             )  # fmt: skip
             by_gyro = None if turn is None else turn * PERIOD
-            if self.witness.hear(turned, says, PERIOD, told, by_gyro):
+            if self.faults.look(turned, says, PERIOD, told, by_gyro):
                 found = min(found, (line + 1) * PERIOD)
-            self.events += [event.kind for event in self.witness.events]
+            self.events += [event.kind for event in self.faults.events]
         return found
 
 
 def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
     bench = Bench(counts)
     bench.run(told, told, seconds=2.0)
-    assert bench.witness.status.text == ""
+    assert bench.faults.status.text == ""
     return bench
 
 
@@ -87,16 +87,16 @@ def test_a_wheel_that_lies_is_left_out_within_fifty_milliseconds_and_named(
 ) -> None:
     bench = driven()
     assert bench.run(only(wheel, says), TEN) <= 0.05
-    assert bench.witness.status.left_out == (WHEELS[wheel],)
-    assert bench.witness.status.text.startswith(f"{WHEELS[wheel]} wheel is left out")
+    assert bench.faults.status.left_out == (WHEELS[wheel],)
+    assert bench.faults.status.text.startswith(f"{WHEELS[wheel]} wheel is left out")
     said = only(wheel, says).as_tuple()
-    assert bench.witness.believed(said) == pytest.approx((10.0,) * 4, 1e-3)
+    assert bench.faults.believed(said) == pytest.approx((10.0,) * 4, 1e-3)
 
 
 def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
     bench = driven()
     bench.run(only(1, 0.0), TEN)
-    front_right, front_left, *rear = bench.witness.believed((1, 2, 3, 4))
+    front_right, front_left, *rear = bench.faults.believed((1, 2, 3, 4))
     assert (front_right, rear) == (1, [3, 4])
     assert front_left == pytest.approx(3, rel=1e-3)
 
@@ -104,25 +104,25 @@ def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
 def test_a_wheel_of_each_side_can_be_left_out_and_never_both_of_one() -> None:
     bench = driven()
     bench.run(WheelSpeeds(0.0, 0.0, 10.0, 10.0), TEN)
-    assert bench.witness.status.left_out == ("front_left", "front_right")
+    assert bench.faults.status.left_out == ("front_left", "front_right")
     bench.run(STILL, TEN)
-    assert bench.witness.status.left_out == ("front_left", "front_right")
+    assert bench.faults.status.left_out == ("front_left", "front_right")
 
 
 def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
     bench = driven()
     bench.run(only(2, 0.0), TEN)
     bench.run(STILL, STILL, seconds=5.0)
-    assert bench.witness.status.left_out == ("rear_left",), "who stands agrees with everybody"
+    assert bench.faults.status.left_out == ("rear_left",), "who stands agrees with everybody"
     bench.run(TEN, TEN, seconds=2.0)
-    assert not bench.witness.status.left_out
+    assert not bench.faults.status.left_out
     assert bench.events == ["left out", "again"]
 
 
 def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
     robot, plain = odometry(3200), Plain()
     for told in [TEN] * 200 + [only(0, 0.0)] * 50:
-        robot.fold(Feedback(AT, told, PERIOD), None, TEN)
+        robot.fold(Feedback(AT, told, PERIOD), TEN)
         plain.fold(Feedback(AT, told, PERIOD))
     assert abs(plain.pose.yaw) > 0.3
     assert abs(robot.pose.yaw) < 1e-3
@@ -132,7 +132,7 @@ def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
 def test_the_wheels_angles_are_what_the_encoders_said() -> None:
     robot = odometry()
     for says in [TEN] * 100 + [only(0, 0.0)] * 100:
-        estimate = robot.fold(Feedback(AT, says, PERIOD), None, TEN)
+        estimate = robot.fold(Feedback(AT, says, PERIOD), TEN)
     assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
     assert estimate.speeds == only(0, 0.0)
 
@@ -140,12 +140,12 @@ def test_the_wheels_angles_are_what_the_encoders_said() -> None:
 def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
     robot = odometry(3200)
     for says in [TEN] * 100 + [only(0, 0.0)] * 2:
-        robot.fold(Feedback(AT, says, PERIOD), None, TEN)
+        robot.fold(Feedback(AT, says, PERIOD), TEN)
     robot.set_pose(robot.pose)
     before = robot.pose
-    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), None, TEN)
-    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), None, TEN)
-    assert robot.doubt.left_out == ("front_right",)
+    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    assert robot.checks.wheels.status.left_out == ("front_right",)
     assert apart(before, robot.pose)[0] == pytest.approx(0.01, abs=1e-3)
 
 
@@ -163,19 +163,19 @@ def test_hands_that_push_with_nothing_commanded_leave_no_wheel_out(
         for line in range(500):
             noisy = WheelSpeeds(*(s + 0.1 * (line % 2) * (s != 0.0) for s in says.as_tuple()))
             assert bench.run(noisy, STILL, PERIOD) == math.inf
-        assert bench.witness.status.left_out == ()
+        assert bench.faults.status.left_out == ()
 
 
 def test_with_a_gyro_the_wheel_in_the_air_is_left_out_though_nothing_is_commanded() -> None:
     bench = Bench()
     assert bench.run(only(3, 0.0, 5.0), STILL, turn=0.0) <= 0.05
-    assert bench.witness.status.left_out == ("rear_right",)
+    assert bench.faults.status.left_out == ("rear_right",)
 
 
 def test_a_wheel_that_spins_in_the_air_counts_and_is_told_as_slip() -> None:
     bench = driven()
     assert bench.run(only(0, 12.5), TEN, seconds=10.0) == math.inf
-    assert bench.witness.status.slipping == ("right",)
+    assert bench.faults.status.slipping == ("right",)
 
 
 # slip
@@ -186,22 +186,22 @@ def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> No
     bench = driven()
     bench.run(only(wheel, 11.0), TEN, seconds=0.2)
     side = WHEELS[wheel].partition("_")[2]
-    assert bench.witness.status.slipping == (side,)
+    assert bench.faults.status.slipping == (side,)
     bench.run(TEN, TEN, seconds=0.4)
-    assert bench.witness.slips
+    assert bench.faults.slips
     bench.run(TEN, TEN, seconds=0.5)
-    assert not bench.witness.slips
+    assert not bench.faults.slips
 
 
 def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
     calm, slipping = odometry(3200), odometry(3200)
     for says in [TEN] * 200:
-        sure = calm.fold(Feedback(AT, says, PERIOD), None, TEN)
-        slipping.fold(Feedback(AT, says, PERIOD), None, TEN)
+        sure = calm.fold(Feedback(AT, says, PERIOD), TEN)
+        slipping.fold(Feedback(AT, says, PERIOD), TEN)
     begun = sure.covariance.yawyaw
     for _ in range(100):
-        sure = calm.fold(Feedback(AT, TEN, PERIOD), None, TEN)
-        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), None, TEN)
+        sure = calm.fold(Feedback(AT, TEN, PERIOD), TEN)
+        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), TEN)
     assert unsure.twist_variances.linear > 90 * sure.twist_variances.linear
     assert unsure.twist_variances.lateral == pytest.approx(100 * sure.twist_variances.lateral)
     assert unsure.twist_variances.angular > 90 * sure.twist_variances.angular
@@ -210,10 +210,12 @@ def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
 
 def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
     calm, slipping = odometry(3200), odometry(3200)
+    calm.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False))
+    slipping.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True))
     for _ in range(100):
         line = Feedback(AT, TEN, PERIOD)
-        sure = calm.fold(line, Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False)))
-        unsure = slipping.fold(line, Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True)))
+        sure = calm.fold(line)
+        unsure = slipping.fold(line)
     ratio = unsure.twist_variances.linear / sure.twist_variances.linear
     assert ratio == pytest.approx(100.0)
     assert unsure.covariance.xx > 90 * sure.covariance.xx
@@ -252,12 +254,12 @@ class Fall:
                 continue
             fault = sanity.watch(wishing[i], line.speeds, PERIOD)
             plain.fold(line)
-            robot.fold(line, None, wishing[i])
+            robot.fold(line, wishing[i])
             if off is None and i >= begun and abs(lying[i, wheel] - true[i, wheel]) > 2.0:
                 off = i
-            if out is None and robot.doubt.left_out:
+            if out is None and robot.checks.wheels.status.left_out:
                 out = i
-                self.wrong += robot.doubt.left_out != (WHEELS[wheel],) or i < begun
+                self.wrong += robot.checks.wheels.status.left_out != (WHEELS[wheel],) or i < begun
             if fault:
                 break
         self.plain, self.mine = apart(healthy.pose, plain.pose), apart(healthy.pose, robot.pose)
@@ -332,9 +334,9 @@ def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
     lying = LIES[kind](said(angles, counts), wheel, begun)
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(lying, counts), wishes(told), strict=True)):
-        robot.fold(line, None, wish)
-        if robot.doubt.left_out:
-            assert robot.doubt.left_out == (WHEELS[wheel],)
+        robot.fold(line, wish)
+        if robot.checks.wheels.status.left_out:
+            assert robot.checks.wheels.status.left_out == (WHEELS[wheel],)
             assert i >= begun
             return (i - begun + 1) * PERIOD
     return math.inf
@@ -375,10 +377,10 @@ def healthy(
         robot.fold(Feedback(AT, one, PERIOD))
         plain.fold(Feedback(AT, one, PERIOD))
     for line, wish in zip(lines(speeds), wishes(told), strict=True):
-        robot.fold(line, None, wish)
+        robot.fold(line, wish)
         plain.fold(line)
         if line.speeds != STILL:
-            was, slips = slips, bool(robot.doubt.slipping)
+            was, slips = slips, bool(robot.checks.wheels.status.slipping)
             alarms += slips and not was
     return alarms, robot.pose == plain.pose
 
@@ -423,8 +425,8 @@ def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float
     )  # fmt: skip
     robot = odometry()
     for i, (line, wish) in enumerate(zip(lines(said(angles, counts)), wishes(told), strict=True)):
-        robot.fold(line, None, wish)
-        if i >= begun and robot.doubt.slipping:
+        robot.fold(line, wish)
+        if i >= begun and robot.checks.wheels.status.slipping:
             return (i - begun + 1) * PERIOD
     return math.inf
 
