@@ -94,13 +94,12 @@ def how_it_ended(code: int) -> str:
 
 def end(process: subprocess.Popen[bytes], patience_s: float) -> None:
     """End a child by SIGTERM, and by SIGKILL if it takes longer than that."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+    process.terminate()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @asynccontextmanager

@@ -4,8 +4,8 @@ A writer never waits, neither for the reader nor for a lock. If the reader falls
 item takes the place of the oldest one. A writer stores its item before it wakes the reader, and a
 woken reader looks at the items afterwards, so no wake-up is lost. A reader may be woken in vain.
 
-Two kinds of queues are not mailboxes: one in which the oldest items are worth more than the newest
-(the log), and one in which no item may be lost (replies to queries).
+Two kinds of queues are not mailboxes: one whose oldest items are worth more than its newest ones
+(the log, the recording), and one in which no item may be lost (replies to queries).
 """
 
 from __future__ import annotations
