@@ -32,7 +32,8 @@ this order as contracts, and `lint-imports` checks them.
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
-    host/            the machine: clock, timers, threads, files, systemd, logs, errors
+    host/            the machine: clock, timers, threads and the mailboxes between them, child
+                     processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
     error_budget/    `acsard odom`: what each cause contributes to the odometry's error
     calibration/     `acsard calibrate`: from a log, or by a drive of its own
