@@ -34,7 +34,8 @@ this order as contracts, and `lint-imports` checks them.
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
     prompts/         how a verb asks the person beside the robot: at a terminal or by a program
-    host/            the machine: clock, timers, threads, files, systemd, logs, errors
+    host/            the machine: clock, timers, threads and the mailboxes between them, child
+                     processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
     terminal/        tables and output of all tools, by the library rich
     core/            the robot as a pure function: no clock, no I/O, no thread

@@ -32,7 +32,7 @@ from acsard.host import clock
 from acsard.host.silence import Silence
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
-"""Variables with which systemd speaks to the parent. A child must not answer in its name."""
+"""Variables that systemd sets for the parent. A child must not answer in the parent's name."""
 
 BEAT_S = 0.5
 """Longest time between two looks for a sign of life, and between two signs, s."""
@@ -69,14 +69,14 @@ def environment(hidden: Collection[str] = ()) -> dict[str, str]:
 
 
 class Limits(Struct, frozen=True):
-    """Limits of a child that works for somebody else than the robot."""
+    """Limits of a child whose work is less important than the robot's."""
 
     nice: int
     memory_bytes: int
 
 
 def limit(pid: int, limits: Limits) -> None:
-    """Give a child this priority and so much data memory, and let it go first without memory."""
+    """Set the priority and the data memory of a child; it is the first to go without memory."""
     try:
         with suppress(OSError):
             Path(f"/proc/{pid}/oom_score_adj").write_bytes(FIRST_TO_GO)
@@ -93,14 +93,13 @@ def how_it_ended(code: int) -> str:
 
 
 def end(process: subprocess.Popen[bytes], patience_s: float) -> None:
-    """End a child by SIGTERM, and by SIGKILL if it takes longer than that."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(patience_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+    """End a child by SIGTERM, and by SIGKILL if it still runs after `patience_s`."""
+    process.terminate()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @asynccontextmanager

@@ -4,8 +4,8 @@ A writer never waits, neither for the reader nor for a lock. If the reader falls
 item takes the place of the oldest one. A writer stores its item before it wakes the reader, and a
 woken reader looks at the items afterwards, so no wake-up is lost. A reader may be woken in vain.
 
-Two kinds of queues are not mailboxes: one in which the oldest items are worth more than the newest
-(the log), and one in which no item may be lost (replies to queries).
+Two kinds of queues are not mailboxes: one whose oldest items are worth more than its newest ones
+(the log, the recording), and one in which no item may be lost (replies to queries).
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class Mailbox(Generic[T]):
         """Create an empty mailbox.
 
         Args:
-            most: number of items that wait at most.
-            wake: what `put` calls after it has stored an item, on the writer's thread. By default
-                it ends the reader's `wait`.
+            most: largest number of waiting items.
+            wake: function that `put` calls on the writer's thread after it has stored an item. The
+                default ends the reader's `wait`.
         """
         self.waiting: deque[T] = deque(maxlen=most)
         """The items that wait, the oldest on the left. Only the reader may take from it directly.
@@ -74,7 +74,7 @@ class Mailbox(Generic[T]):
         return room
 
     def put(self, item: T) -> bool:
-        """Store an item and wake the reader; return what `store` returns."""
+        """Store an item and wake the reader; return False if the oldest one was dropped for it."""
         room = self.store(item)
         self._wake()
         return room
@@ -87,7 +87,7 @@ class Mailbox(Generic[T]):
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
-        """Call `wake` from now on instead of ending `wait`, and at once if there is news."""
+        """Call `wake` from now on instead of ending `wait`, and at once if an item waits."""
         self._wake = wake
         if self.waiting or self.closed:
             wake()
@@ -103,7 +103,7 @@ class Mailbox(Generic[T]):
         return [items.popleft() for _ in range(len(items))]
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Wait until an item waits or the mailbox is closed, at most `seconds`; return whether."""
+        """Wait until there is an item or the end; return False if `seconds` pass before."""
         began_ns, left = clock.mono_ns(), seconds
         while not (self.waiting or self.closed):
             if left is not None and left <= 0:

@@ -41,7 +41,7 @@ from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
 from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Route, services, values
-from acsard.web.settings import Setting, rows
+from acsard.web.settings_form import Setting, rows
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer

@@ -327,6 +327,36 @@ def test_latches_are_held_from_the_rename_on(
     syncs.set()
 
 
+def test_latches_that_come_with_the_end_are_written(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    pop = file._box.pop
+
+    def late() -> Latches | None:
+        latches = pop()
+        if latches is FAULT:  # the thread has taken it; now a stop and the end come at once
+            file.keep(STOP)
+            file._box.close()
+        return latches
+
+    monkeypatch.setattr(file._box, "pop", late)
+    file.keep(FAULT)
+    until(lambda: file._thread is not None and not file._thread.is_alive())
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_each_write_waits_for_the_file_and_for_its_name(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    synced: list[Path] = []
+    monkeypatch.setattr(module, "sync", synced.append)
+    file.keep(STOP)
+    end(file)
+    assert synced[-2:] == [tmp_path / NAME, tmp_path]
+
+
 def test_to_wait_ends_once_the_latches_are_held(tmp_path: Path, started: Started) -> None:
     file, _ = started(tmp_path)
     file.keep(STOP)

@@ -89,7 +89,9 @@ def test_the_new_content_is_on_the_disk_before_it_gets_the_name(
     calls, fsync, rename = [], os.fsync, os.replace
 
     def synced(handle: int) -> None:
-        calls.append(("sync", os.readlink(f"/proc/self/fd/{handle}")))
+        path = os.readlink(f"/proc/self/fd/{handle}")
+        assert Path(path).read_bytes() == NEW
+        calls.append(("sync", path))
         fsync(handle)
 
     def renamed(old: str, new: Any) -> None:

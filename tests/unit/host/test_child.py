@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -101,6 +102,7 @@ def test_a_child_without_a_first_sign_of_life_is_killed(monkeypatch: pytest.Monk
 def test_a_child_that_falls_silent_is_killed_although_it_is_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(module, "START_NS", 3600 * NS_PER_S)
     monkeypatch.setattr(module, "SILENT_NS", 0)
     child = Child(program(ALIVE + "os.kill(os.getpid(), 19)"))
     assert child.run() == -signal.SIGKILL
@@ -239,10 +241,19 @@ def test_a_parent_that_closed_its_end_is_gone_and_takes_no_signs_of_life() -> No
         parent.beat()
 
 
-def test_a_pipe_takes_no_signs_of_life_and_ends_the_child_all_the_same() -> None:
+def test_a_terminal_takes_no_signs_of_life_and_still_blocks_for_other_programs() -> None:
+    ours, its = os.openpty()
+    parent = Parent(its)
+    parent.beat()
+    assert (os.get_blocking(its), select.select([ours], [], [], 0.05)[0]) == (True, [])
+    os.close(ours)
+    assert parent.gone()
+    os.close(its)
+
+
+def test_the_end_of_a_pipe_is_the_end_of_the_parent() -> None:
     reads, writes = os.pipe()
     parent = Parent(reads)
-    assert os.get_blocking(reads)  # it may be a terminal that others read too
     parent.beat()
     os.close(writes)
     assert parent.gone()

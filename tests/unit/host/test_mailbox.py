@@ -27,7 +27,7 @@ def took_s(begin_ns: int) -> float:
     return (clock.mono_ns() - begin_ns) / NS_PER_S
 
 
-# what waits
+# the items
 
 
 def test_items_come_out_once_and_in_the_order_in_which_they_came() -> None:
@@ -118,7 +118,7 @@ def test_no_wake_up_is_lost_however_writers_and_reader_meet() -> None:
     assert done.wait(WAIT_S), seen
 
 
-def test_what_is_stored_alone_wakes_nobody_until_the_bell_is_rung() -> None:
+def test_an_item_that_is_only_stored_wakes_no_reader() -> None:
     woken: list[str] = []
     box = Mailbox[int](4, lambda: woken.append("woken"))
     assert box.store(1)
@@ -138,7 +138,7 @@ def test_a_callback_runs_on_the_writer_s_thread_and_finds_the_item() -> None:
 
 
 @pytest.mark.parametrize(("items", "closes", "woken"), [(0, False, 0), (2, False, 1), (0, True, 1)])
-def test_a_callback_that_is_set_late_is_told_of_what_came_before(
+def test_a_callback_that_is_set_late_is_called_for_the_items_before_it(
     items: int, closes: bool, woken: int
 ) -> None:
     box, calls = filled(4, items), []
@@ -161,7 +161,7 @@ def test_a_callback_that_fails_fails_its_writer_and_the_item_is_there() -> None:
 # the end
 
 
-def test_a_closed_mailbox_still_gives_what_waits_and_never_makes_its_reader_wait() -> None:
+def test_a_closed_mailbox_still_gives_its_items_and_never_makes_its_reader_wait() -> None:
     box = filled(4, 2)
     assert not box.closed
     box.close()

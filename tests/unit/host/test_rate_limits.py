@@ -1,4 +1,4 @@
-"""A rate lets its burst through and then so many a second; places are counted."""
+"""A bucket passes its burst, then its rate; places are limited per name and in all."""
 
 from __future__ import annotations
 

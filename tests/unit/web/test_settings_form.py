@@ -5,7 +5,7 @@ from __future__ import annotations
 from acsard.core.config.live import LIVE
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.web.settings import rows
+from acsard.web.settings_form import rows
 
 ROWS = {row.key: row for row in rows(effective(Config()))}
 
