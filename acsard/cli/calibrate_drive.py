@@ -66,7 +66,7 @@ def guided(
     `RefusedError`.
     """
     from acsard.calibration.guided.legs import GuideError, setup
-    from acsard.calibration.guided.robot_on_bus import SOURCE, Robot
+    from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
     from acsard.calibration.guided.runner import guide
     from acsard.cli.common import require_one
     from acsard.client import connect
@@ -85,7 +85,7 @@ def guided(
         made = setup(config)
         prompt = stack.enter_context(_prompt(args, lines))
         prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
-        robot = Robot(client, config, prompt)
+        robot = RobotOnBus(client, config, prompt)
         if name == "gyro":
             robot.gyro(args.imu or IMU)
         elif name == "positions":

@@ -7,6 +7,7 @@ import json
 import math
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,15 +21,17 @@ import zenoh
 
 from acsard.calibration.guided import robot_on_bus
 from acsard.calibration.guided.leg_driver import HELD_UP, Recorder, Sample
-from acsard.calibration.guided.legs import GuideError
-from acsard.calibration.guided.robot_on_bus import POSITIONS, Sensor
+from acsard.calibration.guided.legs import GuideError, Leg, Move
+from acsard.calibration.guided.robot_on_bus import POSITIONS, RobotOnBus, Sensor
+from acsard.client import Client
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import JointsConfig
+from acsard.core.config.settings import Config, JointsConfig
 from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.prompts.prompt import Ask
+from acsard.prompts.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -414,6 +417,26 @@ def test_what_is_no_position_and_what_does_not_come_is_told(
 
         with pytest.raises(GuideError, match="cannot be read"):
             until(came, 5.0, "a sample")
+
+
+def test_a_state_that_cannot_be_read_ends_the_leg_and_says_so(free: str) -> None:
+    with router(free) as said, client_session(free, "") as heard:
+        client = Client(heard, "acsar", "app")
+        ended = threading.Event()
+
+        def publish() -> None:
+            while not ended.wait(0.05):
+                said.put(client.key("state"), b"\xc1")
+
+        publisher = threading.Thread(target=publish)
+        publisher.start()
+        try:
+            robot = RobotOnBus(client, Config(), NoPrompt())
+            with pytest.raises(GuideError, match="state cannot be read"):
+                robot.ride(Leg("ahead", "", (Move(1.0, 0.1),)))
+        finally:
+            ended.set()
+            publisher.join()
 
 
 def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:

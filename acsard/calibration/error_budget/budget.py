@@ -19,14 +19,14 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.drive_log import Line, Motion, motion
+from acsard.calibration.error_budget.drive_log import Line, motion
 from acsard.calibration.error_budget.step_errors import Driving, Steps, rounding
 from acsard.core.config.settings import Config, OdometryConfig
 from acsard.core.motion.error_model import DECIMAL, ErrorModel, TwistUncertainty, columns
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.path import Path
 from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
-from acsard.core.values import REST
+from acsard.core.values import REST, PoseCovariance
 
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
@@ -138,148 +138,141 @@ class Heard(Struct, frozen=True):
 
 def budget(heard: Heard, config: Config, metres: float = METRES) -> Budget:
     """Return the error budget of a daemon with this configuration; `metres` replaces the 100 m."""
-    kinematics = Kinematics(config.drive)
-    if len(heard.lines) >= LEAST_LINES:
-        moved = motion(heard.lines, np.array(heard.sent), kinematics, heard.whole)
-        of = _Driven(heard, config, kinematics, moved, metres)
-        if of.rolled >= LEAST_M or of.turned >= LEAST_RAD:
-            return of.budget()
-    return _standing(heard, config, kinematics, metres)
-
-
-def _standing(heard: Heard, config: Config, kinematics: Kinematics, metres: float) -> Budget:
-    """Return the budget of a robot that stands, from the settings alone."""
-    lines, shares = heard.lines, []
-    for cause, kind in _declared(config.odometry, kinematics):
-        place = _driven(kind, kinematics, 0, STRAIGHT, metres)
-        turn = _driven(kind, kinematics, 0, SPIN, math.inf, math.tau)
-        shares.append(Share(cause, _mm(place), _deg(turn), "settings"))
-    if not columns(config.odometry, kinematics):
-        shares.append(Share("parameters", None, None, "unknown"))
-    spread = TwistUncertainty(ErrorModel(_only(config.odometry), kinematics), 0).of(REST, 0.0)
-    counts = config.mcu.encoder_counts if heard.counted else 0
-    return Budget(
-        lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
-        counts, heard.gyro, still=True,
-        at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=tuple(shares),
-        multiplier=(configured := kinematics.multipliers[2]),
-        learned=(learned := None if heard.learned is None else heard.learned * configured),
-        learned_std=(learned or 0.0) * heard.deviation, learned_used=heard.used,
+    model, lines = _Model(config, metres), heard.lines
+    still = _standing(heard, config, model)
+    if len(lines) < LEAST_LINES:
+        return still
+    moved = motion(lines, np.array(heard.sent), model.kinematics, heard.whole)
+    rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
+    if rolled < LEAST_M and turned < LEAST_RAD:
+        return still
+    found = rounding(np.array([one.speeds for one in lines]), moved.period)
+    counts = still.counts or (round(math.tau / found.count) if found.count else 0)
+    creeping = metres / max(rolled, LEAST_M) * moved.seconds / MOST_STEPS
+    driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), heard.gyro)
+    model.rolls, model.turns = rolled >= LEAST_M, turned >= LEAST_RAD
+    return replace(
+        still, metres=rolled, turned=math.degrees(turned), missing=moved.missing,
+        unseen=moved.unseen, lateness=moved.lateness, quantum=found.quantum, counts=counts,
+        still=False, shares=tuple(_causes(heard, model, driving, counts)),
     )  # fmt: skip
 
 
-class _Driven:
-    """Computes the shares of a drive."""
+def _standing(heard: Heard, config: Config, model: _Model) -> Budget:
+    """Return the budget of a robot that stands, from the settings alone."""
+    lines, odometry, known = heard.lines, config.odometry, model.declares_parameters
+    shares = (
+        model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, noise=True)),
+        model.share(
+            "parameters", "settings" if known else "unknown", STRAIGHT, SPIN,
+            _only(odometry, parameters=True),
+        ),
+    )  # fmt: skip
+    spread = TwistUncertainty(ErrorModel(_only(odometry), model.kinematics), 0).of(REST, 0.0)
+    configured = model.kinematics.multipliers[2]
+    learned = None if heard.learned is None else heard.learned * configured
+    return Budget(
+        lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
+        config.mcu.encoder_counts if heard.counted else 0, heard.gyro, still=True,
+        at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=shares,
+        multiplier=configured, learned=learned, learned_std=(learned or 0.0) * heard.deviation,
+        learned_used=heard.used,
+    )  # fmt: skip
 
-    def __init__(
-        self, heard: Heard, config: Config, kinematics: Kinematics, moved: Motion, metres: float
-    ) -> None:
-        self._heard, self._config, self._kinematics = heard, config, kinematics
-        self._motion, self._metres = moved, metres
-        self.rolled = float(np.abs(moved.distance).sum())
-        self.turned = float(np.abs(moved.turn).sum())
 
-    def budget(self) -> Budget:
-        heard, moved = self._heard, self._motion
-        found = rounding(np.array([one.speeds for one in heard.lines]), moved.period)
-        creeping = self._metres / max(self.rolled, LEAST_M) * moved.seconds / MOST_STEPS
-        driving = Driving(
-            heard.lines, moved, found, self._kinematics, max(STEP_S, creeping), heard.gyro
-        )
-        counts = self._config.mcu.encoder_counts if heard.counted else 0
-        if not counts and found.count:
-            counts = round(math.tau / found.count)
-        shares = [*self._of_lines(driving, counts), *self._of_base(driving)]
-        return replace(
-            _standing(heard, self._config, self._kinematics, self._metres),
-            metres=self.rolled, turned=math.degrees(self.turned), missing=moved.missing,
-            unseen=moved.unseen, lateness=moved.lateness, quantum=found.quantum, counts=counts,
-            still=False, shares=tuple(shares),
-        )  # fmt: skip
+def _causes(heard: Heard, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
+    """Yield the share of each cause alone."""
+    odometry, plain = model.odometry, driving.plain()
 
-    def _of_lines(self, driving: Driving, counts: int) -> Iterator[Share]:
-        """Yield the shares of time, quantisation and gaps."""
-        heard, none = self._heard, _only(self._config.odometry)
-        if heard.counted:
-            # Counts are cumulative, so late and missing lines cause no error.
-            yield self._share("time", "measured", none, driving.plain())
-            yield self._share("quantisation", "measured", none, driving.plain(), counts)
-            yield self._share("gaps", "measured", none, driving.plain())
-            return
-        told: Basis = "measured" if heard.whole else "unknown"
-        yield self._share("time", told, none, driving.late())
-        yield self._share("quantisation", told, none, driving.rounded(), counts)
-        yield self._share("gaps", told, none, driving.missed())
-
-    def _of_base(self, driving: Driving) -> Iterator[Share]:
-        """Yield the shares of slip, parameters and the gyro."""
-        heard, odometry = self._heard, self._config.odometry
-        declared = self._share("slip", "settings", _only(odometry, noise=True), driving.plain())
-        seen = self._share("slip", "measured", _only(odometry), driving.contradicted())
-        yield max(declared, seen, key=_millimetres)
-        known = bool(columns(odometry, self._kinematics))
-        basis: Basis = "settings" if known else "unknown"
-        kind = _only(odometry, parameters=True)
-        if heard.learned is not None:
-            share = heard.deviation if heard.used else abs(heard.learned - 1.0)
-            off = share * self._kinematics.multipliers[2]
-            kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
-        yield self._share("parameters", basis, kind, driving.plain())
-        if heard.gyro:
-            known = odometry.covariance == "model" and self._motion.yaw_variance is not None
-            told: Basis = "measured" if known else "unknown"
-            steps = driving.turned_by_gyro()
-            yield self._share("gyro", told, _only(odometry), steps, scale=GYRO_SCALE)
-
-    def _share(
-        self, cause: Cause, basis: Basis, odometry: OdometryConfig, steps: Steps,
+    def share(
+        cause: Cause, basis: Basis, steps: Steps, only: OdometryConfig | None = None,
         counts: int = 0, scale: float = 0.0,
     ) -> Share:  # fmt: skip
+        left, only = steps.to_the_left(), only or _only(odometry)
+        return model.share(cause, basis, steps, left, only, counts, scale)
+
+    # Counts are cumulative, so late and missing lines cause no error.
+    counted = heard.counted
+    basis: Basis = "measured" if counted or heard.whole else "unknown"
+    yield share("time", basis, plain if counted else driving.late())
+    yield share("quantisation", basis, plain if counted else driving.rounded(), counts=counts)
+    yield share("gaps", basis, plain if counted else driving.missed())
+
+    declared = share("slip", "settings", plain, _only(odometry, noise=True))
+    seen = share("slip", "measured", driving.contradicted())
+    yield max(declared, seen, key=_millimetres)
+
+    kind = _only(odometry, parameters=True)
+    basis = "settings" if model.declares_parameters else "unknown"
+    if heard.learned is not None:
+        off = heard.deviation if heard.used else abs(heard.learned - 1.0)
+        off *= model.kinematics.multipliers[2]
+        kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
+    yield share("parameters", basis, plain, kind)
+
+    if heard.gyro:
+        known = odometry.covariance == "model" and driving.tells_gyro
+        basis = "measured" if known else "unknown"
+        yield share("gyro", basis, driving.turned_by_gyro(), scale=GYRO_SCALE)
+
+
+class _Model:
+    """The odometry's covariance model, which is asked for the error of one cause at a time."""
+
+    def __init__(self, config: Config, metres: float) -> None:
+        self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
+        self.rolls = self.turns = True
+        """Whether the drive is long enough to extrapolate the error of position or heading."""
+        self._metres = metres
+
+    @property
+    def declares_parameters(self) -> bool:
+        """Whether the settings declare an uncertainty of the wheels or of the track."""
+        return bool(columns(self.odometry, self.kinematics))
+
+    def share(
+        self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,
+        counts: int = 0, scale: float = 0.0,
+    ) -> Share:  # fmt: skip
+        """Return the error of one cause.
+
+        Args:
+            ahead: the steps that are repeated until the distance is driven.
+            left: the steps that are repeated until a turn is made.
+            only: the settings, without the errors of other causes.
+            counts: the encoders' counts per wheel turn; 0 if their resolution is not the cause.
+            scale: the relative standard deviation of the gyro's scale.
+        """
         if basis == "unknown":
             return Share(cause, None, None, basis)
         millimetres = degrees = None
-        if self.rolled >= LEAST_M:
-            millimetres = _mm(
-                _driven(odometry, self._kinematics, counts, steps, self._metres, scale=scale)
-            )
-        if self.turned >= LEAST_RAD:
-            left = steps.to_the_left()
-            degrees = _deg(
-                _driven(odometry, self._kinematics, counts, left, math.inf, math.tau, scale)
-            )
+        if self.rolls:
+            error = self._error(ahead, only, counts, scale, self._metres, math.inf)
+            millimetres = 1e3 * math.sqrt(error.xx + error.yy)
+        if self.turns:
+            error = self._error(left, only, counts, scale, math.inf, math.tau)
+            degrees = math.degrees(math.sqrt(error.yawyaw))
         return Share(cause, millimetres, degrees, basis)
 
-
-def _declared(
-    odometry: OdometryConfig, kinematics: Kinematics
-) -> Iterator[tuple[Cause, OdometryConfig]]:
-    yield "slip", _only(odometry, noise=True)
-    if columns(odometry, kinematics):
-        yield "parameters", _only(odometry, parameters=True)
-
-
-def _driven(
-    odometry: OdometryConfig, kinematics: Kinematics, counts: int, steps: Steps, metres: float,
-    turns: float = math.inf, scale: float = 0.0,
-) -> PoseUncertainty:  # fmt: skip
-    """Return the error after `metres` m or `turns` rad of these steps, repeated.
-
-    `scale` is the relative standard deviation of the gyro's scale.
-    """
-    pose, path = PoseUncertainty(ErrorModel(odometry, kinematics), counts), Path()
-    rolled = turned = 0.0
-    for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
-        dx, dy, heading = path.advance(distance, turn)
-        variance = by_gyro if steps.by_gyro else None
-        pose.advance(distance, turn, dx, dy, heading, variance, scale=scale)
-        if along or yaw:
-            pose.doubt(along, yaw)
-        if any(missed):
-            pose.stand(*missed)
-        rolled, turned = rolled + abs(distance), turned + abs(turn)
-        if rolled >= metres or turned >= turns:
-            break
-    return pose
+    def _error(
+        self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
+        angle: float,
+    ) -> PoseCovariance:  # fmt: skip
+        """Return the covariance after `metres` m or `angle` rad of these steps, repeated."""
+        pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
+        rolled = turned = 0.0
+        for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
+            dx, dy, heading = path.advance(distance, turn)
+            variance = by_gyro if steps.by_gyro else None
+            pose.advance(distance, turn, dx, dy, heading, variance, scale=scale)
+            if along or yaw:
+                pose.doubt(along, yaw)
+            if any(missed):
+                pose.stand(*missed)
+            rolled, turned = rolled + abs(distance), turned + abs(turn)
+            if rolled >= metres or turned >= angle:
+                break
+        return pose.covariance
 
 
 def _only(
@@ -298,14 +291,6 @@ def _only(
             right_wheel_radius_multiplier_std=0.0, distance_scale_std=0.0,
         )  # fmt: skip
     return made
-
-
-def _mm(driven: PoseUncertainty) -> float:
-    return 1e3 * math.sqrt(driven.covariance.xx + driven.covariance.yy)
-
-
-def _deg(driven: PoseUncertainty) -> float:
-    return math.degrees(math.sqrt(driven.covariance.yawyaw))
 
 
 def _millimetres(share: Share) -> float:

@@ -128,6 +128,11 @@ class Driving:
         """Return the steps without an error."""
         return self._steps()
 
+    @property
+    def tells_gyro(self) -> bool:
+        """Whether the lines show the noise of the gyro."""
+        return self._motion.yaw_variance is not None
+
     def turned_by_gyro(self) -> Steps:
         """Return the steps with the gyro noise that odometry assumes."""
         return self._steps(gyro=self._motion.yaw_variance)

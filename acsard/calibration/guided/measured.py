@@ -9,14 +9,7 @@ import numpy as np
 from acsard.calibration import heading
 from acsard.calibration.doubts import remarks
 from acsard.calibration.evidence import RATE, TURN, Base
-from acsard.calibration.fit import (
-    LEFT_RADIUS,
-    RIGHT_RADIUS,
-    Rates,
-    configured,
-    constant,
-    rates,
-)  # fmt: skip
+from acsard.calibration.fit import Rates, configured, constant, rates
 from acsard.calibration.gain import Error, Gain
 from acsard.calibration.gain import constant as with_one_track
 from acsard.calibration.guided.readings import Found, Reading, found, joined, predicted
@@ -55,12 +48,7 @@ def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Cal
     result = constant(told.parameters, told.covariance, rate, 0.0)
     chance = float(np.sqrt(told.covariance[TURN, TURN])) / abs(told.parameters[TURN])
     sure_enough(result, chance, WORST, "these readings", MEND)
-    size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
-    drives = Drives(
-        len(rides), sum(float(ride.t[-1]) for ride in rides),
-        size * float(np.abs(rows.left + rows.right).sum()) / 2,
-        float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
-    )  # fmt: skip
+    drives = Drives.of(rides, rows, by_wheels, base, result, rate)
     now = told.parameters.copy()
     now[: RATE + 1] = base.start()[: RATE + 1]
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)

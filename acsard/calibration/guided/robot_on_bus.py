@@ -84,7 +84,7 @@ class Sensor:
         raise GuideError(f"what comes on {self.key} cannot be read: {'; '.join(errors)}")
 
 
-class Robot:
+class RobotOnBus:
     """The robot on the bus: sends the commands of a leg and records the sensors meanwhile."""
 
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:

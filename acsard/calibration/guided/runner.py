@@ -34,16 +34,16 @@ def guide(name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run]) -
     # The legs that depend on the track follow the reading that tells it.
     track, number = 1.0, 0
 
-    def hear(leg: str, asks: tuple[Ask, ...]) -> None:
+    def ask_for(leg: str, asks: tuple[Ask, ...]) -> None:
         for ask in asks:
             answers[leg, ask.name] = UNITS[ask.unit] * prompt.number(ask)
 
-    hear("", way.asks)
+    ask_for("", way.asks)
     while number < len(legs := way.legs(setup, track)):
         leg, number = legs[number], number + 1
         prompt.start(f"{number}. {leg.words} ({leg.seconds:.0f} s)", leg.by_key)
         rides[leg.name] = ride(leg)
-        hear(leg.name, leg.asks)
+        ask_for(leg.name, leg.asks)
         for measure in leg.measures:
             readings.append(reading(measure, leg.name, rides, answers))
             if measure.what == "turned":

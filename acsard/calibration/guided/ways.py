@@ -94,6 +94,7 @@ LINE = "front", "rear", "wheelbase"
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
     def spun(how: str, side: int, rate: float, since: str) -> Leg:
+        # `rate` is a true rate, rad/s. Two rates show how the track depends on the rate.
         count = turns(setup, rate, track, 3)
         around = setup.turn(side * 2 * math.pi * count, rate, track)
         to = "left" if side > 0 else "right"
@@ -136,6 +137,9 @@ GAP_M = 0.2
 OUT_M = 0.9
 """Distance that the robot drives before the turns on the spot, m."""
 
+HALF_RATE, ROUND_RATE = 0.8, 1.2
+"""True rates of the half turns and of the whole turns, rad/s."""
+
 SQUARE = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
 )
@@ -154,11 +158,11 @@ REAR, FRONT = ("left", "right", "rear width"), ("right", "left", "front width")
 
 
 def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
-    out, count = setup.ahead(setup.length), turns(setup, 1.2, track, 2)
-    around = setup.turn(-2 * math.pi * count, 1.2, track)
+    out, count = setup.ahead(setup.length), turns(setup, ROUND_RATE, track, 2)
+    around = setup.turn(-2 * math.pi * count, ROUND_RATE, track)
 
     def there_and_back(to: str, side: int) -> Leg:
-        half = setup.turn(side * math.pi, 0.8, track)
+        half = setup.turn(side * math.pi, HALF_RATE, track)
         home = setup.ahead(setup.length - 2 * GAP_M)
         return Leg(
             f"half round to the {to}",
@@ -212,6 +216,9 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 SIDE_M = 1.2
 
+CORNER_RATE = 0.9
+"""True turn rate at the corners, rad/s."""
+
 
 def side_of_square(setup: Setup) -> float:
     """Return the length of the square's side, m."""
@@ -231,7 +238,7 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     )  # fmt: skip
 
     def square(to: str, other: str, side: int) -> Leg:
-        corner = setup.turn(side * math.pi / 2, 0.9, track)
+        corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
             f"Set the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far from "

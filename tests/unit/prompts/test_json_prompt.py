@@ -242,6 +242,14 @@ def test_what_is_found_is_told_as_it_is_made_with_how_far_it_is(program: Program
     assert max(shares) < 1.0
 
 
+def test_the_result_ends_the_progress(program: Program) -> None:
+    with program.hears(JsonPrompt()) as person:
+        person.progress(0.5)
+        person.result("\nall of it\n")
+    assert program.told("progress") == [0.5, 1.0]
+    assert program.said[-1] == {"result": "all of it"}
+
+
 OFFERED = {"mcu.baud_rate": 57600}
 
 

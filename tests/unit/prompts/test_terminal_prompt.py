@@ -97,3 +97,11 @@ def test_nobody_measures_nothing() -> None:
     assert NoPrompt().number(OPTIONAL) == 0.0
     with pytest.raises(NobodyError, match=re.escape("leave --yes out")):
         NoPrompt().number(DISTANCE)
+
+
+@pytest.mark.parametrize(("as_json", "shown"), [(False, "robot acsar\n"), (True, "")])
+def test_the_subject_is_left_out_of_the_output_of_one_object(
+    as_json: bool, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    TerminalPrompt(as_json).begin("robot acsar", simulated=False)
+    assert capsys.readouterr().out == shown

@@ -17,6 +17,7 @@ from acsard.calibration.guided.legs import (
     Move,
     setup,
 )
+from acsard.calibration.guided.ways import WAYS
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from tests.unit.calibration.guided.room import beyond
 
@@ -58,9 +59,6 @@ def test_a_turn_by_the_true_track_is_the_angle_whatever_is_configured(
 ) -> None:
     move = setup(robot(multiplier=multiplier)).turn(angle, 0.9, track)
     assert move.angular * multiplier / track * move.seconds == pytest.approx(angle)
-
-
-WAYS = "gyro", "positions", "tape", "wall", "umbmark"
 
 
 @pytest.mark.parametrize("way", WAYS)
