@@ -127,9 +127,9 @@ def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Pa
 @pytest.mark.parametrize(
     "words",
     [
-        ["doctor"], ["top"], ["fleet"], ["echo", "state", "-n1", "--short"],
-        ["echo", "odom", "-n1"],
-        ["hz", "odom", "-n2"], ["topics"], ["check"], ["set"], ["whoami"], ["odom"],
+        ["doctor"], ["top"], ["fleet"], ["odom"], ["echo", "odom", "-n1"],
+        ["topics"], ["hz", "odom", "-n2"], ["check"], ["set"], ["whoami"],
+        ["echo", "state", "-n1", "--short"],
         ["get", "nonsense"], ["call", "nonsense"], ["set", "limits.linear_speed", "-1"], ["drive"],
     ],
     ids=" ".join,

@@ -1,7 +1,7 @@
 """A real daemon ends in every way and starts again under a commander that never stops sending.
 
-The commander sends zeros for 0.3 s every 2 s and a speed in between, so it arms itself after every
-start: only the latch holds the robot. The ways that need systemd are in `tests/systemd`.
+The commander sends zeros for 0.3 s every second and a speed in between, so it arms itself after
+every start: only the latch holds the robot. The ways that need systemd are in `tests/systemd`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Way = Literal["kill", "crash", "abort", "term"]
 
 MODES = {"stop": "stopped", "fault": "fault", "inactive": "inactive"}
 
-CYCLE_S = 2.0
+CYCLE_S = 1.0
 """Time in which the commander sends its zeros once and then a speed."""
 
 CRASH = """\
