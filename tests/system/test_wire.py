@@ -104,7 +104,7 @@ def test_speeds_on_the_wire_grow_by_the_acceleration_limit_only(started: Started
 def test_a_trailing_comma_and_wired_signs_and_letters_apply_on_the_wire(
     tmp_path: Path, peer: Peer
 ) -> None:
-    config = {
+    config: Tables = {
         "mcu": {"port": str(peer.path), "trailing_comma": True},
         "mcu.wheels": {
             "front_right": "-b", "front_left": "+a", "rear_left": "+c", "rear_right": "+d",
