@@ -14,6 +14,7 @@ from acsard.client.riding import HELD_UP, Phase, Riding
 from acsard.core.config.settings import DriveConfig
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import REST, Twist
+from tests.each import each
 
 LEG = Leg("", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
 TURN = Leg("", (Move(5.0, 0.0, 0.5),), by_key=True)
@@ -101,7 +102,7 @@ STOPS: dict[str, Late] = {
 }
 
 
-@pytest.mark.parametrize("why", STOPS)
+@each("why", STOPS)
 def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
     world = World(Leg("", (Move(10.0, 0.3),))).until_moving()
     world.tells = STOPS[why]

@@ -7,6 +7,7 @@ import pytest
 from acsard.cli import foxglove as verb
 from acsard.foxglove.address import DEFAULT, loopback
 from acsard.host.errors import UsageError
+from tests.each import each
 
 
 @pytest.mark.parametrize(
@@ -27,9 +28,7 @@ def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str
         loopback(text)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"]
-)
+@each("text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"])
 def test_what_is_no_address_is_told_how_to_write_one(text: str) -> None:
     with pytest.raises(UsageError, match=r"write it like 127\.0\.0\.1:8765"):
         loopback(text)

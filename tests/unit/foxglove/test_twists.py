@@ -10,13 +10,14 @@ from acsard.core.messages.schema import Header, Time, TwistStamped, Vector3
 from acsard.core.messages.schema import Twist as Message
 from acsard.core.values import NS_PER_S, Twist
 from acsard.foxglove.twists import encoding_of, wish
+from tests.each import each
 
 MESSAGE = Message(Vector3(x=0.3), Vector3(z=-0.2))
 STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
 
 
-@pytest.mark.parametrize("name", ["geometry_msgs/Twist", "geometry_msgs/msg/Twist"])
-@pytest.mark.parametrize("form", ["json", "cdr"])
+@each("name", ["geometry_msgs/Twist", "geometry_msgs/msg/Twist"])
+@each("form", ["json", "cdr"])
 def test_a_panel_s_twist_is_read(name: str, form: str) -> None:
     encoding = encoding_of(form, name)
     found = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
@@ -30,7 +31,7 @@ def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
     assert found == Wish(Twist(0.3, -0.2), 5 * NS_PER_S)
 
 
-@pytest.mark.parametrize(
+@each(
     ("form", "name"),
     [
         ("json", "std_msgs/msg/String"),
@@ -45,7 +46,7 @@ def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> 
         encoding_of(form, name)
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         b"",
@@ -64,7 +65,7 @@ def test_what_is_no_twist_is_refused(payload: bytes) -> None:
             wish(encoding, payload)
 
 
-@pytest.mark.parametrize("cut", range(0, 52, 4))
+@each("cut", range(0, 52, 4))
 def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
     with pytest.raises(DecodeError):
         wish(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])
