@@ -65,7 +65,7 @@ def test_delays_that_grow_slowly_are_not_taken_for_a_clock(
 def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
     way: Way, plateau: float
 ) -> None:
-    seconds = 20.0
+    seconds = 12.0
     oldest, obeyed = driven_over(way, lambda t: plateau if t > 3.0 else 0.0, seconds)
     assert obeyed > 20
     assert oldest <= bound(way, seconds)
