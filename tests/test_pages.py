@@ -185,7 +185,7 @@ def test_what_proves_a_promise_is_there(arguments: list[str]) -> None:
 # other blocks
 
 
-@pytest.mark.parametrize("block", blocks("toml"), ids=at)
+@each("block", blocks("toml"))
 def test_lines_for_the_configuration_are_accepted(block: Block) -> None:
     for table, values in tomllib.loads(block.text).items():
         kind: Any = type(getattr(Config(), table))
@@ -227,7 +227,7 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize("page", PAGES)
+@each("page", PAGES)
 def test_every_link_leads_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
         if "://" in target:

@@ -69,7 +69,6 @@ def recorded(path: Path, seconds: float) -> Path:
     config = replace(Config(), record=replace(Config().record, directory=str(path.parent)))
     box = Streamed(path, config, START)
     world = World(config, recorder=box)
-    world.bus.wanted = set()
     world.drive(0.3, 0.2, 1.0)
     while world.now_ns - START.mono_ns < seconds * 1e9:
         for linear, angular in ((0.4, 0.3), (-0.2, 0.5), (0.0, -0.8), (0.5, 0.0)):

@@ -15,7 +15,6 @@ from tests.scenarios.world import World
 def driven(counts: int, reporting: bool) -> World:
     """Drive about for ten seconds and stop. The board reports by its own clock or when prompted."""
     world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
-    world.bus.wanted = set()
     with world.mcu.free_running(0.01) if reporting else nullcontext():
         world.run(0.5)
         for _ in range(4):

@@ -40,8 +40,9 @@ from acsard.recording.file import Recording
 from acsard.recording.published import MEASURED, Publisher
 from acsard.recording.replay import lived
 from acsard.recording.replayed import Course
+from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
-from tests.scenarios.world import World
+from tests.scenarios.world import EVERY_KEY, World
 
 CHECKED = replace(
     Config(),
@@ -59,7 +60,7 @@ def driven(config: Config) -> tuple[World, Tape]:
     The client in it subscribed to everything.
     """
     tape = Tape()
-    world = World(config, recorder=tape)
+    world = World(config, recorder=tape, wanted=EVERY_KEY)
     world.bus.publish("tf_static", world.loop.report.tf_static())
     drive_through_faults(world, 4.0)
     happenings(world, random.Random(1))
@@ -116,7 +117,7 @@ def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
     assert len(then) == len(now) > 0
 
 
-@pytest.mark.parametrize("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out"])
+@each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out"])
 def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> None:
     world, _, said = both
     assert_same(world.bus.published[key], said[key])

@@ -190,7 +190,6 @@ def test_without_the_setting_nobody_listens_to_a_gyro() -> None:
 
 def gone_silent(made: World, seed: int) -> Drive:
     """The gyro teaches for a while and dies; then only the wheels remain."""
-    made.bus.wanted = {"odom"}
     wandering(made, seed, seconds=30.0)
     made.gyro_dead = True
     made.hold(0.0, 0.0, 1.0)
@@ -231,7 +230,6 @@ def test_the_covariance_knows_how_well_the_track_is_known() -> None:
 def test_what_was_learned_is_lived_again_to_the_last_bit() -> None:
     tape = Tape()
     made = world(learned_track=True, recorder=tape)
-    made.bus.wanted = set()
     wandering(made, 13, seconds=25.0)
     assert " in use, configured" in made.state.effective_track
     made.gyro_dead = True

@@ -289,7 +289,6 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
     seconds: float,
 ) -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.05)))
-    world.bus.wanted = set()
     with world.mcu.free_running(0.05):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
@@ -473,7 +472,7 @@ def test_a_board_that_is_silent_now_and_then_is_counted() -> None:
 
 
 def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
-    world = World(Config(sim=SimConfig(faults=("mute",))))
+    world = World(Config(sim=SimConfig(faults=("mute",))), wanted={"state"})
     world.run(10.0)
     states = [one for one in world.bus.published["state"] if isinstance(one, RobotState)]
     assert {state.link for state in states} == {"booting"}
@@ -491,7 +490,7 @@ def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
 def test_a_silent_or_garbled_board_is_told_by_what_was_heard(
     fault: str, heard: str, mend: str
 ) -> None:
-    world = World()
+    world = World(wanted={"state"})
     with world.mcu.having(named(fault)):
         world.run(2.9)
         assert "first good lines" in world.state.reason

@@ -31,6 +31,7 @@ from acsard.core.messages.schema import DiagnosticArray
 from acsard.core.simulator import protocol
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.values import NS_PER_S, Instant, Outputs, Received
+from tests.each import each
 from tests.scenarios.world import VirtualPort, World
 from tests.unit.core.link.test_damage import drive as replies_of_a_drive
 
@@ -429,7 +430,6 @@ def test_over_a_long_drive_counts_and_clock_wrap_and_nothing_jumps() -> None:
     world = World(fine)
     world.mcu._on_ns -= 60 * NS_PER_S  # run for a minute: the clock wraps in 5 s
     world.run(0.3)
-    world.bus.wanted = set()
     last = (0.0, 0.0)
     for _ in range(15):
         world.drive(0.9, 0.9, seconds=1.0)
@@ -622,8 +622,8 @@ def test_a_plain_link_that_echoes_is_found_out_when_the_speed_changes(
     assert world.state.mode == "driving"
 
 
-@pytest.mark.parametrize("period", [0.0, 0.05])
-@pytest.mark.parametrize(
+@each("period", [0.0, 0.05])
+@each(
     ("lag", "counts"),
     [(0.0, 3200), (0.002, 3200), (0.002, 1_000_000), (0.05, 3200), (0.05, 1_000_000),
      (0.3, 3200), (0.3, 1_000_000)],
@@ -645,7 +645,6 @@ def test_no_board_that_measures_is_taken_for_an_echo(
         }
         limits = replace(LimitsConfig(), angular_speed=1.0, **rates)
         world = World(replace(plain, limits=limits))
-        world.bus.wanted = set()
         with world.mcu.free_running(period) if period else nullcontext():
             world.mcu.unpadded_replies, world.mcu.ending = False, "\r\n"
             world.run(0.5)

@@ -165,7 +165,6 @@ def test_ordinary_drives_are_never_doubted(counts: int, seconds: int) -> None:
     """The robot skids on a slippery floor, has coarse encoders, and is sometimes pushed."""
     sim = SimConfig(encoder_counts=counts, track_multiplier=1.6, turn_slip=0.5)
     made, dice = world(sim=sim, fault_time=0.5), random.Random(counts)
-    made.bus.wanted = set()
     made.send(0.0)
     made.run(0.1)
     while made.now_ns < (6.5 + seconds) * NS_PER_S:

@@ -150,7 +150,6 @@ def shove(world: World, mode: str, dice: random.Random) -> None:
 def test_no_hand_latches_a_fault_whatever_the_mode(count: int, world: World) -> None:
     dice, kinds = random.Random(7), Counter[str]()
     modes = ("ready", "inactive", "stopped", "fault", "driving")
-    world.bus.wanted = set()
     for trial in range(count):
         mode = modes[trial % len(modes)]
         enter(world, mode, dice)
@@ -231,9 +230,8 @@ def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_spee
     kind, seconds = interruption
     for linear, angular in ((1, 0), (-1, 1), (0.5, 0), (0, 4), (0.7, -2), (-0.3, 0)):
         world = World(Config(sim=SimConfig(motor_time_constant=lag)))
-        world.bus.wanted = set()
         world.run(0.2)
-        world.drive(linear, angular, seconds=2.5)
+        world.drive(linear, angular, seconds=1.7)
         if kind == "clear":
             world.put("stop", b"")
             world.run(seconds)
@@ -245,7 +243,7 @@ def test_motors_that_lag_are_no_runaway_when_the_daemon_has_forgotten_their_spee
             world.port.unplug()
             world.run(seconds)
             world.port.plug(world.mcu)
-        world.run(3.0)
+        world.run(2.0)
         assert told(world, "fault") == []
 
 
@@ -305,7 +303,6 @@ def test_feedback_as_sparse_as_may_be_raises_no_false_alarm_even_with_lines_lost
     config = Config(mcu=McuConfig(reply_period=0.25), sim=SimConfig(motor_time_constant=lag))
     assert contradictions(config) == []
     world, dice = World(config), random.Random(3)
-    world.bus.wanted = set()
     with world.mcu.free_running(0.25), world.mcu.lost_replies(3):
         world.run(3.0)
         world.send(0.0)

@@ -7,6 +7,7 @@ import argparse
 import pytest
 
 from acsard.cli import accuracy
+from tests.each import each
 
 
 def parsed(*words: str) -> argparse.Namespace:
@@ -20,7 +21,7 @@ def test_it_looks_for_ten_seconds_and_ends() -> None:
     assert (args.seconds, args.follow, args.json) == (5.0, False, False)
 
 
-@pytest.mark.parametrize("seconds", ["0", "0.5", "601", "nan", "-3", "long"])
+@each("seconds", ["0", "0.5", "601", "nan", "-3", "long"])
 def test_times_that_tell_nothing_are_refused(seconds: str) -> None:
     with pytest.raises(SystemExit):
         parsed("--seconds", seconds)

@@ -13,6 +13,7 @@ import pytest
 from acsard.cli import VERBS, main
 from acsard.cli.completion import SHELLS
 from acsard.host.errors import Exit
+from tests.each import each
 from tests.system.harness import Program, environment, until
 from tests.system.test_cli import Terminal
 from tests.system.typed import typed
@@ -71,7 +72,7 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "offered"),
     [
         ("acsard ca", {"call", "calibrate"}),
@@ -94,7 +95,7 @@ def test_bash_offers_verbs_options_and_values(
     assert set(offers("bash", "-c", ask)) == offered
 
 
-@pytest.mark.parametrize(("words", "offered"), VALUES)
+@each(("words", "offered"), VALUES)
 def test_fish_offers_the_same_values(
     scripts: dict[str, Path], words: str, offered: set[str]
 ) -> None:

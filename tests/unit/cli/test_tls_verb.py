@@ -30,6 +30,7 @@ from acsard.cli import main
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit
 from acsard.host.own_identity import own_addresses
+from tests.each import each
 
 ROLES = ("viewer", "operator", "maintainer")
 
@@ -106,7 +107,7 @@ def test_each_place_has_the_certificate_of_the_one_authority(made: Path) -> None
         assert (made / place / "ca.pem").read_bytes() == authority
 
 
-@pytest.mark.parametrize("place", PLACES)
+@each("place", PLACES)
 def test_a_key_belongs_to_its_certificate(made: Path, place: str) -> None:
     key = load_pem_private_key((made / place / "key.pem").read_bytes(), None)
     assert isinstance(key, ec.EllipticCurvePrivateKey)
@@ -114,9 +115,7 @@ def test_a_key_belongs_to_its_certificate(made: Path, place: str) -> None:
     assert key.public_key() == certificate(made / place).public_key()
 
 
-@pytest.mark.parametrize(
-    ("place", "name"), [(".", "robot"), *((f"clients/{role}", role) for role in ROLES)]
-)
+@each(("place", "name"), [(".", "robot"), *((f"clients/{role}", role) for role in ROLES)])
 def test_the_common_name_is_whose_it_is(made: Path, place: str, name: str) -> None:
     assert common_name(certificate(made / place).subject) == name
 
@@ -137,7 +136,7 @@ def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) 
         assert (usage.key_cert_sign, usage.digital_signature) == (False, True)
 
 
-@pytest.mark.parametrize("place", PLACES)
+@each("place", PLACES)
 def test_a_certificate_serves_at_both_ends_of_a_link(made: Path, place: str) -> None:
     usage = certificate(made / place).extensions.get_extension_for_class(x509.ExtendedKeyUsage)
     assert set(usage.value) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
@@ -153,7 +152,7 @@ def test_the_robot_is_known_by_its_names_and_the_addresses_given(made: Path) -> 
     assert given <= set(found.get_values_for_type(x509.IPAddress))
 
 
-@pytest.mark.parametrize("place", PLACES)
+@each("place", PLACES)
 def test_a_certificate_holds_from_a_little_before_now_for_the_days_asked(
     made: Path, place: str
 ) -> None:

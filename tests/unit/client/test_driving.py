@@ -21,6 +21,7 @@ from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
+from tests.each import each
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"
@@ -358,7 +359,7 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
     assert world.sent == []
 
 
-@pytest.mark.parametrize(
+@each(
     ("state", "words"),
     [
         (FOLLOWED, ""),

@@ -45,6 +45,7 @@ from acsard.core.values import (
     Verb,
     WheelSpeeds,
 )
+from tests.each import each
 
 MS = 1_000_000
 WALL_NS = 1_800_000_000 * NS_PER_S
@@ -1100,7 +1101,7 @@ def random_walk(seed: int) -> list[Outputs]:
     return found
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_the_same_inputs_give_the_same_outputs(seed: int) -> None:
     first = random_walk(seed)
     assert first == random_walk(seed)

@@ -22,6 +22,7 @@ from acsard.doctor.daemon_findings import (
 )
 from acsard.doctor.finding import Finding
 from acsard.doctor.running import Running
+from tests.each import each
 from tests.unit.doctor.test_running import INFO, STATE
 
 NOW = 1_800_000_000_000_000_000
@@ -84,7 +85,7 @@ def test_a_gyro_that_does_what_it_should_is_no_warning(does: str) -> None:
     assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
 
 
-@pytest.mark.parametrize("does", ["silent", "disagrees", "not believed", "what a later one does"])
+@each("does", ["silent", "disagrees", "not believed", "what a later one does"])
 def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
     (finding,) = gyro(does, {})
     assert (finding.subject, finding.level) == ("gyro", "warning")
@@ -142,7 +143,7 @@ def test_lines_that_are_not_answered_are_a_warning() -> None:
     assert "mcu check" in finding.mend
 
 
-@pytest.mark.parametrize(
+@each(
     ("sent", "came", "period", "told"),
     [(100, 100, 0.0, 0), (100, 98, 0.0, 0), (100, 97, 0.0, 0), (100, 96, 0.0, 1),
      (100, 130, 0.0, 0), (10, 0, 0.0, 0), (100, 10, 0.1, 0)],

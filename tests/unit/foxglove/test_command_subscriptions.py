@@ -15,6 +15,7 @@ from acsard.core.messages.topics import full_key
 from acsard.core.ros.attachments import Attachment
 from acsard.core.ros.transports import command_keys
 from acsard.foxglove.command_subscriptions import Reader, Way, ways
+from tests.each import each
 
 TWIST = Twist(Vector3(x=0.3), Vector3(z=-0.2))
 STAMPED = TwistStamped(Header(Time(5), "elsewhere"), TWIST)
@@ -56,8 +57,8 @@ def test_a_namespace_is_before_the_names_of_ros_and_a_tree_that_is_off_has_none(
     assert len(found("nav", RosConfig(bridge=False, rmw=False))) == 4
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("message", [TWIST, STAMPED], ids=["plain", "stamped"])
+@each("form", FORMATS)
+@each("message", [TWIST, STAMPED])
 def test_a_twist_is_told_with_the_time_it_came(form: Format, message: Twist | TwistStamped) -> None:
     told = read(encode(message, form))
     assert told == TwistStamped(Header(Time(9, 1), "base_link"), TWIST)
@@ -93,7 +94,7 @@ def test_wheels_and_frame_are_those_of_this_robot() -> None:
     assert told.twist.linear.x == pytest.approx(0.6)
 
 
-@pytest.mark.parametrize(
+@each(
     ("payload", "put"),
     [
         (b'{"linear": {"x": 1}}', True),

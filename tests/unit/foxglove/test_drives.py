@@ -22,6 +22,7 @@ from acsard.foxglove import drives
 from acsard.foxglove.drives import Drives, Viewer, encoding_of, wish
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
+from tests.each import each
 from tests.system.harness import until
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
@@ -172,7 +173,7 @@ def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers
     viewers.heard(1, 1)
 
 
-@pytest.mark.parametrize(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
+@each(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
 def test_a_panel_that_publishes_too_seldom_is_known(rate: float, slow: bool) -> None:
     assert told_slow(NS_PER_S / rate) is slow
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import Events, LogEvent, Time
 from acsard.foxglove.relay import News
+from tests.each import each
 
 KEPT = 20
 
@@ -33,7 +33,7 @@ def test_who_opens_the_log_gets_all_that_is_still_known() -> None:
     assert len(News().of(events(1000))) == KEPT
 
 
-@pytest.mark.parametrize(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
+@each(("before", "now"), [(3, 4), (3, 3), (0, 5), (19, 23), (40, 60), (40, 55)])
 def test_each_is_told_once(before: int, now: int) -> None:
     news = News()
     news.of(events(before))

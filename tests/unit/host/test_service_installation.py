@@ -25,12 +25,13 @@ from acsard.host.service_installation import (
     strangers,
     uninstalling,
 )
+from tests.each import each
 
 PROGRAM = "/usr/bin/env"
 """A program that every user may run."""
 
 
-@pytest.mark.parametrize(
+@each(
     ("prefix", "base", "good"),
     [
         ("/opt/acsard/venv", "/usr", True),

@@ -197,7 +197,6 @@ def test_the_minute_before_and_after_what_happened_is_kept(
     monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
     monkeypatch.setattr(retention, "AROUND_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
-    bench.world.bus.wanted = set()
 
     def rest(seconds: float) -> None:
         for _ in range(round(seconds * 2)):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
-import pytest
 from rich.cells import cell_len
 
 from acsard.core.messages.schema import SourceState
+from tests.each import each
 from tests.unit.top.screens import SEEN, STATE, line_with, lines_of, of, painted
 
 WIDTHS = (40, 60, 80, 160)
@@ -30,7 +30,7 @@ def read(width: int) -> str:
     return " ".join(" ".join(lines_of(FULL, width, None)).split())
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@each("width", WIDTHS)
 def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
     told, lines = read(width), lines_of(FULL, width, None)
     for figure in (

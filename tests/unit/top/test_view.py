@@ -14,6 +14,7 @@ from acsard.core.messages.schema import Latency, RobotState, SourceState, Spread
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
 from acsard.top.screen_data import MODES, ScreenData
+from tests.each import each
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
 ENOUGH = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"
@@ -32,7 +33,7 @@ def test_the_head_says_who_where_and_how_fresh() -> None:
         assert told in head
 
 
-@pytest.mark.parametrize("mode", list(Mode))
+@each("mode", list(Mode))
 def test_every_mode_has_a_badge_of_its_colour_and_its_reason(mode: Mode) -> None:
     seen = of(mode=mode.value, reason="because")
     assert lines_of(seen)[1].strip() == f"{mode.value.upper()}   because"

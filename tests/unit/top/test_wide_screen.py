@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from acsard.core.messages.schema import Latency, SourceState, Time
 from acsard.daemon.latencies import NAMES
 from acsard.top.wide_screen import FIGURES
+from tests.each import each
 from tests.unit.top.screens import (
     BEFORE,
     INFO,
@@ -41,7 +42,7 @@ def test_the_wheels_are_where_they_are_on_the_robot() -> None:
     assert re.search(r"rear  ▲ \+12.50 .*▼  -7.50", line_with("rear"))
 
 
-@pytest.mark.parametrize("wheels", [[], [1.0], [1.0] * 9, [float("nan")] * 4])
+@each("wheels", [[], [1.0], [1.0] * 9, [float("nan")] * 4])
 def test_wheels_that_are_not_four_numbers_are_shown_as_far_as_they_go(wheels: list[float]) -> None:
     assert len(lines_of(of(wheels=wheels))) == 24 - 1
 
@@ -75,8 +76,8 @@ def test_rates_are_taken_between_two_states() -> None:
     assert "-/s of 1,200" in line_with("superseded", replace(SEEN, state=BEFORE, before=STATE))
 
 
-@pytest.mark.parametrize("set_by", [3600, -3600, 1, -1])
-@pytest.mark.parametrize("width", [80, 60])
+@each("set_by", [3600, -3600, 1, -1])
+@each("width", [80, 60])
 def test_a_robot_s_clock_that_is_set_changes_no_rate(set_by: int, width: int) -> None:
     stepped = replace(STATE, stamp=Time(1000 + set_by, 0))
     told = "\n".join(lines_of(replace(SEEN, state=stepped, passed=1.0), width))
@@ -103,7 +104,7 @@ def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
     assert "nothing" in line_with("rejected")
 
 
-@pytest.mark.parametrize("does", ["used", "silent", "disagrees", "not believed"])
+@each("does", ["used", "silent", "disagrees", "not believed"])
 def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
     assert line_with("gyro", of(gyro=does)).split(maxsplit=1)[1].startswith(does)
     assert not any("gyro" in line for line in lines_of(SEEN))

@@ -13,6 +13,7 @@ from acsard.calibration.guided.ways import WAYS
 from acsard.cli import calibrate, mcu
 from acsard.web.frames import Begin, FrameError
 from acsard.web.jobs import KEY, Reach, words
+from tests.each import each
 
 REACH = Reach("/etc/acsard/acsard.toml", "tls/robot:7447", "robot2", "/etc/acsard/tls")
 PORTS = ("/dev/acsar", "sim")
@@ -34,7 +35,7 @@ def test_a_check_has_the_port_and_the_file_and_asks() -> None:
     assert [args.yes, args.write, args.wheels_are_lifted] == [False] * 3
 
 
-@pytest.mark.parametrize("way", ["", *NEEDS])
+@each("way", ["", *NEEDS])
 def test_a_calibration_goes_to_the_robot_of_the_page_and_asks(way: str) -> None:
     positions = "sim/pose" if way == "positions" else ""
     args = parsed(words(Begin("calibrate", "", way, positions), REACH, ()))
@@ -51,7 +52,7 @@ def test_what_is_not_known_is_not_given() -> None:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     "wish",
     [
         Begin("check", ""),
@@ -102,7 +103,7 @@ def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:
     assert [one for one in NEEDS if one not in why] == []
 
 
-@pytest.mark.parametrize("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
+@each("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
 def test_what_is_no_key_is_no_positions(key: str) -> None:
     assert not KEY.match(key)
     assert KEY.match("sim/pose")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import msgspec
-import pytest
 from msgspec.structs import replace
 
 from acsard.core.messages.schema import Latency, RobotState, Spread, Time, Twist, Vector3
 from acsard.core.values import NS_PER_S
 from acsard.web.last_minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
+from tests.each import each
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
@@ -56,7 +56,7 @@ def test_it_is_the_last_minute_and_no_more_however_long_it_goes_on() -> None:
     assert {len(column) for column in columns(told)} == {len(told.age)}
 
 
-@pytest.mark.parametrize("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
+@each("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
 def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns: int) -> None:
     told = lived(100.0, look_ns).plotted(100 * NS_PER_S)
     assert len(told.age) <= ROWS

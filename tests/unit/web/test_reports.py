@@ -15,6 +15,7 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.web import reports
 from acsard.web.reports import BYTES, KEEP_NS, NICE, Reports, ReportState
+from tests.each import each
 
 PATIENCE_S = 30.0
 
@@ -85,7 +86,7 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
     run(story)
 
 
-@pytest.mark.parametrize(
+@each(
     ("program", "why"),
     [
         ("import sys; sys.exit('acsard: needs the library plotly; run: pip')", "needs the library"),

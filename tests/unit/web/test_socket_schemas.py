@@ -20,6 +20,7 @@ from acsard.web.openapi import KEYS, LINES, SENT, VALUE
 from acsard.web.socket_sender import Following
 from acsard.web.streams import KEYS as FOLLOWED
 from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
+from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 GREETING = socket_messages.Greeting(
@@ -62,14 +63,14 @@ def test_all_that_may_be_followed_is_described() -> None:
     }
 
 
-@pytest.mark.parametrize("message", SAID, ids=lambda one: type(one).__name__)
+@each("message", SAID)
 def test_what_is_said_is_as_described_and_nothing_of_it_may_be_missing(message: Struct) -> None:
     frame = as_told(message)
     assert kinds([frame]) == {type(message).__name__}
     assert [one for one in spoilt(frame) if taken(one)] == []
 
 
-@pytest.mark.parametrize("line", GUIDED, ids=lambda one: type(one).__name__)
+@each("line", GUIDED)
 def test_what_a_check_or_calibration_says_is_as_described(line: Struct) -> None:
     assert kinds([as_told({"guide": line})]) == {"Guided", type(line).__name__}
     assert not taken({"guide": {}})

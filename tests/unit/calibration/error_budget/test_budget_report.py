@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.calibration.error_budget.budget_report import advice, parts
 from acsard.terminal.output import SENTENCES, plain
+from tests.each import each
 
 DRIVEN = Budget(
     10.0, 4.0, 400.0, 1000, 3, 0.25, 0.004, 0.01, 0, gyro=False, still=False,
@@ -30,7 +31,7 @@ def text(budget: Budget) -> str:
 KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
 
 
-@pytest.mark.parametrize(
+@each(
     ("cause", "says"),
     [
         ("time", "latency_timer"),

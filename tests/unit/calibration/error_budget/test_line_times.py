@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from acsard.calibration.error_budget.drive_log import places
+from tests.each import each
 
 PERIOD = 0.01
 NONE = np.zeros(0)
@@ -19,7 +20,7 @@ def test_even_lines_are_in_their_places() -> None:
     assert not found.missing.any()
 
 
-@pytest.mark.parametrize("period", [0.00997, 0.01, 0.0102, 0.05])
+@each("period", [0.00997, 0.01, 0.0102, 0.05])
 def test_the_period_need_not_be_known(period: float) -> None:
     t = np.asarray(np.arange(400) * period, dtype=np.float64)
     assert places(t, NONE).period == pytest.approx(period, rel=1e-6)
@@ -40,7 +41,7 @@ def test_an_adapter_that_holds_lines_loses_none() -> None:
     assert 0.003 < float(np.std(found.late)) < 0.006  # a uniform delay over 16 ms has 4.6
 
 
-@pytest.mark.parametrize("gone", [1, 2, 5, 20])
+@each("gone", [1, 2, 5, 20])
 def test_lines_that_do_not_come_are_missing_where_they_were(gone: int) -> None:
     rng = np.random.default_rng(1)
     kept = np.delete(EVEN, np.arange(300, 300 + gone)) + rng.uniform(0, 0.001, 600 - gone)

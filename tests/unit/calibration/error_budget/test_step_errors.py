@@ -11,6 +11,7 @@ from acsard.calibration.error_budget.drive_log import motion
 from acsard.calibration.error_budget.step_errors import Driving, Floats, Steps, rounding
 from acsard.core.config.settings import DriveConfig
 from acsard.core.motion.kinematics import Kinematics
+from tests.each import each
 from tests.unit.calibration.error_budget.drives import Told, late, rounded
 
 PERIOD, COUNT = 0.01, 4000
@@ -55,7 +56,7 @@ def test_a_wheel_that_stands_does_not_err() -> None:
     assert not rounding(np.zeros((COUNT, 4)), PERIOD).variance.any()
 
 
-@pytest.mark.parametrize("counts", [96, 400, 1000, 4000])
+@each("counts", [96, 400, 1000, 4000])
 def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int) -> None:
     rng = np.random.default_rng(counts)
     step = math.tau / counts
@@ -67,7 +68,7 @@ def test_a_firmware_that_counts_in_each_period_is_told_by_its_speeds(counts: int
     assert found.offset[:, 0].sum() == pytest.approx((said * PERIOD - counted).sum(), abs=0.1)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@each("seed", range(20))
 def test_a_firmware_that_filters_is_not_taken_for_one_that_counts(seed: int) -> None:
     rng = np.random.default_rng(seed)
     said: Floats = np.cumsum(rng.normal(0, 0.2, (300, 4)), axis=0).round(2)

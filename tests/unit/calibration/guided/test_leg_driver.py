@@ -14,6 +14,7 @@ from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import REST, Twist
+from tests.each import each
 
 US, OTHER = "joe/1/aa", "joe/2/bb"
 LEG = Leg("", "", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
@@ -109,7 +110,7 @@ STOPS: dict[str, Late] = {
 }
 
 
-@pytest.mark.parametrize("why", STOPS)
+@each("why", STOPS)
 def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
     world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
     world.tells = STOPS[why]

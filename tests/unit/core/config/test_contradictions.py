@@ -17,6 +17,7 @@ from acsard.core.config.settings import (
     RosConfig,
     SimConfig,
 )
+from tests.each import each
 
 
 def problems(**tables: object) -> list[str]:
@@ -56,7 +57,7 @@ def test_a_plain_endpoint_stays_on_this_machine_even_with_certificates(endpoint:
     assert problems(bus=BusConfig(listen=(endpoint,), insecure=True)) == []
 
 
-@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
+@each("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
 def test_anything_else_is_no_endpoint(endpoint: str) -> None:
     (line,) = problems(bus=BusConfig(listen=(HERE, endpoint), tls="/etc/acsard/tls"))
     assert "not an endpoint" in line
@@ -68,7 +69,7 @@ def test_a_client_needs_somewhere_to_connect_to() -> None:
     assert problems(bus=BusConfig(mode="client", connect=("tcp/127.0.0.1:7447",))) == []
 
 
-@pytest.mark.parametrize("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
+@each("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
 def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
     listen: tuple[str, ...],
 ) -> None:
@@ -141,7 +142,7 @@ def test_the_sample_fields_take_more_still() -> None:
     assert "control.rate = 80 takes 86% of the wire at 57600 baud" in warning
 
 
-@pytest.mark.parametrize(
+@each(
     ("mcu", "count"),
     [
         (McuConfig(), 33),

@@ -10,9 +10,10 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.named_faults import NamedFault, forms, named
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config, McuConfig, SimConfig
+from tests.each import each
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "values"),
     [
         ("mute", ()),
@@ -53,7 +54,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "words"),
     [*REFUSED, ("", "not a fault"), ("reset=0", "above 0"), ("reset=-1", "above")],
 )
@@ -81,7 +82,7 @@ def test_a_file_may_have_any_of_them() -> None:
     assert config.sim.faults == ("ftdi", "stalls=5:0.15", "stuck_encoder=b")
 
 
-@pytest.mark.parametrize(("text", "words"), REFUSED)
+@each(("text", "words"), REFUSED)
 def test_what_is_no_fault_is_told_with_its_key_and_place(text: str, words: str) -> None:
     (told,) = problems(f'["ftdi", "{text}"]')
     assert told.startswith(f'sim.faults[1] = "{text}": ')
@@ -99,7 +100,7 @@ def test_what_needs_a_timer_is_told_where_it_goes() -> None:
     ]
 
 
-@pytest.mark.parametrize("faults", ['"ftdi"', "[1]", '[""]', r'["mute\n"]', f'["{"x" * 65}"]'])
+@each("faults", ['"ftdi"', "[1]", '[""]', r'["mute\n"]', f'["{"x" * 65}"]'])
 def test_what_is_no_list_of_short_texts_is_told_as_of_any_key(faults: str) -> None:
     (told,) = problems(faults)
     assert told.startswith("sim.faults = ")

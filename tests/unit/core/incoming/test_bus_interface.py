@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
-import pytest
-
 from acsard.core.incoming.bus_interface import GATEWAY_KEY, GatewayTold, RoutersTold
 from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import GatewayState
 from acsard.core.values import Event, RoutersStatus
+from tests.each import each
 
 
 def arrival(payload: bytes, encoding: str = "") -> Arrival:
@@ -49,7 +48,7 @@ def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
     assert daemon.hears(GatewayState(7, 0, 0)) is None
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         b"",

@@ -16,6 +16,7 @@ from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, ImuTold, readin
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.values import Event, GyroSample
+from tests.each import each
 
 ZEROS = [0.0] * 9
 FULL = Imu(
@@ -44,8 +45,8 @@ def turning(rate: float, at_ns: int = 7, who: str = "imu") -> Arrival:
     return said(at_ns, who, angular_velocity={"z": rate})
 
 
-@pytest.mark.parametrize("named", [True, False])
-@pytest.mark.parametrize("form", FORMATS)
+@each("named", [True, False])
+@each("form", FORMATS)
 def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
     encoding = encoding_name(form, "Imu") if named else ""
     got = reading(arrival(encode(FULL, form), encoding))
@@ -90,7 +91,7 @@ REFUSED: dict[str, Arrival] = {
 }
 
 
-@pytest.mark.parametrize("reason", REFUSED)
+@each("reason", REFUSED)
 def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
     counters, events = Counter[str](), list[Event]()
     assert ImuTold().hear(REFUSED[reason], counters, events) is None

@@ -56,6 +56,7 @@ from acsard.core.values import (
     Snapshot,
     WheelsStatus,
 )
+from tests.each import each
 from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
@@ -242,13 +243,13 @@ def close(q: Quaternion, r: Quaternion) -> bool:
     )
 
 
-@pytest.mark.parametrize(("yaw", "turn"), YAWS)
+@each(("yaw", "turn"), YAWS)
 def test_a_yaw_is_its_quaternion(yaw: float, turn: Quaternion) -> None:
     assert close(from_yaw(yaw), turn)
     assert close(from_rpy(0.0, 0.0, yaw), turn)
 
 
-@pytest.mark.parametrize(("quarters", "turn"), RPYS)
+@each(("quarters", "turn"), RPYS)
 def test_quarter_turns_about_fixed_axes_are_their_quaternion(
     quarters: tuple[int, int, int], turn: Quaternion
 ) -> None:
@@ -317,8 +318,8 @@ def test_the_static_transforms_carry_the_time_of_the_start() -> None:
     assert stamps == {Time(1_700_000_000, 0)}
 
 
-@pytest.mark.parametrize("lidar", [True, False])
-@pytest.mark.parametrize("footprint", [True, False])
+@each("lidar", [True, False])
+@each("footprint", [True, False])
 def test_each_static_transform_has_its_own_switch(lidar: bool, footprint: bool) -> None:
     message = static(replace(LIDAR, publish_tf=lidar), replace(FOOTPRINT, publish_tf=footprint))
     names = [transform.child_frame_id for transform in message.transforms]
@@ -413,7 +414,7 @@ def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
 # keys without subscribers
 
 
-@pytest.mark.parametrize("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
+@each("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
 def test_only_what_is_wanted_is_published(wanted: set[str]) -> None:
     found = Report(CONFIG, START).due(OUTPUTS, wanted, look)
     assert sorted(key for key, _ in found) == sorted(wanted - {"tf_static"})
@@ -481,13 +482,13 @@ def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
 # publishing rates
 
 
-@pytest.mark.parametrize("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
+@each("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
 def test_a_rate_of_zero_is_every_sample(key: str) -> None:
     assert times_of(key, CONFIG) == list(range(1000))
 
 
-@pytest.mark.parametrize("key", ["odom", "wheel_states", "cmd_vel_out", "state", "diagnostics"])
-@pytest.mark.parametrize("hz", [1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0])
+@each("key", ["odom", "wheel_states", "cmd_vel_out", "state", "diagnostics"])
+@each("hz", [1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0])
 def test_the_average_rate_is_the_configured_one(key: str, hz: float) -> None:
     times = times_of(key, rates(**{key: hz}))
     assert abs(len(times) - hz * 10) <= 1
@@ -560,7 +561,7 @@ def test_a_pause_is_not_made_up_for_by_a_burst() -> None:
 # last values
 
 
-@pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
+@each("key", sorted(ALL - {"tf_static"}))
 def test_there_is_no_present_value_before_the_first_step(key: str) -> None:
     assert Report(CONFIG, START).current(key, never) is None
 
@@ -570,7 +571,7 @@ def test_the_static_transforms_are_there_from_the_start() -> None:
     assert report.current("tf_static", never) == report.tf_static()
 
 
-@pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
+@each("key", sorted(ALL - {"tf_static"}))
 def test_the_present_value_is_what_was_or_would_have_been_published(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
@@ -585,7 +586,7 @@ def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
     assert odom == published()["odom"]
 
 
-@pytest.mark.parametrize("key", ["", "alive", "cmd/app", "info", "nonsense"])
+@each("key", ["", "alive", "cmd/app", "info", "nonsense"])
 def test_what_is_not_published_has_no_present_value(key: str) -> None:
     report = Report(CONFIG, START)
     report.due(OUTPUTS, ALL, look)
@@ -623,7 +624,7 @@ def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
     assert (state.gyro, rows) == ("off", [])
 
 
-@pytest.mark.parametrize(
+@each(
     ("does", "level"),
     [
         ("waiting for rest", 0),
@@ -689,7 +690,7 @@ def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
 DAY_NS = 86400 * 10**9
 
 
-@pytest.mark.parametrize(
+@each(
     ("days", "level", "words"),
     [
         (400, 0, "valid for 400 days"),

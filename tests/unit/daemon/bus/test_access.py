@@ -31,6 +31,7 @@ from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, ful
 from acsard.core.ros.transports import PARAMETERS, claims, endpoints
 from acsard.core.values import Role
 from acsard.daemon.bus.access import GRANTS, access_control, gateway_access
+from tests.each import each
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 EVERYBODY = ("local", *ROLES)
@@ -135,7 +136,7 @@ def test_every_policy_names_rules_and_subjects_that_exist() -> None:
 TOLD = [key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")]
 
 
-@pytest.mark.parametrize("told", TOLD)
+@each("told", TOLD)
 def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) -> None:
     key = DEFAULT.key(told)
     assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
@@ -145,7 +146,7 @@ def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) 
         assert DEFAULT.lets(who, "reply", key, "egress")
 
 
-@pytest.mark.parametrize("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
+@each("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
 def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: str) -> None:
     assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == {"local"}
     assert TRUSTING.who("declare_subscriber", TRUSTING.key(below)) == FROM["viewer"]
@@ -199,9 +200,7 @@ LEAST: dict[str, Role] = {
 }
 
 
-@pytest.mark.parametrize(
-    "topic", [t for t in TOPICS if t.direction != "out"], ids=lambda topic: topic.key
-)
+@each("topic", [t for t in TOPICS if t.direction != "out"])
 def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
     access = SENSING if topic.gyro else DEFAULT
     key = access.key(written(topic.key))
@@ -317,8 +316,8 @@ def test_not_even_a_maintainer_asks_beyond_the_robots_own_keys() -> None:
         assert DEFAULT.who("query", key) == TRUSTING.who("query", key) == set()
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize(
+@each("role", ROLES)
+@each(
     "key", ["acsard/other/stop", "acsard/other/cmd/app", "acsard/acsard/stop", "other/cmd_vel", "x"]
 )
 def test_nothing_outside_the_robots_own_keys_is_granted(role: Role, key: str) -> None:
@@ -369,8 +368,8 @@ def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() ->
         zenoh.Config().insert_json5("access_control", json.dumps(access.value))
 
 
-@pytest.mark.parametrize("namespace", ["", "robot1"])
-@pytest.mark.parametrize("transport", ["bridge", "rmw"])
+@each("namespace", ["", "robot1"])
+@each("transport", ["bridge", "rmw"])
 def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, namespace: str) -> None:
     other = "rmw" if transport == "bridge" else "bridge"
     ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
@@ -422,7 +421,7 @@ def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
     assert not any(role in policy["subjects"] for policy in access.value["policies"])
 
 
-@pytest.mark.parametrize(
+@each(
     "tables",
     [
         {},
@@ -431,9 +430,8 @@ def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
         {"access": AccessConfig(viewers=(), operators=(), maintainers=())},
         {"robot": RobotConfig(id="x" * 32)},
     ],
-    ids=["defaults", "no ROS", "ROS elsewhere", "no certificates", "long id"],
 )
-@pytest.mark.parametrize("rules", [access_control, gateway_access])
+@each("rules", [access_control, gateway_access])
 def test_zenoh_accepts_the_rules(
     tables: dict[str, Any], rules: Callable[[Config], dict[str, object]]
 ) -> None:
@@ -460,8 +458,8 @@ def test_at_the_gateway_each_role_may_what_it_may_and_the_daemon_all() -> None:
                 assert gateway.lets("local", message, key, flow)
 
 
-@pytest.mark.parametrize("page", ["web", "systemd", "zenoh"])
-@pytest.mark.parametrize("role", ROLES)
+@each("page", ["web", "systemd", "zenoh"])
+@each("role", ROLES)
 def test_each_page_names_the_services_of_a_role(page: str, role: Role) -> None:
     text = (Path(__file__).parents[4] / "deploy" / page / "README.md").read_text()
     (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)

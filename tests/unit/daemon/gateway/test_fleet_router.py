@@ -26,6 +26,7 @@ from acsard.core.values import ROLES, Role
 from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.gateway.fleet_router import Router, router_file
 from acsard.host.errors import InUseError, RouterFileError, UsageError
+from tests.each import each
 
 ROUTER_FILE = Path(__file__).resolve().parents[4] / "deploy" / "zenoh" / "router.json5"
 
@@ -239,7 +240,7 @@ def test_each_certificate_that_commands_has_keys_of_its_own_on_each_robot(
         assert policy["subjects"] == [f"certificate {name}"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("robots", "people"),
     [
         (["robot1", "robot1"], {}),
