@@ -25,14 +25,16 @@ def replace(
         file: The file. Other processes find the old one or the new one, never a part of it.
         content: The new content. Until its mode is set, only its owner can read it.
         mode: The mode; by default that of the file before, or `NEW_MODE`.
-        owner: The user and the group, if this process may set them; by default those before.
+        owner: The user and the group. By default those before, if this process may set them.
         synced: True waits for the disk before the rename, so that a power cut leaves the old file
             or the new one. After False a power cut may leave a part of the new one until `sync`.
     """
     if file.exists():
         before = file.stat()
         mode = stat.S_IMODE(before.st_mode) if mode is None else mode
-        owner = owner or (before.st_uid, before.st_gid)
+        kept = owner or (before.st_uid, before.st_gid)
+    else:
+        kept = owner
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
         with os.fdopen(handle, "wb") as new:
@@ -40,11 +42,12 @@ def replace(
             new.flush()
             os.fchmod(new.fileno(), NEW_MODE if mode is None else mode)
             try:
-                if owner:
-                    os.fchown(new.fileno(), *owner)
+                if kept:
+                    os.fchown(new.fileno(), *kept)
             except PermissionError:
                 # The file of another user in a directory of ours becomes ours.
-                pass
+                if owner:
+                    raise
             if synced:
                 os.fsync(new.fileno())
         os.replace(name, file)

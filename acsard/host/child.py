@@ -131,6 +131,11 @@ async def running(
     finally:
         if child.returncode is None:
             child.kill()
+            # asyncio sees the end of a child only after the end of its output, and it stops
+            # reading a pipe whose reader is behind.
+            for output in (child.stdout, child.stderr):
+                with suppress(RuntimeError):  # somebody else reads this one
+                    await output.read() if output else b""
             await child.wait()
 
 

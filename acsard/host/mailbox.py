@@ -57,7 +57,8 @@ class Mailbox(Generic[T]):
         """The items that wait, the oldest on the left. Only the reader may take from it directly.
         In each step the daemon looks at about forty mailboxes, too many for a method call each."""
         self._bell = Bell()
-        self._wake = wake or self._bell.ring
+        self.wake = wake or self._bell.ring
+        """Wakes the reader. A writer that uses `store` calls it afterwards."""
         self.closed = False
         """Whether the last item has arrived. It may still wait."""
 
@@ -76,19 +77,19 @@ class Mailbox(Generic[T]):
     def put(self, item: T) -> bool:
         """Store an item and wake the reader; return False if the oldest one was dropped for it."""
         room = self.store(item)
-        self._wake()
+        self.wake()
         return room
 
     def close(self) -> None:
         """Mark the end and wake the reader, which still gets the items that wait."""
         self.closed = True
-        self._wake()
+        self.wake()
 
     # The reader's side
 
     def wakes(self, wake: Callable[[], object]) -> None:
         """Call `wake` from now on instead of ending `wait`, and at once if an item waits."""
-        self._wake = wake
+        self.wake = wake
         if self.waiting or self.closed:
             wake()
 

@@ -178,7 +178,11 @@ class Reports:
         """Run the child and return the report. Raises `_FailedError` with the child's message."""
         command, limits = [*self._command, str(one.path)], Limits(NICE, MEMORY)
         async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
-            body, said = await asyncio.gather(_body(child), _listened(child, one))
+            listening = asyncio.create_task(_listened(child, one))
+            try:
+                body, said = await _body(child), await listening
+            finally:
+                listening.cancel()
             code = await child.wait()
         if code == -signal.SIGKILL:
             raise _FailedError(KILLED)

@@ -173,7 +173,7 @@ class Vault:
     def _write(self, tokens: list[Token]) -> None:
         # If root writes the file, the service still reads it as its own user.
         directory = self.path.parent.stat()
-        owner = (directory.st_uid, directory.st_gid)
+        owner = (directory.st_uid, directory.st_gid) if os.geteuid() == 0 else None
         replace(self.path, msgspec.json.encode(tokens), mode=MODE, owner=owner)
 
 

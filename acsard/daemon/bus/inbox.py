@@ -220,8 +220,11 @@ class Inbox:
         )
         if key == "stop" and put:
             self._stops.put(arrival)
-        elif not self._line(key).put(arrival):
-            self._overrun += 1
+        else:
+            line = self._line(key)
+            # The count comes before the wake-up, because the reader takes both at once.
+            self._overrun += not line.store(arrival)
+            line.wake()
 
     def _line(self, key: str) -> Mailbox[Arrival]:
         """Return the buffer of a key.

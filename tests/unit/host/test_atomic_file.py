@@ -70,6 +70,9 @@ def test_a_file_of_another_user_becomes_ours(file: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(os, "fchown", refuse)
     replace(file, NEW)
     assert (file.read_bytes(), file.stat().st_uid) == (NEW, os.geteuid())
+    with pytest.raises(PermissionError):
+        replace(file, OLD, owner=(1, 1))
+    assert file.read_bytes() == NEW
 
 
 @pytest.mark.parametrize("call", ["fchmod", "fsync", "replace"])

@@ -148,6 +148,19 @@ def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
     assert asyncio.run(story()) == -signal.SIGKILL
 
 
+def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
+    flood = "import os\nwhile True: os.write(1, bytes(65536))"
+
+    async def story() -> int | None:
+        async with running(program(flood), stdout=PIPE) as child:
+            assert child.stdout is not None
+            await child.stdout.readexactly(1)
+            await asyncio.sleep(0.2)  # asyncio stops reading when its buffer is full
+        return child.returncode
+
+    assert asyncio.run(asyncio.wait_for(story(), 20)) == -signal.SIGKILL
+
+
 def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
     async def story() -> tuple[bytes, int | None]:
         async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:

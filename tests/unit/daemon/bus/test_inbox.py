@@ -84,6 +84,15 @@ def test_a_flood_on_one_key_pushes_out_only_its_own_and_is_counted() -> None:
     assert inbox.take(8).overrun == 0
 
 
+def test_a_loop_that_takes_when_it_is_woken_finds_the_loss_counted() -> None:
+    inbox, loop = an_inbox()
+    arrived(inbox, *["cmd/app"] * ARRIVALS)
+    found: list[int] = []
+    loop.command = lambda: found.append(inbox.take(8).overrun)  # type: ignore[method-assign]
+    arrived(inbox, "cmd/app")
+    assert found == [1]
+
+
 class Asked:
     """A query without Zenoh. It records its replies and, at the end, that it was dropped."""
 
