@@ -29,12 +29,11 @@ def replace(
         synced: True waits for the disk before the rename, so that a power cut leaves the old file
             or the new one. After False a power cut may leave a part of the new one until `sync`.
     """
+    kept = owner
     if file.exists():
         before = file.stat()
         mode = stat.S_IMODE(before.st_mode) if mode is None else mode
         kept = owner or (before.st_uid, before.st_gid)
-    else:
-        kept = owner
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
         with os.fdopen(handle, "wb") as new:
