@@ -47,7 +47,7 @@ Inside `core/`, in the same order:
     core/incoming/   what comes in over the bus: a sample becomes a command, a query a reply
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas
-    core/motion/     kinematics, odometry, arbiter, freshness, neutral, limits, modes
+    core/motion/     kinematics, odometry, consistency checks, arbiter, freshness, limits, modes
     core/link/       the serial line: codec, checksum, negotiation, sample times, link state
     core/config/     acsard.toml becomes one frozen Config, or errors that name key and mend
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs

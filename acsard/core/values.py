@@ -191,7 +191,7 @@ Level = Literal["info", "warning", "error"]
 class Event(Struct, frozen=True):
     """An event for the log.
 
-    `text` is for people. `tally.py` writes at most a line per name and second.
+    `text` is for people. `event_throttle.py` writes at most a line per name and second.
     """
 
     name: EventName

@@ -7,8 +7,8 @@
 - A source that sends zeros holds the robot still for any length of time, because an operator who
   wants that and a controller that has failed look the same. `state` and the log report it.
 
-Each refusal has a name under which it is counted, and `words.py` has the sentences for people.
-`values.Command` explains source, sender and clock.
+Each refusal has a name under which it is counted, and `arbiter_text.py` has the sentences for
+people. `values.Command` explains source, sender and clock.
 """
 
 from __future__ import annotations

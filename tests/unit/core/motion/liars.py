@@ -1,4 +1,4 @@
-"""Simulated drives as four encoders report them, of which one may fail, to judge `verdict.py`.
+"""Simulated drives as four encoders report them, of which one may fail, for `wheel_faults.py`.
 
 Each wheel has its own motor lag, tyre and load, and starts anywhere within one count of its
 encoder. A line reports counts over its period in two decimals. The module
