@@ -12,6 +12,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S
+from tests.each import each
 from tests.scenarios.speakers import Speaker, Way
 from tests.scenarios.world import World
 
@@ -125,7 +126,7 @@ def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) ->
     assert world.state.mode == "inactive"
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "payload", "put", "reason"),
     [
         ("cmd/app", b"{", True, "malformed"),
@@ -155,8 +156,10 @@ def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) ->
     ],
 )
 def test_a_bad_command_is_refused_whole_and_counted(
-    world: World, key: str, payload: bytes, put: bool, reason: str
+    key: str, payload: bytes, put: bool, reason: str
 ) -> None:
+    world = World()
+    world.run(0.2)
     world.drive(0.3, seconds=0.5)
     world.run(0.2)
     world.put(key, payload, put)

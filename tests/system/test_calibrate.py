@@ -39,11 +39,11 @@ from tests.system.harness import (
     Peer,
     Program,
     acsard,
-    finish,
     free_endpoint,
     until,
 )  # fmt: skip
 from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.typed import typed
 from tests.unit.calibration.guided.played import Player
 from tests.unit.calibration.robots import Robot
 
@@ -443,6 +443,6 @@ def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None
     with Daemon(tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):
-            ended = finish(acsard("calibrate", *words, "--config", str(daemon.config)), tmp_path)
+            ended = typed("calibrate", *words, "--config", str(daemon.config))
             assert ended.code == 2
             assert why in ended.err
