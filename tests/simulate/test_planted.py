@@ -16,12 +16,9 @@ ALL = (*FAULTS, *CASES)
 ADDED = [fault for fault in ALL if not all(edit.old for edit in fault.edits)]
 
 OPEN = {
-    "case 8",
     "case 9",
     "freshness budget",
-    "freshness drift",
     "freshness halves",
-    "latches fault",
     "robot set",
     "robot unsent",
 }
