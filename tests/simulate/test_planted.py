@@ -16,21 +16,11 @@ ALL = (*FAULTS, *CASES)
 ADDED = [fault for fault in ALL if not all(edit.old for edit in fault.edits)]
 
 OPEN = {
-    "case 11",
-    "case 3",
-    "case 7",
-    "case 8",
     "case 9",
     "freshness budget",
-    "freshness drift",
     "freshness halves",
-    "latches fault",
-    "latches lowered",
-    "limits ramp",
-    "limits stall",
     "robot set",
     "robot unsent",
-    "sanity evidence",
 }
 """Faults that no seed has found yet; each was played for less than its limit."""
 
