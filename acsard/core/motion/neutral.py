@@ -91,6 +91,7 @@ class Sender:
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
         self.noticed_ns, self.shared = now_ns, command.shared
+        unarmed = not self._armed
         if not zero:
             self._zero_ns = self._proven_zero_ns = None
         elif now_ns >= since_ns and not command.shared:
@@ -98,6 +99,8 @@ class Sender:
         elif now_ns >= since_ns and self._zero_ns is None:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
+            if zero and unarmed:
+                self.arrived_ns = None  # a speed before the zero that arms must not count by it
             self._doubt(command, verdict)
             return
         self._proven_armed, self._proven_zero_ns = self._armed, self._zero_ns
