@@ -17,25 +17,26 @@ Where to look: each package may import only those below it. `pyproject.toml` sta
 this order as contracts, and `lint-imports` checks them.
 
     cli/             one file per verb: its options, one call into another package, its output
-    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
     bench/           `acsard bench`: measures a daemon from outside
     doctor/          `acsard doctor`: what is wrong with this installation
     foxglove/        `acsard foxglove`: a live server for Foxglove
-    lan/             certificates for other machines
-    report/          `acsard log report`: what a recording shows, as a page
+    certificates/    certificates for other machines
+    report/          `acsard recording report`: what a recording shows, as a page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a process of its own
+    calibration/     `acsard calibrate`, by a log or a drive of its own, and `acsard accuracy`: how
+                     much each cause contributes to the odometry's error
     client/          follow and drive a robot from Python, synchronous or with asyncio; the
                      follower and the commander hold the rules and time limits of all tools
     daemon/          the process: control loop, latch file, ways down
-    daemon/gateway/  `acsard door`: the process in which TLS ends
+    daemon/gateway/  `acsard gateway`: the process in which TLS ends
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
-    host/            the machine: clock, timers, threads, files, systemd, logs, errors
+    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
+    host/            the machine: clock, timers, threads and the mailboxes between them, child
+                     processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
-    error_budget/    `acsard odom`: what each cause contributes to the odometry's error
-    calibration/     `acsard calibrate`: from a log, or by a drive of its own
     terminal/        tables and output of all tools, by the library rich
     core/            the robot as a pure function: no clock, no I/O, no thread
 
@@ -46,7 +47,7 @@ Inside `core/`, in the same order:
     core/incoming/   what comes in over the bus: a sample becomes a command, a query a reply
     core/ros/        the two ROS transports: names, hashes, tokens, attachments, parameters
     core/messages/   the published structs, the table of keys, encodings, reports, schemas
-    core/motion/     kinematics, odometry, arbiter, freshness, neutral, limits, modes
+    core/motion/     kinematics, odometry, consistency checks, arbiter, freshness, limits, modes
     core/link/       the serial line: codec, checksum, negotiation, sample times, link state
     core/config/     acsard.toml becomes one frozen Config, or errors that name key and mend
     core/values.py   the values in SI units: Instant, Twist, Pose, Command, Inputs, Outputs

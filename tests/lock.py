@@ -1,6 +1,6 @@
 """`python -m tests.lock`: rewrite `deploy/systemd/requirements.lock` with today's versions.
 
-It asks pip which distributions an install of acsard with the extras `lan` and `web` takes from the
+It asks pip which distributions an install of acsard with the extras `tls` and `web` takes from the
 package index, including those needed to build it. It asks for each supported Python on x86_64 and
 aarch64, and pins the hashes of those wheels. All platforms get the same versions. `--check` prints
 the changes and writes nothing.
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 LOCK = ROOT / "deploy" / "systemd" / "requirements.lock"
 
-EXTRAS = ("lan", "web")
+EXTRAS = ("tls", "web")
 
 PYTHONS = ("3.11", "3.12", "3.13")
 

@@ -112,7 +112,7 @@ How = Run | Elsewhere | InCi | Collected | Shown
 HERE = "tests/system/test_pages.py"
 FLEET, UNIT = "tests/system/test_fleet.py", "tests/systemd/test_unit.py"
 ROUTER = "tests/system/test_router.py"
-LOG = "tests/unit/cli/test_log.py"
+LOG = "tests/unit/cli/test_recording.py"
 SERVICE, OPEN = "tests/systemd/test_service.py", "tests/systemd/test_web.py"
 WEB = "tests/system/test_web_strangers.py"
 SIMULATED = "tests/system/test_simulated.py"
@@ -290,11 +290,11 @@ COMMANDS: dict[str, How] = {
     "acsard echo wheel_states imu --csv > drive.csv": Elsewhere(
         SIMULATED, "test_a_drive_is_recorded_as_calibrate_reads_it"
     ),
-    "acsard odom": Run("based on|stands still"),
+    "acsard accuracy": Run("based on|stands still"),
     "acsard calibrate": Elsewhere(
         GUIDED, "test_a_person_with_a_gyro_is_guided_from_the_start_to_the_written_file"
     ),
-    "acsard calibrate --way tape --write": Elsewhere(
+    "acsard calibrate --method tape --write": Elsewhere(
         GUIDED, "test_a_person_with_a_tape_alone_is_guided_to_the_written_file"
     ),
     "acsard calibrate --positions sim/pose --yes": Elsewhere(
@@ -308,8 +308,8 @@ COMMANDS: dict[str, How] = {
     ".venv/bin/pytest tests/firmware": PYTEST,
     '.venv/bin/pytest -s -m "firmware and not soak" tests/firmware': PYTEST,
     # deploy/web
-    "acsard lan init --directory tls": Elsewhere(
-        "tests/unit/cli/test_lan.py",
+    "acsard tls init --directory tls": Elsewhere(
+        "tests/unit/cli/test_tls_verb.py",
         "test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role",
     ),
     f"acsard web {_AWAY} --invite operator --name phone --days 30": INVITED,
@@ -321,7 +321,7 @@ COMMANDS: dict[str, How] = {
     ),
     "acsard web --tokens": COOKIE,
     "acsard web --revoke phone": COOKIE,
-    "sudo /opt/acsard/venv/bin/acsard lan init": BY_THE_SERVICE,
+    "sudo /opt/acsard/venv/bin/acsard tls init": BY_THE_SERVICE,
     "sudo install -D -m 0644 -t /etc/systemd/system/acsard-web.service.d "
     "deploy/systemd/lan.conf": BY_THE_SERVICE,
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard-web"': BY_THE_SERVICE,
@@ -329,7 +329,7 @@ COMMANDS: dict[str, How] = {
     "--invite operator --name phone": BY_THE_SERVICE,
     "sudo /opt/acsard/venv/bin/acsard web --config /etc/acsard/acsard.toml "
     "--revoke phone": BY_THE_SERVICE,
-    'sudo sh -c "/opt/acsard/venv/bin/acsard lan renew && systemctl restart acsard"': Elsewhere(
+    'sudo sh -c "/opt/acsard/venv/bin/acsard tls renew && systemctl restart acsard"': Elsewhere(
         OPEN, "test_a_renewed_certificate_is_shown_after_the_restart_and_tokens_still_count"
     ),
     # deploy/ros2
@@ -391,21 +391,21 @@ COMMANDS: dict[str, How] = {
         "test_nothing_of_somebody_else_is_overwritten_or_removed_without_force",
         "pip is not called again",
     ),
-    "sudo /opt/acsard/venv/bin/acsard log": Elsewhere(
+    "sudo /opt/acsard/venv/bin/acsard recording": Elsewhere(
         LOG, "test_the_list_has_a_line_each_and_says_what_happened"
     ),
-    "sudo /opt/acsard/venv/bin/acsard log show --from 14:05": Elsewhere(
+    "sudo /opt/acsard/venv/bin/acsard recording show --from 14:05": Elsewhere(
         LOG, "test_a_part_of_a_story_by_seconds_and_by_the_time_of_day"
     ),
-    "sudo /opt/acsard/venv/bin/acsard log replay": Elsewhere(
+    "sudo /opt/acsard/venv/bin/acsard recording replay": Elsewhere(
         LOG, "test_a_replay_says_that_all_is_the_same"
     ),
-    "sudo /opt/acsard/venv/bin/acsard log export 12 drive.mcap": Elsewhere(
-        "tests/unit/cli/test_log_export.py",
+    "sudo /opt/acsard/venv/bin/acsard recording export 12 drive.mcap": Elsewhere(
+        "tests/unit/cli/test_recording_export.py",
         "test_a_number_and_a_name_are_taken_and_what_is_there_stays",
     ),
-    "acsard log report FILE": Elsewhere(
-        "tests/unit/cli/test_log_report.py",
+    "acsard recording report FILE": Elsewhere(
+        "tests/unit/cli/test_recording_report.py",
         "test_the_numbers_of_the_file_are_those_of_the_recording",
     ),
     "systemctl status acsard": INSTALLED._replace(but="the status line is asked for alone"),
@@ -413,7 +413,7 @@ COMMANDS: dict[str, How] = {
         UNIT, "test_the_journal_can_be_asked_for_an_event", "the event is chosen by the test"
     ),
     "/opt/acsard/venv/bin/acsard service status": INSTALLED,
-    "sudo /opt/acsard/venv/bin/acsard lan init --write /etc/acsard/acsard.toml": OPENED,
+    "sudo /opt/acsard/venv/bin/acsard tls init --write /etc/acsard/acsard.toml": OPENED,
     'sudo sh -c "systemctl daemon-reload && systemctl restart acsard"': OPENED,
     "acsard echo state --connect tls/robot.local:7449 --tls clients/viewer": OPENED._replace(
         but="it calls `stop` instead"
@@ -425,12 +425,12 @@ COMMANDS: dict[str, How] = {
     f"acsard fleet {_PLAIN}": IN_ONE_VIEW,
     f"acsard drive --id robot2 {_PLAIN}": DRIVE._replace(but="without the router"),
     f"acsard call stop --id '*' {_PLAIN}": IN_ONE_VIEW,
-    "python3 -m venv .venv && .venv/bin/pip install '.[lan]'": AUTHORITY,
-    "acsard lan init --directory fleet": Run("^Wrote "),
-    "acsard lan add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),
-    "for n in {1..10}; do acsard lan add robot$n --directory fleet; done": TEN,
-    "acsard lan router robot{1..10} --operator laptop-anna > router.json5": TEN,
-    "acsard lan add laptop-anna --role operator --directory fleet": Run("operators = "),
+    "python3 -m venv .venv && .venv/bin/pip install '.[tls]'": AUTHORITY,
+    "acsard tls init --directory fleet": Run("^Wrote "),
+    "acsard tls add router.local --address 192.168.1.10 --directory fleet": Run("router.local"),
+    "for n in {1..10}; do acsard tls add robot$n --directory fleet; done": TEN,
+    "acsard tls router robot{1..10} --operator laptop-anna > router.json5": TEN,
+    "acsard tls add laptop-anna --role operator --directory fleet": Run("operators = "),
     "sudo install -d -o zenohd -m 0700 /etc/zenohd/tls": PLACES,
     "sudo install -o zenohd -m 0400 ca.pem certificate.pem key.pem /etc/zenohd/tls/": PLACES,
     "sudo install -m 0644 router.json5 /etc/zenohd/": PLACES,

@@ -93,7 +93,7 @@ def report(directory: Path) -> list[Path]:
     with tempfile.TemporaryDirectory() as place, browsing() as browser:
         drawn = Path(place) / "drive.html"
         recorded = _recorded(Path(place) / "drive.mcap")
-        done = finish(acsard("log", "report", str(recorded), str(drawn)), place)
+        done = finish(acsard("recording", "report", str(recorded), str(drawn)), place)
         assert done.code == 0, done
         browser.ask("Emulation.setScrollbarsHidden", hidden=True)
         written = []

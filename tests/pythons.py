@@ -48,7 +48,6 @@ def record(where: Path, seconds: float) -> list[Path]:
     for name, config in (("plain", PLAIN), ("full", FULL)):
         tape = Tape(every=50_000)
         world = World(config, recorder=tape)
-        world.bus.wanted = set()
         drive_through_faults(world, seconds)
         for first in (0, *list(tape.states)[:1]):
             path = where / f"{name}-{first}-{sys.version_info[0]}.{sys.version_info[1]}.mcap"
@@ -79,7 +78,7 @@ def replays(python: str, paths: Sequence[Path]) -> bool:
     """Return whether that Python replays all recordings identically. Prints a line for each."""
     version, same = run(python, "-V"), True
     for path in paths:
-        said = run(python, "-m", "acsard", "log", "replay", str(path))
+        said = run(python, "-m", "acsard", "recording", "replay", str(path))
         print(f"{version:14} {path.name:20} {said}", flush=True)
         # the lines after the verdict list the items that were compared
         verdict, *_ = said.splitlines() or [""]

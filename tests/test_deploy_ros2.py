@@ -23,6 +23,7 @@ from ruamel.yaml import YAML
 
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.ros.transports import ros_names
+from tests.each import each
 
 FILES = Path(__file__).parents[1] / "deploy" / "ros2"
 CONFIG = Config()
@@ -92,7 +93,7 @@ def test_the_joints_that_turn_are_the_wheels() -> None:
     assert {joint(name).get("type") for name in CONFIG.joints.as_tuple()} == {"continuous"}
 
 
-@pytest.mark.parametrize("name", CONFIG.joints.as_tuple())
+@each("name", CONFIG.joints.as_tuple())
 def test_a_wheel_stands_on_the_floor_where_the_separation_puts_it(name: str) -> None:
     radius, half = CONFIG.drive.wheel_radius, CONFIG.drive.wheel_separation / 2
     assert one(joint(name), "parent").get("link") == CONFIG.odometry.base_frame
@@ -487,4 +488,4 @@ def test_drive_py_begins_and_ends_with_zeros() -> None:
     """
     text = (FILES / "drive.py").read_text()
     (zeros,) = re.findall(r"^ZEROS_S = ([\d.]+)$", text, re.M)
-    assert float(zeros) > CONFIG.commands.pause + min(TIMEOUTS)
+    assert float(zeros) > CONFIG.commands.neutral_pause + min(TIMEOUTS)

@@ -12,6 +12,7 @@ import pytest
 
 from acsard.recording.file import Recording
 from acsard.recording.replayed import differs, live
+from tests.each import each
 
 RECORDINGS = sorted((Path(__file__).parent / "recordings").glob("*.mcap"))
 
@@ -24,7 +25,7 @@ def test_there_are_some_and_each_is_small() -> None:
     assert {name: size for name, size in sizes.items() if size > MOST_BYTES} == {}
 
 
-@pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
+@each("path", RECORDINGS)
 def test_it_comes_out_as_it_did(path: Path) -> None:
     recording = Recording(path)
     tally, trouble, _ = live(recording)

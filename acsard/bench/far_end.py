@@ -33,7 +33,7 @@ class Part(msgspec.Struct, frozen=True):
     """Role of the far end."""
 
     config: dict[str, object]
-    unprompted: float = 0.0
+    free_running: float = 0.0
     """Time between reports by the board's own clock, s; 0 to answer each line."""
     baud_rate: int = 0
     """Baud rate of this end, if it is one that the configuration does not allow; else 0."""
@@ -115,8 +115,8 @@ def main(part: Part) -> None:
     sys.stdout.write(end.path + "\n")
     sys.stdout.flush()
     gc.disable()
-    if part.unprompted:
-        with mcu.unprompted(part.unprompted):
+    if part.free_running:
+        with mcu.free_running(part.free_running):
             end.play(sys.stdin.fileno())
     else:
         end.play(sys.stdin.fileno())

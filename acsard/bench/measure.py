@@ -105,7 +105,7 @@ def measure(config: Config, port: str, seconds: float) -> Result:
 
 
 def _own(state: RobotState) -> dict[str, Summary]:
-    spreads = {name: figure.since_start for name, figure in state.figures.items()}
+    spreads = {name: figure.since_start for name, figure in state.latencies.items()}
     return {
         name: Summary(s.count, round(s.p50, 1), round(s.p99, 1), round(s.max, 1))
         for name, s in spreads.items()

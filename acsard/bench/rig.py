@@ -10,7 +10,6 @@ daemon's place.
 
 from __future__ import annotations
 
-import os
 import random
 import signal
 import subprocess
@@ -40,8 +39,8 @@ from acsard.daemon.bus.outlets import direct
 from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
+from acsard.host.child import end, end_with_parent, environment, how_it_ended
 from acsard.host.errors import Exit, ExitError, NoAnswerError, UnreachableError
-from acsard.host.processes import end_with_parent
 
 END_S = 5.0
 """Time limit for the end of a process, s. It usually takes 0.2 s."""
@@ -52,21 +51,9 @@ def end_with_us() -> None:
     end_with_parent(signal.SIGTERM)
 
 
-def leave(process: subprocess.Popen[bytes]) -> None:
-    """End a child: first by SIGTERM, then by SIGKILL."""
-    if process.poll() is None:
-        process.send_signal(signal.SIGTERM)
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
 def ended(who: str, code: int, said: str = "") -> ExitError:
     """Return an error that describes the unexpected end of a process."""
-    how = f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
-    return ExitError(Exit.FAILURE, f"{who} {how}" + (f": {said}" if said else ""))
+    return ExitError(Exit.FAILURE, f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
 def daemon_ended(code: int, log: Path) -> ExitError:
@@ -124,11 +111,11 @@ class Rig:
         *,
         words: Sequence[str] = ACSARD,
         port: str = "",
-        unprompted: float = 0.0,
+        free_running: float = 0.0,
         wire_baud_rate: int = 0,
     ) -> None:
         self._config, self._file, self._words, self._port = config, file, words, port
-        self._part = Part(effective(config), unprompted, wire_baud_rate)
+        self._part = Part(effective(config), free_running, wire_baud_rate)
         self._endpoint = config.bus.listen[0]
         self._codec = Codec(config.mcu.wheels, config.mcu.trailing_comma)
         self._kinematics = Kinematics(config.drive)
@@ -178,7 +165,7 @@ class Rig:
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        stack.callback(leave, far_end)
+        stack.callback(end, far_end, END_S)
         assert far_end.stdout is not None
         device = far_end.stdout.readline().decode().strip()
         if not device:
@@ -186,12 +173,9 @@ class Rig:
         return device
 
     def _start_program(self, stack: ExitStack, port: str) -> None:
-        hidden = (
-            "INVOCATION_ID", "NOTIFY_SOCKET", "ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG",
-            "STATE_DIRECTORY",
-        )  # fmt: skip
+        hidden = ("ACSARD_CONFIG", "ACSARD_TLS", "RUST_LOG", "STATE_DIRECTORY")
         words = [*self._words, "--config", str(self._file), "--port", port]
-        env = {key: value for key, value in os.environ.items() if key not in hidden}
+        env = environment(hidden)
         # The measured daemon must not leave files behind, so its latches go to the temporary
         # directory.
         env["XDG_STATE_HOME"] = str(self._log.parent)
@@ -206,7 +190,7 @@ class Rig:
                 start_new_session=True,
                 preexec_fn=end_with_us,
             )
-        stack.callback(leave, self.process)
+        stack.callback(end, self.process, END_S)
 
     def _connect(self) -> zenoh.Session | None:
         try:
@@ -320,7 +304,7 @@ class Rig:
 
     def leave(self) -> None:
         """End the program."""
-        leave(self.process)
+        end(self.process, END_S)
 
     def end(self) -> Record:
         """End the program and return the record; the rig cannot be used again."""

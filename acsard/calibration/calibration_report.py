@@ -43,7 +43,7 @@ class Report(Struct, frozen=True):
     """
 
     log: str
-    way: str
+    reference: str
     """Sensors that the wheels were compared with."""
     scale: str
     """Sensors that measured the wheels' size. If it is "", the mean radius stays as configured."""
@@ -100,7 +100,7 @@ def report(log: str, found: Calibration, drive: DriveConfig, written: str) -> Re
     track_std, left_std, right_std = found.found.std.tolist()
     gain, drives = found.gain, found.drives
     return Report(
-        log=log, way=found.way, scale=found.scale,
+        log=log, reference=found.way, scale=found.scale,
         wheel_separation_multiplier=track, wheel_separation_multiplier_std=track_std,
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
@@ -142,7 +142,7 @@ def parts(found: Report, calibration: Calibration, where: str) -> Iterator[Rende
     yield (
         f"{found.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
         f"{drives.metres:.1f} m, {drives.turns:.1f} turns at up to {drives.fastest:.2f} rad/s; "
-        f"compared with {found.way}"
+        f"compared with {found.reference}"
     )
     now, then = calibration.now, calibration.found
     was = found.effective_track / then.values[SEPARATION] * now.values[SEPARATION]

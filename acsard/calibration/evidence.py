@@ -19,6 +19,7 @@ from msgspec import Struct
 
 from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Complexes
+from acsard.core.config.settings import DriveConfig
 
 LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE, DRIFT, STRETCH = range(9)
 COUNT = 9
@@ -36,6 +37,14 @@ class Base(Struct, frozen=True):
     right: float
     track: float
     """Configured wheel separation multiplier."""
+
+    @classmethod
+    def of(cls, drive: DriveConfig) -> Base:
+        """Return the configured geometry."""
+        return cls(
+            drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
+            drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
+        )  # fmt: skip
 
     def start(self) -> Floats:
         """Return the parameters that are configured now."""
@@ -80,6 +89,14 @@ def of_rows(
     squares = np.bincount(block, weight * residual**2, blocks).astype(np.float64)
     counts = np.bincount(block, minlength=blocks).astype(np.float64)
     return Evidence(normal, score, squares, counts)
+
+
+def condition(normal: Floats) -> float:
+    """Return the condition number of normal equations, whatever the parameters' units are."""
+    size = np.sqrt(np.diag(normal))
+    if not np.all(size > 0.0):
+        return np.inf
+    return float(np.linalg.cond(normal / np.outer(size, size)))
 
 
 def huber(normalised: Floats | Complexes, least: float) -> Floats:

@@ -268,6 +268,13 @@ class Multipliers(Struct, frozen=True):
     def std(self) -> Floats:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
+    @property
+    def ratio_std(self) -> float:
+        """Standard deviation of the ratio of both radii, as a fraction."""
+        shares = self.covariance / np.outer(self.values, self.values)
+        apart = np.array([0.0, 1.0, -1.0])
+        return float(np.sqrt(max(0.0, apart @ shares @ apart)))
+
     def own(self) -> tuple[Floats, float]:
         """Return each multiplier's own standard deviation, and the common one as a fraction.
 

@@ -22,8 +22,8 @@ from acsard.calibration.doubts import (
     turns_the_right_way,
     way_units,
 )  # fmt: skip
-from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base
-from acsard.calibration.fit import LEAST_BLOCKS, LEFT_RADIUS, RIGHT_RADIUS, Multipliers, Source
+from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base, condition
+from acsard.calibration.fit import LEAST_BLOCKS, Multipliers, Source
 from acsard.calibration.heading import Headings, Rows
 from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import Block, Wheels, blocks
@@ -40,7 +40,7 @@ LEAST_ROLL = 3.0
 ALIKE = 0.98
 """Squared correlation of both rolls above which they count as a single movement."""
 
-WORST_TRACK, WORST_RATIO = 0.2, 0.03
+WORST = 0.2, 0.03
 """Largest useful standard deviations, as fractions: of the track by chance, of the radii ratio."""
 
 WORST_CONDITION = 1e4
@@ -87,21 +87,20 @@ def turns_enough(turned: Floats) -> None:
         )
 
 
-def sure_enough(found: Multipliers, chance: float) -> None:
+def sure_enough(
+    found: Multipliers, chance: float, worst: tuple[float, float] = WORST, log: str = "this log",
+    mend: str = DRIVE,
+) -> None:  # fmt: skip
     """Raise `RefusedError` if the result is too uncertain to be useful.
 
     `chance` is the standard deviation of the track as a fraction, without the track's own
-    variation.
+    variation. `mend` is what to do then.
     """
-    size = np.outer(found.values, found.values)
-    share = found.covariance / size
-    ratio = share[LEFT_RADIUS, LEFT_RADIUS] + share[RIGHT_RADIUS, RIGHT_RADIUS]
-    ratio = float(np.sqrt(max(0.0, ratio - 2 * share[LEFT_RADIUS, RIGHT_RADIUS])))
-    told = {"the effective track": (chance, WORST_TRACK), "left to right": (ratio, WORST_RATIO)}
-    for name, (deviation, worst) in told.items():
-        if not deviation <= worst:
+    told = {"the effective track": chance, "left to right": found.ratio_std}
+    for (name, deviation), most in zip(told.items(), worst, strict=True):
+        if not deviation <= most:
             raise RefusedError(
-                f"{name} comes out of this log only to {deviation:.1%}, which is of no use: {DRIVE}"
+                f"{name} comes out of {log} only to {deviation:.1%}, which is of no use: {mend}"
             )
 
 
@@ -110,8 +109,7 @@ def told_apart(normal: Floats) -> None:
 
     `normal` is the result of `Fit.apart`.
     """
-    size = np.sqrt(np.diag(normal))
-    if not np.all(size > 0.0) or np.linalg.cond(normal / np.outer(size, size)) > WORST_CONDITION:
+    if condition(normal) > WORST_CONDITION:
         raise RefusedError(
             f"the log turns and goes ahead only together, so that the track and the wheels cannot "
             f"be told apart (condition number over {WORST_CONDITION:g}): {DRIVE}"

@@ -25,7 +25,7 @@ from acsard.calibration.fit import (
     rates,
 )  # fmt: skip
 from acsard.calibration.gain import Gain, gain, seen_by_places
-from acsard.calibration.heading import Headings
+from acsard.calibration.heading import Headings, Rows
 from acsard.calibration.log_table import Floats, noted
 from acsard.calibration.paths import Wheels, wheels
 from acsard.calibration.prepared import (
@@ -66,6 +66,19 @@ class Drives(Struct, frozen=True):
     fastest: float
     """Rate of the fastest turns, rad/s."""
 
+    @classmethod
+    def of(
+        cls, runs: Sequence[Run], rows: Rows, by_wheels: Floats, base: Base, found: Multipliers,
+        rate: Rates,
+    ) -> Drives:  # fmt: skip
+        """Return the totals of these runs. `by_wheels` is the turn of each row, rad."""
+        size = base.radius * float(found.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
+        return cls(
+            len(runs), sum(float(run.t[-1]) for run in runs),
+            size * float(np.abs(rows.left + rows.right).sum()) / 2,
+            float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
+        )  # fmt: skip
+
 
 class Calibration(Struct, frozen=True):
     """The result. Each standard deviation has the unit of its quantity."""
@@ -101,10 +114,7 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
 
 
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
-    base = Base(
-        drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
-        drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
-    )  # fmt: skip
+    base = Base.of(drive)
     angles = [wheels(run) for run in log.runs]
     headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
     tries: list[tuple[float, int, Prepared, Fit]] = []
@@ -164,12 +174,7 @@ def _calibration(
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m is taken for run {name}")
     in_range(result.values)
-    size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
-    drives = Drives(
-        len(log.runs), sum(float(run.t[-1]) for run in log.runs),
-        size * float(np.abs(rows.left + rows.right).sum()) / 2,
-        float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
-    )  # fmt: skip
+    drives = Drives.of(log.runs, rows, by_wheels, base, result, rate)
     notes += _cuts(log.runs, angles)
     notes += _too_good(headings, made, fitted, base)
     notes += remarks(late, bias, by_wheels, result.values, base, sized=bool(scale))

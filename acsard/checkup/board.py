@@ -23,9 +23,9 @@ from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.check import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
-from acsard.core.link.contract import WATCHDOG_S
 from acsard.core.link.lines import LineReader
-from acsard.core.link.silence_diagnosis import Heard
+from acsard.core.link.link_diagnosis import Heard
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.values import NS_PER_S, WheelSpeeds
 
 
@@ -60,8 +60,8 @@ class Wire(Protocol):
 class Operator(Protocol):
     """The operator at the robot."""
 
-    def say(self, text: str) -> None:
-        """Show a message about the present action."""
+    def doing(self, text: str) -> None:
+        """Show the present activity until the next one."""
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         """Return one of the answers, or None if no person watches the robot."""

@@ -19,8 +19,8 @@ from acsard.checkup.findings import Finding, StoppedError
 from acsard.checkup.motion import ZERO, Reply
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
 from acsard.core.formatting import printable_bytes
+from acsard.core.link.link_diagnosis import SHOWN
 from acsard.core.link.session import IDENTITY
-from acsard.core.link.silence_diagnosis import SHOWN
 
 MOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""
@@ -183,7 +183,7 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     """
     if not (board.own_clock or board.lost > MOST):
         return None
-    operator.say("the motors turn for a moment each time, to tell on which way lines are lost")
+    operator.doing("the motors turn for a moment each time, to tell on which way lines are lost")
     ways = pulsed(board, motors) if motors else None
     if ways is None:
         return outcomes.find("lost where: untold")

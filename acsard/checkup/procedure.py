@@ -153,7 +153,7 @@ class _Steps:
     def _turn(self, motor: int) -> Finding:
         """Test one motor. The operator is asked only if this computer was in time."""
         board, operator, channels = self._board, self._operator, self._channels
-        operator.say(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
+        operator.doing(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
 
         def looked() -> Finding:
             channels[motor:] = [wheels.channel(board, motor)]
@@ -179,7 +179,7 @@ class _Steps:
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
-                self._operator.say("this computer was late; once more")
+                self._operator.doing("this computer was late; once more")
                 board.known = known
                 if board.armed:
                     board.rest()
@@ -215,7 +215,7 @@ class _Steps:
                 if again:
                     self._come_back()
                 if doing:
-                    self._operator.say(doing)
+                    self._operator.doing(doing)
                 self._tell(self._tried(step))
                 return
             except RestartedError as error:
@@ -249,7 +249,7 @@ class _Steps:
         """Send zeros until a restarted board answers and its motors stand."""
         board = self._board
         board.forget()
-        self._operator.say("the board started anew; once more, when it answers")
+        self._operator.doing("the board started anew; once more, when it answers")
         if not board.wakes(BOOT_S):
             raise StoppedError(restarts.finding(board.mcu, self._seen, back=False))
         if said := restarts.cause(board.others):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acsard.calibration.solve import Calibration
     from acsard.calibration.tape_distance import Tape
     from acsard.core.config.settings import DriveConfig
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
 
 DESCRIPTION = """\
 Measure the wheel radii and the effective track width, each with its standard deviation, and say how
@@ -58,7 +58,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--log",
         type=Path,
         metavar="FILE",
-        help="recorded drive: a CSV file or a recording of `acsard log`",
+        help="recorded drive: a CSV file or a recording of `acsard recording`",
     )
     parser.add_argument(
         "--distance",
@@ -90,19 +90,20 @@ def main(args: argparse.Namespace) -> int:
             "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
             "asks them through a program. Leave one out"
         )
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
 
-    with JsonAttendant() as lines:
+    with JsonPrompt() as lines:
         return _calibrate(args, lines)
 
 
-def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
+def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     import msgspec
 
     from acsard.calibration.calibration_report import Refusal, keys, parts, report
     from acsard.calibration.doubts import RefusedError
     from acsard.calibration.guided.legs import GuideError
     from acsard.calibration.log_table import LogError
+    from acsard.prompts.prompt import NobodyError
     from acsard.terminal.output import SENTENCES, plain, show
 
     where, mine = load(args.config)
@@ -114,7 +115,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
             found, config = _calibrated(_only_log(args), mine.drive, args.distance), mine
         else:
             found, config = guided(_no_log(args), mine, where, lines)
-    except (LogError, RefusedError, GuideError) as error:
+    except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
@@ -130,7 +131,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonAttendant | None) -> int:
         else:
             show(*parts(told, found, where), most=SENTENCES)
     else:
-        lines.shows(plain(*parts(told, found, where), width=SENTENCES))
+        lines.result(plain(*parts(told, found, where), width=SENTENCES))
         trouble = differing(config, mine, where)
         written = written or lines.offer(args.config, keys(found), trouble)
     if written and not args.log:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,16 +14,13 @@ from acsard.host.errors import UsageError
 if TYPE_CHECKING:
     import zenoh
 
-    from acsard.calibration.guided.legs import Setup
-    from acsard.calibration.guided.ways import Kind
     from acsard.calibration.solve import Calibration
     from acsard.client import Client
-    from acsard.client.legs import Robot
     from acsard.core.config.settings import Config
-    from acsard.prompts.calibration_prompts import Attendant
-    from acsard.prompts.json_lines import JsonAttendant
+    from acsard.prompts.json_prompt import JsonPrompt
+    from acsard.prompts.prompt import Prompt
 
-DRIVE_OPTIONS = ("way", "positions", "positions_at", "imu", "yes", "json_lines")
+DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 
 IMU = "imu"
 """The gyro's key if the command line names none."""
@@ -33,7 +29,7 @@ IMU = "imu"
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that only a guided drive takes."""
     parser.add_argument(
-        "--way",
+        "--method",
         choices=tuple(NEEDS),
         help="reference for the drive (default: a gyro if the robot has one ([odometry] gyro), "
         "else a tape)",
@@ -41,7 +37,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--positions",
         metavar="KEY",
-        help="for --way positions: the key of the positions (PoseStamped or Odometry in JSON, "
+        help="for --method positions: the key of the positions (PoseStamped or Odometry in JSON, "
         "msgpack or CDR), as `acsard topics` lists it (sim/pose), or any full key",
     )
     parser.add_argument(
@@ -52,7 +48,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--imu",
         metavar="KEY",
-        help="for --way gyro: the key of the gyro (default: imu), as `acsard topics` lists it, "
+        help="for --method gyro: the key of the gyro (default: imu), as `acsard topics` lists it, "
         "or a full key",
     )
     parser.add_argument(
@@ -63,7 +59,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def guided(
-    args: argparse.Namespace, config: Config, where: str, lines: JsonAttendant | None
+    args: argparse.Namespace, config: Config, where: str, lines: JsonPrompt | None
 ) -> tuple[Calibration, Config]:
     """Drive the robot and return the calibration with the configuration that the robot runs with.
 
@@ -71,10 +67,10 @@ def guided(
     `RefusedError`.
     """
     from acsard.calibration.guided.legs import GuideError, setup
-    from acsard.calibration.guided.ways import KINDS
+    from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
+    from acsard.calibration.guided.runner import guide
     from acsard.cli.common import require_one
     from acsard.client import connect
-    from acsard.client.legs import SOURCE, Robot
     from acsard.core.messages.topics import full_key
     from acsard.daemon.bus.address import address_of
 
@@ -87,34 +83,33 @@ def guided(
         _may(args, simulated=info.simulated)
         config = _in_force(client, config, where, write=args.write)
         name = _way(args, config)
-        made, kind = setup(config), KINDS[name]
-        if lines is not None:
-            lines.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
-        attendant = stack.enter_context(_attendant(args, lines))
-        robot = Robot(client, config, attendant)
+        made = setup(config)
+        prompt = stack.enter_context(_prompt(args, lines))
+        prompt.begin(f"robot {robot_id} at {endpoint}", simulated=info.simulated)
+        robot = RobotOnBus(client, config, prompt)
         if name == "gyro":
             robot.gyro(args.imu or IMU)
         elif name == "positions":
             robot.positions(args.positions, _elsewhere(args, tls, stack))
         try:
-            return _played(kind, made, robot, attendant), config
+            return guide(name, made, prompt, robot.ride), config
         except KeyboardInterrupt:
             raise GuideError("the operator ended the drive. Nothing is written") from None
 
 
 def _usable(args: argparse.Namespace, odometry: str) -> None:
-    if args.way == "positions" and not args.positions:
-        raise UsageError("--way positions needs the key of the positions: --positions KEY")
-    if args.positions and args.way not in (None, "positions"):
-        raise UsageError(f"--positions does not go with --way {args.way}: leave one out")
+    if args.method == "positions" and not args.positions:
+        raise UsageError("--method positions needs the key of the positions: --positions KEY")
+    if args.positions and args.method not in (None, "positions"):
+        raise UsageError(f"--positions does not go with --method {args.method}: leave one out")
     if args.positions in ("odom", odometry):
         raise UsageError(
             "odom is computed from the wheels themselves: the positions must come from "
             "another source"
         )
-    if args.imu and (args.positions or args.way not in (None, "gyro")):
-        other = "--positions" if args.positions else f"--way {args.way}"
-        raise UsageError(f"--imu is for --way gyro, not for {other}: leave one out")
+    if args.imu and (args.positions or args.method not in (None, "gyro")):
+        other = "--positions" if args.positions else f"--method {args.method}"
+        raise UsageError(f"--imu is for --method gyro, not for {other}: leave one out")
     if args.positions_at and not args.positions:
         raise UsageError(
             "--positions-at says where the key of --positions is: give --positions KEY as well"
@@ -175,30 +170,31 @@ def differing(config: Config, mine: Config, where: str) -> str:
 def _way(args: argparse.Namespace, config: Config) -> str:
     if args.positions:
         return "positions"
-    gyro = args.way == "gyro" or args.imu
+    gyro = args.method == "gyro" or args.imu
     if gyro and args.imu in (None, IMU) and not config.odometry.gyro:
         raise UsageError(
             "this robot's daemon receives no gyro: set odometry.gyro = true and restart "
-            "the daemon, or use --way tape, wall or umbmark"
+            "the daemon, or use --method tape, wall or umbmark"
         )
-    way: str = args.way or ("gyro" if gyro or config.odometry.gyro else "tape")
+    way: str = args.method or ("gyro" if gyro or config.odometry.gyro else "tape")
     return way
 
 
 @contextmanager
-def _attendant(args: argparse.Namespace, lines: JsonAttendant | None) -> Iterator[Attendant]:
-    from acsard.prompts.calibration_prompts import Nobody, attending, interrupted_by
+def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prompt]:
+    from acsard.host.terminal_modes import one_by_one
+    from acsard.prompts.prompt import ended_by_signals
+    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
 
     if args.yes:
-        yield Nobody()
+        yield NoPrompt(args.json)
         return
-    numbers = signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
-    if lines is not None:
-        with interrupted_by((signal.SIGINT, *numbers)):
+    with ended_by_signals():
+        if lines is not None:
             yield lines
-        return
-    with attending() as person, interrupted_by(numbers):
-        yield person
+            return
+        with one_by_one():
+            yield TerminalPrompt(args.json)
 
 
 def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Session | None:
@@ -210,26 +206,3 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
     session = client_session(args.positions_at, tls)
     stack.callback(session.close)
     return session
-
-
-def _played(kind: Kind, made: Setup, robot: Robot, attendant: Attendant) -> Calibration:
-    from acsard.calibration.guided.legs import Leg
-
-    attendant.say(
-        f"Calibration with {kind.needs}. {kind.told(made)} Stay near the robot: any key "
-        "stops it at once."
-    )
-    way, number = kind.begin(made), 0
-    step = next(way)
-    while True:
-        if isinstance(step, Leg):
-            number += 1
-            attendant.start(f"{number}. {step.words} ({step.seconds:.0f} s)", step.by_key)
-            answer: object = robot.ride(step)
-        else:
-            answer = attendant.number(step)
-        try:
-            step = way.send(answer)
-        except StopIteration as end:
-            found: Calibration = end.value
-            return found

@@ -53,7 +53,7 @@ def main_completion(args: argparse.Namespace) -> int:
     known = words()
     for verb, action in _actions(whole):
         kind = kinds.get(str(action.metavar))
-        if verb == "log" and action.dest == "file":
+        if verb == "recording" and action.dest == "file":
             kind = RECORDING
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
@@ -97,7 +97,10 @@ def _missing(library: str) -> ExitError:
 def _actions(
     parser: argparse.ArgumentParser, verb: str = ""
 ) -> Iterator[tuple[str, argparse.Action]]:
-    """Yield every option and argument with its verb. Those of `log show` belong to `log`."""
+    """Yield every option and argument with its verb.
+
+    Those of `recording show` belong to `recording`.
+    """
     for action in parser._actions:
         yield verb, action
         if isinstance(action, argparse._SubParsersAction):

@@ -59,6 +59,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 def main(args: argparse.Namespace) -> int:
     """Drive until Ctrl-C."""
     from acsard.client import connect
+    from acsard.core.messages.permissions import COMMAND_ROLE, has
     from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
     from acsard.top.keyboard import Keyboard, Ride
 
@@ -68,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
             "drive reads single keys and needs a terminal; a program uses acsard.client"
         )
     with connect(endpoint, robot_id=robot_id, source=args.source, tls=tls) as robot:
-        if tls and (us := robot.whoami()).role in ("", "viewer"):
+        if tls and not has((us := robot.whoami()).role, COMMAND_ROLE):
             raise (NotPermittedError if us.role else NoAnswerError)(us.words())
         ride = Ride(robot, Keyboard(args.linear, args.angular), robot_id, endpoint)
         try:

@@ -8,10 +8,11 @@ import sys
 
 from acsard.cli.common import add_bus, robot_address
 from acsard.core.formatting import lines
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
 
 DEFAULT = "127.0.0.1:8765"
+"""The address that Foxglove and Lichtblick try by default."""
 
 
 def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -50,7 +51,6 @@ def main(args: argparse.Namespace) -> int:
             Exit.FAILURE, f"needs the library foxglove-sdk; run: {install('foxglove')}"
         ) from None
     from acsard.client import connect
-    from acsard.foxglove.address import loopback
 
     address = loopback(args.address)
     endpoint, robot_id, tls = robot_address(args)
@@ -70,6 +70,30 @@ def main(args: argparse.Namespace) -> int:
         finally:
             bridge.close()
     return int(Exit.OK)
+
+
+def loopback(text: str) -> tuple[str, int]:
+    """Return host and port.
+
+    Raises `UsageError` for a malformed address and for one that other machines can reach.
+    """
+    import ipaddress
+
+    host, _, digits = text.rpartition(":")
+    try:
+        address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)
+        port = int(digits)
+    except ValueError:
+        raise UsageError(f"{text} is not an address: write it like {DEFAULT}") from None
+    if not 0 < port < 65536:
+        raise UsageError(f"{text}: a port is a number from 1 to 65535")
+    if not address.is_loopback:
+        raise UsageError(
+            f"other machines could reach {text}, but this protocol has no authentication: every "
+            f"client that connects could drive. Listen on {DEFAULT} and, on the other machine, "
+            f"open a tunnel: ssh -N -L {port}:127.0.0.1:{port} USER@ROBOT"
+        )
+    return str(address), port
 
 
 def _tell(text: str) -> None:

@@ -1,25 +1,29 @@
 """`acsard mcu check`: test the microcontroller on the real robot with its wheels lifted.
 
-`checkup/procedure.py` decides what is tested and in which order. `prompts/check_prompts.py` asks
-the operator.
+`checkup/procedure.py` decides what is tested and in which order, and a prompt asks the operator.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acsard.cli.common import JSON_LINES, Overrides, add_config, load
 from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, MendableError, UsageError
-from acsard.prompts.check_prompts import SIMULATOR, Nobody, Person, answering, ended_by_signals
+from acsard.host.errors import Exit, ExitError, MendableError, UsageError
 
 if TYPE_CHECKING:
     from acsard.checkup.board import Wire
     from acsard.checkup.findings import Finding
     from acsard.core.config.settings import Config
-    from acsard.prompts.json_lines import JsonPerson
+    from acsard.prompts.json_prompt import JsonPrompt
+    from acsard.prompts.prompt import Prompt
+    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
+
+SIMULATOR = "sim"
 
 DESCRIPTION = """\
 Test the microcontroller on your own robot with its wheels lifted. The tool finds its protocol and
@@ -90,15 +94,16 @@ def main(args: argparse.Namespace) -> int:
         writable(args.config)
         if why := withheld(config.mcu.simulated, load(args.config)[1]):
             raise UsageError(f"{where} would not be changed: {why}; leave --write out")
-    with answering(args, config.mcu.port) as person:
-        return _checked(args, config, where, person)
+    with _prompt(args, config.mcu.port) as prompt:
+        return _checked(args, config, where, prompt)
 
 
-def _checked(
-    args: argparse.Namespace, config: Config, where: str, person: Person | Nobody | JsonPerson
-) -> int:
+def _checked(args: argparse.Namespace, config: Config, where: str, prompt: Prompt) -> int:
+    import msgspec
+
     from acsard.checkup import checkup_report, procedure
-    from acsard.checkup.checkup_report import report
+    from acsard.checkup.checkup_report import report, summary
+    from acsard.prompts.prompt import ended_by_signals
 
     _, configured = load(args.config)
     port, simulated = config.mcu.port, config.mcu.simulated
@@ -106,14 +111,14 @@ def _checked(
 
     def tell(finding: Finding) -> None:
         findings.append(finding)
-        person.found(finding)
+        prompt.found(finding)
 
     words = " (the built-in SIMULATOR, in simulated time)" if simulated else ""
-    person.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
+    prompt.begin(f"port {port}{words}, configuration {where}", simulated=simulated)
     trouble: MendableError | None = None
     try:
-        with ended_by_signals():
-            procedure.run(_wire(config), person, config, tell)
+        with ended_by_signals("stopping: zeros go out, then the port is closed", exits=True):
+            procedure.run(_wire(config), prompt, config, tell)
     except MendableError as error:
         if not args.json:
             raise
@@ -129,12 +134,60 @@ def _checked(
         except MendableError as error:  # print the findings of a whole minute before the error
             trouble = error
     found = report(port, findings, changes, written, str(trouble or ""), withheld)
-    person.result(found, where)
+    prompt.result(msgspec.json.encode(found).decode() if args.json else summary(found, where))
     if trouble is not None:
         raise trouble
     if changes and not args.write:
-        person.offer(args.config, changes)
+        prompt.offer(args.config, changes)
     return int(Exit.OK if found.passed else Exit.FAILURE)
+
+
+def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
+    """Return the prompt for these options.
+
+    Raises `ExitError` unless a person can answer, or nothing real can move.
+    """
+    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
+
+    if port == SIMULATOR and args.port != SIMULATOR:
+        raise ExitError(
+            Exit.USAGE,
+            "no port is configured, so there is no board to check (mcu.port is the simulator, "
+            '"sim"): `acsard ports` lists the serial devices, then `acsard mcu check --port '
+            "DEVICE`; `--port sim` checks the built-in simulator",
+        )
+    if args.json_lines:
+        from acsard.prompts.json_prompt import JsonPrompt
+
+        if args.yes:
+            raise ExitError(
+                Exit.USAGE,
+                "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
+                "asks them through a program. Leave one out",
+            )
+        return JsonPrompt()
+    if not args.yes:
+        if not sys.stdin.isatty():
+            raise ExitError(
+                Exit.USAGE,
+                "mcu check turns the wheels and asks a person who sees them: run it in a "
+                "terminal; `--yes` without one is for the simulator (--port sim)",
+            )
+        return TerminalPrompt(args.json)
+    if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
+        return NoPrompt(args.json)
+    from acsard.host.processes import master_of
+
+    master = master_of(port)
+    if master is None or master.name != "acsard":
+        what = f"a pty of {master.name}" if master else "no simulator of acsard's"
+        raise ExitError(
+            Exit.USAGE,
+            f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
+            "a question. Leave --yes out; or lift the wheels, stay with the robot, and add "
+            "--wheels-are-lifted",
+        )
+    return NoPrompt(args.json)
 
 
 def _wire(config: Config) -> Wire:

@@ -27,12 +27,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     # The verb starts itself with this option: the child is the router and ends with its standard
     # input.
-    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Supervise a router until a signal, or be the supervised router (`--held`)."""
+    """Supervise a router until a signal, or be the supervised router (`--supervised`)."""
     import os
 
     from acsard.core.config.settings import LogConfig
@@ -44,7 +44,7 @@ def main(args: argparse.Namespace) -> int:
 
     router, log = Router(args.file), Log(LogConfig())
     try:
-        if not args.held:
+        if not args.supervised:
             return asyncio.run(_kept(str(args.file), log))
         log_from_environment()
         manager = Systemd({}, os.getpid())
@@ -57,9 +57,9 @@ async def _kept(file: str, log: Log) -> int:
     """Run one router process after the other, until a signal or an exit code that is final."""
     import signal
 
-    from acsard.daemon.supervisor import ROUTER, keep_door
+    from acsard.daemon.supervisor import ROUTER, keep_running
 
-    keeper = asyncio.ensure_future(keep_door(["router", file], log.event, ROUTER))
+    keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)
     try:

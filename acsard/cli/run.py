@@ -56,12 +56,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--record",
         metavar="DIRECTORY",
         help="record all inputs and all lines to the board in this directory "
-        "(record.directory); `acsard log` reads it",
+        "(record.directory); `acsard recording` reads it",
     )
     parser.add_argument(
-        "--no-door",
+        "--no-gateway",
         action="store_true",
-        help="do not start `acsard door` for the tls/ endpoints, because it already runs as a "
+        help="do not start `acsard gateway` for the tls/ endpoints, because it already runs as a "
         "service",
     )
     parser.set_defaults(main=main)
@@ -118,14 +118,19 @@ def main(args: argparse.Namespace) -> int:
         for text in warnings(config):
             log.event(Event("configuration", text, "warning"))
 
-    door = ["door", *(("--config", where) if config.bus.outside else ()), "--id", config.robot.id]
-    door += ["--namespace", config.ros.namespace]
+    gateway = [
+        "gateway",
+        *(("--config", where) if config.bus.outside else ()),
+        "--id",
+        config.robot.id,
+    ]
+    gateway += ["--namespace", config.ros.namespace]
     # The systemd watchdog ends a hanging daemon with SIGABRT. The traceback of the hang then goes
     # to standard error.
     if sys.stderr is not None:  # it is None if standard error was closed before the start
         faulthandler.enable()
     try:
-        asyncio.run(daemon.run(config, log, announce, None if args.no_door else door, served))
+        asyncio.run(daemon.run(config, log, announce, None if args.no_gateway else gateway, served))
     finally:
         log.close()
         screen.close(0.2)

@@ -45,7 +45,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "--write",
         action="store_true",
         help="also write them into the local configuration file and keep its comments (needs an "
-        f"extra: {install('mcu')})",
+        f"extra: {install('write')})",
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser)

@@ -12,7 +12,7 @@ from acsard.core.config.settings import Config, LogConfig
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
 
-NUMBERS = "acsard log 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
+NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
 """Shell command that lists the recordings by number. The shell offers local files as well."""
 
 RECORDING: dict[str, str | dict[str, str]] = {

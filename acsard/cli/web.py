@@ -77,7 +77,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         metavar="N",
         help=f"hours until the token expires, for a visitor: 1 to {MOST_HOURS}",
     )
-    parser.add_argument("--held", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
     parser.set_defaults(main=main)
 
 
@@ -127,8 +127,8 @@ def _serve(args: argparse.Namespace, config: Config) -> int:
         tls,
         tokens.place(),
         args.config or "",
-        next_port=args.held,
-        held=args.held,
+        next_port=args.supervised,
+        held=args.supervised,
     )
     log = Log(config.log)
     try:
@@ -160,7 +160,7 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
         raise UsageError(
             f"no browser could use the link: web.address in {where} has no https://. Add "
             '"https://0.0.0.0:8443" there, or name another file with --config (or --address); '
-            "`acsard lan init` makes a certificate"
+            "`acsard tls init` makes a certificate"
         )
     vault = _vault(args, config)
     days = 0 if args.hours else args.days or USUAL_DAYS

@@ -59,7 +59,7 @@ LATE_NS = NS_PER_S // 10
 """Time by which the robot may follow a speed for longer than its source's timeout, because the
 command took this long to arrive."""
 
-NEVER = ("inactive", "stopped", "fault", "leaving")
+NEVER = ("inactive", "stopped", "fault", "shutdown")
 """Modes in which no command counts."""
 
 
@@ -195,7 +195,10 @@ def objection(state: RobotState, source: str, sender: str) -> str:
         return state.reason
     if state.sender in ("", sender):
         return ""
-    return f"another program drives as {source}, {state.sender}: wait until it is silent"
+    return (
+        f"another program drives the robot as {source}, {state.sender}: end it, or wait until it "
+        "is silent"
+    )
 
 
 def heard(state: RobotState, source: str) -> bool:

@@ -19,6 +19,7 @@ from acsard.client.driving import UnheardError, drive
 from acsard.core.incoming.queries import BUSY
 from acsard.core.messages import schema
 from acsard.core.messages.encodings import Decoder, encode, encoding_name
+from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.core.messages.signature import Signature, public_name
 from acsard.core.messages.topics import (
     VERBS,
@@ -338,7 +339,7 @@ class Client:
             return NoAnswerError(f"{error}; {us.silence}")
         if isinstance(error, NoAnswerError):
             return error
-        if us.role == "viewer":
+        if us.role and not has(us.role, COMMAND_ROLE):
             return NotPermittedError(us.words())
         return NotDrivenError(f"{error}; {us.words()}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -13,8 +12,12 @@ from acsard.client.follower import Follower
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import RobotState
 from acsard.daemon.bus.subscription import QUEUED, Subscription, encoded
+from acsard.host.mailbox import Mailbox
 
 STATE = "state"
+
+ANSWERS = 16
+"""Replies that wait at most. A query has one from the daemon and one from each storage."""
 
 
 class Followed(Protocol):
@@ -39,8 +42,8 @@ class Watch(Follower):
         self._states = robot.subscribe(STATE)
         if wake is not None:
             self._states.wakes(wake)
-        self._answers: deque[zenoh.Sample] = deque()
-        """Replies to queries. A thread of Zenoh appends them here and does nothing else."""
+        self._answers = Mailbox[zenoh.Sample](ANSWERS)
+        """Replies to queries. A thread of Zenoh puts them here and does nothing else."""
 
     def look(self, now: float) -> list[RobotState]:
         """Take the states that have arrived, query a late one, and return those that are news.
@@ -57,12 +60,12 @@ class Watch(Follower):
                 self.published(state, now)
                 news.append(state)
         # Replies come last: `answered` compares stamps, and `published` does not.
-        while self._answers:
-            state = self._read(self._answers.popleft())
+        for sample in self._answers.take():
+            state = self._read(sample)
             if state is not None and self.answered(state, now):
                 news.append(state)
         if self.asks(now):
-            self._robot.ask(STATE, self._answers.append)
+            self._robot.ask(STATE, self._answers.put)
         return news
 
     def _read(self, sample: zenoh.Sample) -> RobotState | None:

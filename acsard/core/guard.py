@@ -35,7 +35,7 @@ _ZERO: Wheels = (0, 0, 0, 0)
 _HEX = b"0123456789ABCDEF"
 _COLUMNS = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 
-HALTED = ("stopped", "fault", "leaving")
+HALTED = ("stopped", "fault", "shutdown")
 """Modes in which the robot brakes at the stop deceleration."""
 
 MARGIN_NS = 300_000_000

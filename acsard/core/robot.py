@@ -12,30 +12,24 @@ from __future__ import annotations
 from collections import Counter
 from typing import assert_never
 
-from msgspec.structs import replace
-
 from acsard.core.config.live import changed
 from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.motion_rules import longest_reply
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import Config
-from acsard.core.link.contract import WATCHDOG_S
 from acsard.core.link.feedback import Feedback
+from acsard.core.link.link_diagnosis import UnansweredLines
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.link.session import McuSession
 from acsard.core.motion.arbiter import Arbiter, Choice
-from acsard.core.motion.arbiter_text import REFUSED, chosen
-from acsard.core.motion.command_events import CommandEvents, missed, refused
+from acsard.core.motion.arbiter_text import REFUSED, CommandEvents, chosen, missed, refused
 from acsard.core.motion.event_throttle import EventThrottle
-from acsard.core.motion.gyro import Gyro
-from acsard.core.motion.impossible_lines import ImpossibleLines
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import LearnedTrack
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.limits import Limiter
 from acsard.core.motion.modes import LEAVING, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
-from acsard.core.motion.unanswered_lines import UnansweredLines
 from acsard.core.values import (
     NS_PER_S,
     REST,
@@ -43,7 +37,6 @@ from acsard.core.values import (
     Answer,
     Estimate,
     Event,
-    GyroStatus,
     Inputs,
     Instant,
     Latches,
@@ -63,7 +56,7 @@ UNHEARD_S = WATCHDOG_S - 0.05
 """Time, s, without a line that left, after which the robot starts over from rest. The MCU stops by
 itself at `WATCHDOG_S`, by its own clock, which may be a little fast."""
 
-HALTED = (Mode.STOPPED, Mode.FAULT, Mode.LEAVING)
+HALTED = (Mode.STOPPED, Mode.FAULT, Mode.SHUTDOWN)
 """Modes in which the robot brakes at the stop deceleration."""
 
 NS_PER_MS = 1_000_000
@@ -93,9 +86,6 @@ class Robot:
             config.feedback.response_time,
             self.session.quiet_ns / NS_PER_S,
         )
-        self._gyro = Gyro() if config.odometry.gyro else None
-        multiplier = config.drive.wheel_separation_multiplier
-        self._track = LearnedTrack(multiplier) if config.odometry.learned_track else None
         self._arbiter = Arbiter(config.commands)
         self._limiter = Limiter(config.limits, self._kinematics)
         self._max_dt = max(MAX_DT, 1.5 / config.rate_hz)
@@ -115,13 +105,12 @@ class Robot:
         A line that did not leave does not count."""
         self._status = ("", "", "", "")
         self.counters: Counter[str] = Counter()
-        """Totals since the start: `commands`, `commands_first_contact` of new senders whose delays
+        """Totals since the start: `commands`, `commands_of_new_senders` of new senders whose delays
         were not proved yet, and `command_<reason>` for each reason to refuse. The control loop adds
         those of the port and the bus."""
         self._refused = ""
         self._refused_ns: int | None = None
         self._sanity = Sanity(config.feedback)
-        self._dropped = ImpossibleLines()
         self._answered = UnansweredLines(config.mcu.reply_period)
         self._tally = EventThrottle()
         self._asked: tuple[str, str, int | None] = ("", "", None)
@@ -137,10 +126,8 @@ class Robot:
         counters = {"lines": session.good_lines} | self._odometry.missed()
         counters |= {f"line_{reason}": count for reason, count in session.rejects.items() if count}
         if self._arbiter.forgiven_ns:
-            counters["clocks_forgiven_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
-        gyro = GyroStatus() if self._gyro is None else self._gyro.status
-        if self._track is not None:
-            gyro = replace(gyro, track_use=self._track.use)
+            counters["clock_adjustments_ms"] = self._arbiter.forgiven_ns // NS_PER_MS
+        checks = self._odometry.checks
         return Snapshot(
             pose=self._odometry.pose,
             measured=None if silent else self._odometry.twist,
@@ -150,10 +137,10 @@ class Robot:
             refused=self._refused,
             refused_age_s=None if since is None else (now_ns - since) / NS_PER_S,
             feedback_age_s=session.feedback_age_s(now_ns),
-            gyro=gyro,
-            doubt=self._odometry.doubt,
+            gyro=checks.gyro_status,
+            doubt=checks.wheels.status,
             check=session.negotiation.in_force,
-            encoders=session.snapping.counts,
+            encoders=session.count_recovery.counts,
             sender=self._choice.sender,
         )
 
@@ -243,7 +230,7 @@ class Robot:
         if before == "up" != link:
             self.counters["link_lost"] += 1
             if session.lateness.late_s:
-                self.counters["link_lost_late"] += 1
+                self.counters["link_lost_host_stall"] += 1
         if link != "up":
             self._sanity.forget()
         self._port_trouble = inputs.port_trouble
@@ -263,8 +250,8 @@ class Robot:
             self._linked_once = True
             self._life.link(up=True)
         now = inputs.now
-        if self._gyro is not None:
-            self._gyro.hear(inputs.gyro)
+        if inputs.gyro:
+            self._odometry.checks.hear(inputs.gyro)
         if not feedback:
             return ()
         return tuple(
@@ -277,12 +264,11 @@ class Robot:
         Several impossible lines in a row latch a fault.
         """
         why = self._sanity.impossible(line)
-        told = self._dropped.line(why)
-        if told is not None:
-            events.append(told)
+        if self._sanity.warning is not None:
+            events.append(self._sanity.warning)
         if why:
-            self.counters["line_impossible"] += 1
-            events.append(Event("lines_rejected", why, "warning", kind="impossible", news=False))
+            self.counters["line_implausible"] += 1
+            events.append(Event("lines_rejected", why, "warning", kind="implausible", news=False))
             self._odometry.skip(line)
             if self._sanity.doubtful:
                 self._fault(f"impossible feedback: {why}", now, events)
@@ -291,24 +277,14 @@ class Robot:
         if fault:
             self._fault(fault, now, events)
         if self._sanity.turned:
-            self.counters["wheels_turned"] += 1
-            events.append(Event("wheels_turned", self._sanity.turned, "warning"))
-        estimate = self._odometry.fold(line, self._gyro, self._speeds)
-        if self._gyro is not None:
-            events += self._gyro.events
-            self._learn(self._gyro, events)
-        if self._odometry.events:
-            self.counters["wheels_doubted"] += len(self._odometry.events)
-            events += self._odometry.events
+            self.counters["uncommanded_motion"] += 1
+            events.append(Event("uncommanded_motion", self._sanity.turned, "warning"))
+        estimate = self._odometry.fold(line, self._speeds)
+        checks = self._odometry.checks
+        if checks.wheels.events:
+            self.counters["wheel_faults"] += len(checks.wheels.events)
+        events += checks.events
         return estimate
-
-    def _learn(self, gyro: Gyro, events: list[Event]) -> None:
-        """Use the effective track that the gyro has taught, if configured and known."""
-        if self._track is not None:
-            self._track.look(gyro.learned)
-            self._odometry.turn_by(self._track.used)
-            if self._track.event is not None:
-                events.append(self._track.event)
 
     # Requests.
 
@@ -316,7 +292,7 @@ class Robot:
         if inputs.guard_trip:
             trip = f"the guard replaced a line: {inputs.guard_trip}"
             self._fault(trip, inputs.now, events)
-        if inputs.leaving and self._life.mode is not Mode.LEAVING:
+        if inputs.leaving and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         if not inputs.requests:
             return ()
@@ -364,9 +340,7 @@ class Robot:
     def _place(self, pose: Pose) -> str:
         """Set the pose, and drop the corrections that were due to the pose before."""
         self._odometry.set_pose(pose)
-        self.session.snapping.forgive()
-        if self._gyro is not None:
-            self._gyro.forgive()
+        self.session.count_recovery.forgive()
         pose = self._odometry.pose
         return f"pose is x {pose.x:g}, y {pose.y:g}, yaw {pose.yaw:g}"
 
@@ -415,7 +389,7 @@ class Robot:
         events.append(refused(refusal))
         # Every sender with a clock of its own begins in this state.
         if refusal.reason == "unproven":
-            self.counters["commands_first_contact"] += 1
+            self.counters["commands_of_new_senders"] += 1
             return
         self.counters[f"command_{refusal.reason}"] += 1
         self._refused_ns, self._refused = now_ns, refusal.text[:MAX_TEXT]
@@ -449,7 +423,7 @@ class Robot:
                 return self.session.words(self._port_trouble)
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
-            case Mode.LEAVING:
+            case Mode.SHUTDOWN:
                 return LEAVING
             case _:
                 assert_never(self._life.mode)

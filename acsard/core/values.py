@@ -173,15 +173,15 @@ EventName = Literal[
     "started", "ended", "signal", "configuration", "real_time", "connecting",
     "port_open", "port_waiting", "port_lost",
     "link_down", "link_booting", "link_up", "link_stale", "link_check", "mcu_restarted",
-    "lines_rejected", "lines_dropped", "lines_lost", "wheels_turned", "wheels_doubted",
-    "gyro", "track", "imu_refused",
-    "bus_stuck", "router_missing", "router_found", "no_router",
+    "lines_rejected", "lines_implausible", "lines_lost", "uncommanded_motion", "wheel_fault",
+    "gyro", "learned_track", "imu_refused",
+    "bus_stuck", "router_missing", "router_found", "not_a_router",
     "missed_periods", "recording", "latch_file",
-    "door_open", "door_crowded", "door_stuck", "door_alone", "door_ended",
+    "gateway_open", "gateway_full", "gateway_stuck", "gateway_lost_daemon", "gateway_ended",
     "page_ended", "page_refused",
-    "router_open", "router_crowded", "router_stuck", "router_ended",
+    "router_open", "router_full", "router_stuck", "router_ended",
     "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
-    "mode", "commander", "kept_waiting", "first_contact", "command_refused", "fault",
+    "mode", "commander", "commands_without_effect", "new_sender", "command_refused", "fault",
 ]  # fmt: skip
 """All names of log events. `deploy/systemd/README.md` explains each of them."""
 
@@ -191,7 +191,7 @@ Level = Literal["info", "warning", "error"]
 class Event(Struct, frozen=True):
     """An event for the log.
 
-    `text` is for people. `tally.py` writes at most a line per name and second.
+    `text` is for people. `event_throttle.py` writes at most a line per name and second.
     """
 
     name: EventName

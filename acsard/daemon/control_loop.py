@@ -14,8 +14,8 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
-from acsard.core.incoming.bus_interface import DOOR_KEY as DOOR
-from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, DoorTold, RoutersTold
+from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
+from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, GatewayTold, RoutersTold
 from acsard.core.incoming.commands import Receiver, asker, parts, sender
 from acsard.core.incoming.imu import ImuTold
 from acsard.core.incoming.queries import Queries, Query, refused
@@ -102,7 +102,7 @@ class ControlLoop:
             recorder.begins(self.robot, self._guard)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._door, self._imu = DoorTold(), ImuTold(config.mcu.simulated)
+        self._gateway, self._imu = GatewayTold(), ImuTold(config.mcu.simulated)
         self._routers = RoutersTold()
         self._turn_rates: list[GyroSample] = []
         """Samples of a gyro since the last step."""
@@ -237,8 +237,8 @@ class ControlLoop:
         requests: list[Request] = []
         self._note(got)
         for arrival in got.arrivals:
-            if arrival.key == DOOR:
-                ends_ns = self._door.hear(arrival, self.robot.counters)
+            if arrival.key == GATEWAY:
+                ends_ns = self._gateway.hear(arrival, self.robot.counters)
                 self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
                 continue
             if arrival.key == IMU:

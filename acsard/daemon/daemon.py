@@ -33,7 +33,7 @@ from acsard.daemon.control_loop import ControlLoop
 from acsard.daemon.latch_file import LatchFile
 from acsard.daemon.serial.port import SerialPort
 from acsard.daemon.serial.simulated_board import Simulated
-from acsard.daemon.supervisor import DOOR, PAGE, Kind, keep_door
+from acsard.daemon.supervisor import GATEWAY, PAGE, Kind, keep_running
 from acsard.daemon.wakeup import Next, Ticker, Wakeup
 from acsard.host import clock, real_time
 from acsard.host.logs import Log
@@ -102,7 +102,7 @@ async def run(
     config: Config,
     log: Log,
     announce: Announce,
-    door: Sequence[str] | None = None,
+    gateway: Sequence[str] | None = None,
     page: Sequence[str] | None = None,
 ) -> None:
     """Run until a signal; raise a `MendableError` if the daemon cannot start.
@@ -111,7 +111,7 @@ async def run(
         config: The configuration.
         log: The log.
         announce: Called once when everything runs.
-        door: Arguments of the `acsard door` process to run, None if it is a service of its own.
+        gateway: Arguments of the `acsard gateway` process to run, None if it is a service.
         page: Arguments of the `acsard web` process to run, None for no page.
     """
     wake = Wakeup()
@@ -126,7 +126,7 @@ async def run(
     if refused:
         log.info("real_time", text=refused)
     try:
-        await _run(config, log, announce, departure, wake, manager, door, page)
+        await _run(config, log, announce, departure, wake, manager, gateway, page)
     except asyncio.CancelledError:
         if departure.begun_ns is None:
             raise
@@ -141,7 +141,7 @@ async def _run(
     departure: Departure,
     wake: Wakeup,
     manager: Systemd,
-    door: Sequence[str] | None,
+    gateway: Sequence[str] | None,
     page: Sequence[str] | None,
 ) -> None:
     async with AsyncExitStack() as stack:
@@ -154,7 +154,7 @@ async def _run(
         path = config.mcu.port if simulated is None else simulated.path
         after = stack.enter_context(ExitStack())
         bus, port = _bus(config, wake), _port(config, path, wake, events.append)
-        ends_ns = _certificates(config, door is not None)
+        ends_ns = _certificates(config, gateway is not None)
         # The bus comes first: an id or address in use must end the daemon before the port opens.
         async with _patience(config, log, manager):
             await stack.enter_async_context(bus)
@@ -185,7 +185,7 @@ async def _run(
         announce(path, port.trouble)
         manager.ready()
         departure.started()
-        served = ((door if config.bus.outside else None, DOOR), (page, PAGE))
+        served = ((gateway if config.bus.outside else None, GATEWAY), (page, PAGE))
         helpers = [_keep(words, events.append, kind) for words, kind in served if words is not None]
         async with _beside([port.keep_open(), _repeat_latched(bus, control), *helpers]):
             await _control(config, control, departure, wake, manager)
@@ -306,7 +306,7 @@ async def _patience(config: Config, log: Log, manager: Systemd) -> AsyncIterator
 
 
 async def _keep(words: Sequence[str], log: Callable[[Event], None], kind: Kind) -> None:
-    await keep_door(words, log, kind)
+    await keep_running(words, log, kind)
 
 
 async def _repeat_latched(bus: ZenohBus, control: ControlLoop) -> None:

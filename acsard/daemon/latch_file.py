@@ -11,11 +11,9 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import queue
 import stat
 import threading
 import time
-from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -37,6 +35,7 @@ from acsard.daemon.kept_latches import (
 from acsard.host import clock
 from acsard.host.atomic_file import replace, sync
 from acsard.host.errors import InUseError
+from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
@@ -52,6 +51,9 @@ CLOSE_S = 0.3
 """Time limit of the last write on the way down."""
 
 HANGS = f"the disk did not answer within {START_S:g} s"
+
+EVENTS = 64
+"""Events that wait for the control loop at most. It takes them in every step."""
 
 NO_PLACE = "no directory"
 """Stands for the path where none can be found."""
@@ -112,8 +114,9 @@ class LatchFile:
         """True if the robot has started without the content, and the file is not yet written."""
         self._missed = Latches()
         """Latches in the file that the robot did not start with, since the read took too long."""
-        self._queue: queue.SimpleQueue[Latches | None] = queue.SimpleQueue()
-        self._news: deque[Event] = deque()
+        self._box = Mailbox[Latches](1)
+        """The newest latches that were handed over, until the thread takes them."""
+        self._news = Mailbox[Event](EVENTS)
         self._held: Latches | None = None
         """The latches in the file."""
         self._failed = ""
@@ -218,7 +221,7 @@ class LatchFile:
     def keep(self, latches: Latches) -> None:
         """Hand over the latches that are in force from now on."""
         self._handed = latches
-        self._queue.put(latches)
+        self._box.put(latches)
 
     def holds(self, latches: Latches) -> bool:
         """Return whether a process that is killed now would start with these latches."""
@@ -236,10 +239,10 @@ class LatchFile:
             self._hung = not self._hung
             if self._hung:
                 text = unwritable(self.where, HANGS)
-                self._news.append(Event("latch_file", text, "warning"))
+                self._news.put(Event("latch_file", text, "warning"))
             elif not self._failed:
-                self._news.append(self._again)
-        return [self._news.popleft() for _ in range(len(self._news))]
+                self._news.put(self._again)
+        return self._news.take()
 
     @property
     def trouble(self) -> str:
@@ -264,49 +267,49 @@ class LatchFile:
     def close(self) -> None:
         """Wait a bounded time until the newest latches are written."""
         if self._thread is not None:
-            self._queue.put(None)
+            self._box.close()
             self._thread.join(CLOSE_S)
 
     # the thread's side
 
     def _work(self, now: Instant) -> None:
-        if not self._failed:
-            self._sync_first()
-        latches, over = None, False
-        while not over:
-            try:
-                newest = [self._queue.get(timeout=None if latches is None else RETRY_S)]
-            except queue.Empty:
-                newest = []
-            while not self._queue.empty():
-                newest.append(self._queue.get())
-            over = None in newest
-            latches = next((one for one in reversed(newest) if one is not None), latches)
-            if latches is None:
-                continue
-            self._busy_ns = clock.mono_ns()
-            with self._disk:
-                if self._blind:
-                    self._read_late(now)
-                trouble = self._write(latches)
-            if trouble and trouble != self._failed:
-                self._fail(trouble)
-            self._busy_ns = None
-            if not trouble:
+        latches = None if self._failed else self._sync_first()
+        while True:
+            # Look for the end before the latches, so that the last ones are not overlooked.
+            over = self._box.closed
+            latches = self._box.pop() or latches
+            if latches is not None and not self._try(latches, now):
                 latches = None
-                self._recover()
-                time.sleep(PACE_S)
+                if not over:
+                    time.sleep(PACE_S)
+            if over:
+                return
+            self._box.wait(None if latches is None else RETRY_S)
 
-    def _sync_first(self) -> None:
-        """Sync the write of the start, and have it tried again if that fails."""
+    def _try(self, latches: Latches, now: Instant) -> str:
+        """Write these latches and report a failure or a recovery; return the failure."""
+        self._busy_ns = clock.mono_ns()
+        with self._disk:
+            if self._blind:
+                self._read_late(now)
+            trouble = self._write(latches)
+        if trouble and trouble != self._failed:
+            self._fail(trouble)
+        self._busy_ns = None
+        if not trouble:
+            self._recover()
+        return trouble
+
+    def _sync_first(self) -> Latches | None:
+        """Sync the write of the start; return the latches to write again if that fails."""
         self._busy_ns = clock.mono_ns()
         with self._disk:
             trouble = self._sync()
         self._busy_ns = None
-        if trouble and self._found is not None:
-            self._fail(trouble)
-            if self._handed is None:
-                self._queue.put(self._found)
+        if not trouble or self._found is None:
+            return None
+        self._fail(trouble)
+        return self._found
 
     def _read_late(self, now: Instant) -> None:
         """Read the file that the start did not read, so that no latch in it is overwritten."""
@@ -331,8 +334,8 @@ class LatchFile:
             # The rename comes before the sync. A process is killed far more often than the power
             # fails, and a sync takes up to seconds on an SD card. A power cut in between may leave
             # half a file, which counts as unreadable: the robot then starts stopped.
-            text = encode(self._robot, self._with_missed(latches)).decode()
-            replace(self._path, text, synced=False)
+            content = encode(self._robot, self._with_missed(latches))
+            replace(self._path, content, synced=False)
         except OSError as error:
             return _reason(error)
         self._held = latches
@@ -343,6 +346,7 @@ class LatchFile:
         assert self._path is not None
         try:
             sync(self._path)
+            sync(self._path.parent)
         except OSError as error:
             return _reason(error)
         return ""
@@ -368,12 +372,12 @@ class LatchFile:
     def _fail(self, reason: str) -> None:
         self._failed = reason
         text = f"{unwritable(self.where, reason)}; the daemon tries again every {RETRY_S:g} s"
-        self._news.append(Event("latch_file", text, "warning"))
+        self._news.put(Event("latch_file", text, "warning"))
 
     def _recover(self) -> None:
         if self._failed:
             self._failed = ""
-            self._news.append(self._again)
+            self._news.put(self._again)
 
 
 def _content(path: Path) -> bytes:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 
 from acsard.core.config.settings import Config
 from acsard.core.formatting import many
-from acsard.core.link.host_stalls import BUSY, is_ours
+from acsard.core.link.link_diagnosis import BUSY, is_ours
 from acsard.core.messages.diagnostics import NO_ROUTER
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.motion.gyro import WORDS
@@ -52,7 +52,7 @@ def link(running: Running) -> Iterator[Finding]:
     # warning.
     often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
     # The built-in simulator is late whenever the daemon is, and it is never unplugged.
-    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_late'}", 0):
+    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
         text = f"lost {late_times} since the daemon's start because this computer did not run"
         yield Finding("link", "warning" if late > often else "ok", text, BUSY)
@@ -64,8 +64,8 @@ def link(running: Running) -> Iterator[Finding]:
         yield Finding("link", "warning" if times > often else "ok", text, mend)
     if not problems and not late and not went:
         yield Finding("link", "ok", "up, and no line is lost")
-    if state.doubt:
-        yield Finding("wheels", "warning", state.doubt, mend)
+    if state.wheel_fault:
+        yield Finding("wheels", "warning", state.wheel_fault, mend)
 
 
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
@@ -94,7 +94,7 @@ def refused(counters: Mapping[str, int]) -> list[str]:
 
 def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
     """Return the number of lost links that this computer did not cause, with a description."""
-    times = counters.get("link_lost", 0) - counters.get("link_lost_late", 0)
+    times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
     text = (
         f"it was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
         "silent at times or was unplugged; the log says when (link_stale, link_down)"
@@ -203,15 +203,15 @@ def daemon(running: Running) -> Iterator[Finding]:
     yield from clocks(running)
     yield from gyro(state.gyro, state.counters)
     yield from linked({row.name: row for row in running.rows})
-    if state.counters.get("door_crowded"):
+    if state.counters.get("gateway_full"):
         text = "clients from the network took all connections at times: the log names them"
         yield Finding(
-            "door",
+            "gateway",
             "warning",
             text,
             "remove the client's certificate from [access], or end its program",
         )
-    yield from latch_file(state.latch_file)
+    yield from latch_file(state.latch_file_error)
     yield from late(running)
 
 
@@ -279,11 +279,11 @@ def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
         yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
 
 
-def door(config: Config) -> Iterator[Finding]:
+def gateway(config: Config) -> Iterator[Finding]:
     """Yield a finding for each endpoint of the TLS gateway."""
     for endpoint in config.bus.outside:
         if answers(endpoint):
-            yield Finding("door", "ok", f"open at {endpoint}")
+            yield Finding("gateway", "ok", f"open at {endpoint}")
         else:
-            mend = "see systemctl status acsard-door; `acsard run` starts one by itself"
-            yield Finding("door", "warning", f"no program listens at {endpoint}", mend)
+            mend = "see systemctl status acsard-gateway; `acsard run` starts one by itself"
+            yield Finding("gateway", "warning", f"no program listens at {endpoint}", mend)

@@ -23,7 +23,7 @@ from acsard.core.messages.expiry import expiry
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
-from acsard.doctor.daemon_findings import daemon, door, found, routers
+from acsard.doctor.daemon_findings import daemon, found, gateway, routers
 from acsard.doctor.finding import LEVELS, Finding, Level
 from acsard.doctor.running import Running, compared
 from acsard.host import clock, real_time
@@ -50,7 +50,7 @@ def certificates(tls: str) -> Iterator[Finding]:
                 "certificates",
                 "failure",
                 text,
-                "run `sudo acsard lan init`, or this command with sudo",
+                "run `sudo acsard tls init`, or this command with sudo",
             )
         elif name == KEY and file.stat().st_mode & 0o077:
             yield Finding(
@@ -59,13 +59,13 @@ def certificates(tls: str) -> Iterator[Finding]:
     try:
         require_usable(tls)
     except MendableError as error:
-        yield Finding("certificates", "failure", str(error), "see `acsard lan init --help`")
+        yield Finding("certificates", "failure", str(error), "see `acsard tls init --help`")
         return
     ends = ends_ns(tls)
     level, words = expiry(ends, now().wall_ns)
-    mend = "run `acsard lan renew`, or in a fleet `lan add`, where ca-key.pem is"
+    mend = "run `acsard tls renew`, or in a fleet `tls add`, where ca-key.pem is"
     if ends is None:
-        mend = f"run {install('lan')}, to read the certificate"
+        mend = f"run {install('tls')}, to read the certificate"
     yield Finding("certificates", LEVELS[level], words, mend if level else "")
 
 
@@ -231,4 +231,4 @@ def examine(
         yield from daemon(running)
     else:
         yield running
-    yield from door(config)
+    yield from gateway(config)

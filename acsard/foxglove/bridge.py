@@ -23,13 +23,12 @@ from acsard.core.messages.topics import full_key
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.drives import Drives
-from acsard.foxglove.notices import Notices
-from acsard.foxglove.refusal_notices import Objections
+from acsard.foxglove.notices import Notices, Objections
 from acsard.foxglove.relay import Relay
 from acsard.foxglove.robot_facts import Facts, learn
 from acsard.foxglove.server import Listener, Refusals, Shown, as_parameters, start
 from acsard.foxglove.services import CALLED, STOPS, services
-from acsard.foxglove.settings import Settings
+from acsard.foxglove.viewer_parameters import Settings
 from acsard.host import clock
 
 GATHER_S = 0.015

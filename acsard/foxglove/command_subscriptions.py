@@ -1,25 +1,73 @@
-"""Subscriptions to the commands of the shown sources, on every key of each source."""
+"""Subscribes to the commands of the shown sources, on every key and in every encoding.
+
+Commands are decoded exactly as the daemon decodes them and as `acsard recording export` writes
+them. A command that the daemon refuses is not shown; it appears in the daemon's counters.
+"""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 
 import zenoh
+from msgspec import Struct
 
 from acsard.client import Client
-from acsard.core.config.settings import Config
-from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival
+from acsard.core.config.settings import Config, RosConfig
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Arrival, Receiver, Via
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.schema import TwistStamped
+from acsard.core.messages.schema import Time, TwistStamped
+from acsard.core.messages.topics import source_keys
+from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.channels import CMD_VEL_IN
-from acsard.foxglove.commanders import Reader, Way, ways
+from acsard.core.ros.shapes import asked
+from acsard.core.ros.transports import endpoints
 from acsard.foxglove.robot_facts import Facts
 from acsard.host import clock
+from acsard.host.mailbox import Mailbox
 
 MOST = 100
 """Maximum number of waiting commands per source, about one second of the highest accepted rate; the
 oldest are dropped."""
+
+
+class Way(Struct, frozen=True):
+    """How the daemon interprets samples on one key of the bus."""
+
+    native: str
+    """The native key below the robot's id that the key stands for; "*" is the name of a
+    certificate."""
+    encoding: str = ""
+    """Encoding of samples that do not name one."""
+    via: Via = "native"
+
+
+def ways(key_of: Callable[[str], str], ros: RosConfig, source: str) -> dict[str, Way]:
+    """Return each key on which this source accepts commands: twists, wheel speeds and the ROS keys.
+
+    `key_of` returns the full key for a key below the robot's id.
+    """
+    native = source_keys([source])
+    found = {key_of(key): Way(key) for key in (*native, *source_keys([source], "*"))}
+    for one in endpoints(ros, "*"):
+        if one.native in native:
+            found[one.key] = Way(one.native, one.encoding, one.transport)
+    return found
+
+
+class Reader:
+    """Converts commands to messages of `cmd_vel_in/<source>`, by the robot's configuration."""
+
+    def __init__(self, config: Config) -> None:
+        self._receiver = Receiver(config.joints, Kinematics(config.drive))
+        self._frame = config.odometry.base_frame
+
+    def read(self, arrival: Arrival, wall_ns: int) -> TwistStamped:
+        """Return the twist of a command that arrived at `wall_ns` (wall clock).
+
+        Raises `DecodeError`.
+        """
+        twist = self._receiver.command(arrival).twist
+        return asked(twist, Time.from_ns(wall_ns), self._frame)
 
 
 class Commanders:
@@ -78,8 +126,8 @@ class _Heard:
     def __init__(
         self, session: zenoh.Session, by_key: Mapping[str, Way], wake: Callable[[], object]
     ) -> None:
-        self._ways, self._wake = by_key, wake
-        self._held: deque[tuple[Arrival, int]] = deque(maxlen=MOST)
+        self._ways = by_key
+        self._box = Mailbox[tuple[Arrival, int]](MOST, wake)
         handler = zenoh.handlers.Callback(self._take)
         self._declared = [session.declare_subscriber(key, handler) for key in by_key]
 
@@ -104,12 +152,11 @@ class _Heard:
             way.via,
             b"" if attached is None else attached.to_bytes(),
         )
-        self._held.append((arrival, now.wall_ns))
-        self._wake()
+        self._box.put((arrival, now.wall_ns))
 
     def take(self) -> list[tuple[Arrival, int]]:
         """Return the commands since the last call, with their wall-clock arrival times in ns."""
-        return [self._held.popleft() for _ in range(len(self._held))]
+        return self._box.take()
 
     def undeclare(self) -> None:
         """End the subscriptions."""

@@ -1,8 +1,10 @@
-"""Messages to the viewers: as status messages, on the topic `log`, and on the terminal."""
+"""Messages to the viewers: as status messages, on the topic `log`, and on the terminal.
+
+`Objections` decides when a viewer learns why its commands do not drive.
+"""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from threading import Lock
 
@@ -10,10 +12,13 @@ from foxglove import StatusLevel
 from foxglove.websocket import WebSocketServer
 from msgspec import Struct
 
+from acsard.client.commander import GRACE_S
 from acsard.core.messages.schema import Time
 from acsard.core.ros.shapes import LEVELS, Log
 from acsard.core.values import NS_PER_S, Level
 from acsard.host import clock
+from acsard.host.mailbox import Mailbox
+from acsard.host.rate_limits import Buckets, Rate
 
 STATUS: dict[Level, StatusLevel] = {
     "info": StatusLevel.Info,
@@ -21,8 +26,8 @@ STATUS: dict[Level, StatusLevel] = {
     "error": StatusLevel.Error,
 }
 
-AGAIN_NS = 2 * NS_PER_S
-"""Minimum interval between two notices with the same text."""
+AGAIN = Rate(0.5)
+"""Rate of the notices with the same text: one in two seconds."""
 
 WAITING = 100
 """Maximum number of waiting notices; the oldest are dropped."""
@@ -44,11 +49,10 @@ class Notices:
     """Collects notices from any thread; the main thread sends them."""
 
     def __init__(self, tell: Callable[[str], None], wake: Callable[[], None]) -> None:
-        self._tell, self._wake = tell, wake
+        self._tell = tell
         self._lock = Lock()
-        self._waiting: deque[Notice] = deque(maxlen=WAITING)
-        self._said: dict[str, int] = {}
-        """Time at which each text was last reported."""
+        self._waiting = Mailbox[Notice](WAITING, wake)
+        self._texts = Buckets(AGAIN)
         self._staying: dict[str, Notice] = {}
 
     def say(self, level: Level, name: str, text: str, stays: str = "") -> None:
@@ -58,29 +62,20 @@ class Notices:
         """
         now_ns = clock.mono_ns()
         with self._lock:
-            recent = {t: ns for t, ns in self._said.items() if now_ns - ns < AGAIN_NS}
-            if text in recent and not stays:
-                return
-            self._said = recent | {text: now_ns}
-            self._waiting.append(Notice(level, name, text, stays))
-        self._wake()
+            new = self._texts.take(text, now_ns)
+        if new or stays:
+            self._waiting.put(Notice(level, name, text, stays))
 
     def over(self, stays: str) -> None:
         """End the lasting status with this id."""
-        with self._lock:
-            self._waiting.append(Notice("info", "", "", stays))
-        self._wake()
+        self._waiting.put(Notice("info", "", "", stays))
 
     def send(self, server: WebSocketServer, log: Callable[[Log], None], *, newcomers: bool) -> None:
         """Send the waiting notices. With `newcomers`, send all lasting statuses again first."""
         if newcomers:
             for one in self._staying.values():
                 server.publish_status(one.text, STATUS[one.level], one.stays)
-        while True:
-            with self._lock:
-                if not self._waiting:
-                    return
-                one = self._waiting.popleft()
+        for one in self._waiting.take():
             if not one.text:
                 if self._staying.pop(one.stays, None):
                     server.remove_status([one.stays])
@@ -91,3 +86,25 @@ class Notices:
             stamp = Time.from_ns(clock.now().wall_ns)
             log(Log(stamp, LEVELS[one.level], f"foxglove.{one.name}", one.text))
             self._tell(one.text)
+
+
+class Objections:
+    """The objection to one viewer's commands. The class is pure."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+        self.told = ""
+        """The objection that was reported and still holds, or ""."""
+
+    def look(self, objection: str, now_ns: int) -> bool:
+        """Process the current objection ("" for none); return whether `told` has changed."""
+        if not objection:
+            self._since_ns = None
+            changed, self.told = bool(self.told), ""
+            return changed
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        if now_ns - self._since_ns < GRACE_S * NS_PER_S or objection == self.told:
+            return False
+        self.told = objection
+        return True

@@ -17,13 +17,12 @@ import zenoh
 from acsard.client import Client
 from acsard.client.synchronous import decoder
 from acsard.core.messages.encodings import DecodeError
-from acsard.core.messages.schema import Events
+from acsard.core.messages.schema import Events, LogEvent
 from acsard.core.messages.topics import by_key
 from acsard.core.ros.channels import ENCODING, LOG, SCHEMA_ENCODING, Channel
-from acsard.core.ros.shapes import Log
+from acsard.core.ros.shapes import Log, log
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.foxglove.command_subscriptions import Commanders
-from acsard.foxglove.log_messages import News
 from acsard.foxglove.robot_facts import Facts, key_of
 
 MOST = 100
@@ -33,6 +32,30 @@ EVENTS = "events"
 
 KEPT = ("tf_static", "diagnostics", "state")
 """Keys that are published seldom; a viewer that starts to look receives the last message."""
+
+
+class News:
+    """The daemon's events as log lines, each of them once."""
+
+    def __init__(self) -> None:
+        self._total = self._stamp_ns = 0
+        self._told: list[LogEvent] = []
+
+    def of(self, events: Events) -> list[Log]:
+        """Return the new events as log lines.
+
+        After a restart of the daemon, return all events that it still knows.
+        """
+        known, told, stamp_ns = self._total, self._told, events.stamp.to_ns()
+        if events.total < known:
+            if stamp_ns <= self._stamp_ns:
+                return []  # an older answer that arrived after a published list
+            known, told = 0, []  # the daemon was restarted
+        self._total, self._stamp_ns, self._told = events.total, stamp_ns, events.events
+        new = min(events.total - known, len(events.events))
+        last = events.events[len(events.events) - new :]
+        # An event that lasts counts several times in the total but appears once in the list.
+        return [log(one, one.stamp) for one in last if one not in told]
 
 
 class _Out:
@@ -115,7 +138,7 @@ class Relay:
         arrivals = queue_on(self._robot.session, self._robot.key(key), latched=topic.latched)
         arrivals.wakes(self._wake)
         if not topic.latched:
-            self._robot.ask(key, arrivals.take)  # the next message may be seconds away
+            self._robot.ask(key, arrivals.put)  # the next message may be seconds away
         return Subscription(arrivals, self._robot.key(key))
 
     def pass_on(self) -> None:

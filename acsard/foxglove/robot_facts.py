@@ -9,13 +9,14 @@ from acsard.client import Client
 from acsard.core.config.parsing import from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.permissions import COMMAND_ROLE, has, least_role
 from acsard.core.ros.channels import CMD_VEL_IN, SOURCE, Channel, said
 from acsard.core.ros.transports import left_out
 from acsard.host.errors import ReplyError
 
 DEAF = (
     "clients over TLS cannot receive the commands of the sources (/cmd_vel_in/…): see them with "
-    "`acsard foxglove` on the robot, or later with `acsard log export`"
+    "`acsard foxglove` on the robot, or later with `acsard recording export`"
 )
 
 
@@ -59,10 +60,10 @@ def learn(robot: Client, tls: str) -> Facts:
         deaf = DEAF
         us = robot.whoami()
         role = us.role
-        forbidden = "" if role in ("operator", "maintainer") else us.words()
+        forbidden = "" if has(role, COMMAND_ROLE) else us.words()
     try:
         sources = tuple(one.name for one in robot.get("state").sources)
-        tables = robot.get("config") if role == "maintainer" else None
+        tables = robot.get("config") if has(role, least_role("config")) else None
         config = Config() if tables is None else from_builtins(tables)
     except (DecodeError, msgspec.ValidationError) as error:
         raise ReplyError(

@@ -1,7 +1,7 @@
 """The websocket server of foxglove-sdk: its callbacks and its start.
 
-The library implements the protocol. The protocol has no authentication, so `address.py` limits the
-server to this machine.
+The library implements the protocol. The protocol has no authentication, so the verb
+(`cli/foxglove.py`) takes only an address of this machine.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, W
 
 from acsard.foxglove.drives import Drives
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.settings import Settings
+from acsard.foxglove.viewer_parameters import Settings
 from acsard.host.errors import InUseError, NotPermittedError
 
 BACKLOG = 256

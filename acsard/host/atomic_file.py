@@ -8,32 +8,45 @@ import tempfile
 from pathlib import Path
 
 NEW_MODE = 0o644
-"""Mode of a new file. No file that is written this way holds secrets, and the service's own user
-reads them."""
+"""Mode of a new file, unless another is given: the service's own user reads it."""
 
 
-def replace(file: Path, text: str, *, synced: bool = True) -> None:
-    """Replace the file by one with this text; its owner and its mode stay.
+def replace(
+    file: Path,
+    content: bytes,
+    *,
+    mode: int | None = None,
+    owner: tuple[int, int] | None = None,
+    synced: bool = True,
+) -> None:
+    """Replace the file by one with this content; raise `OSError` and leave it if that fails.
 
     Args:
         file: The file. Other processes find the old one or the new one, never a part of it.
-        text: The new content.
+        content: The new content. Until its mode is set, only its owner can read it.
+        mode: The mode; by default that of the file before, or `NEW_MODE`.
+        owner: The user and the group. By default those before, if this process may set them.
         synced: True waits for the disk before the rename, so that a power cut leaves the old file
             or the new one. After False a power cut may leave a part of the new one until `sync`.
     """
-    before = file.stat() if file.exists() else None
+    kept = owner
+    if file.exists():
+        before = file.stat()
+        mode = stat.S_IMODE(before.st_mode) if mode is None else mode
+        kept = owner or (before.st_uid, before.st_gid)
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
     try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as new:
-            new.write(text)
+        with os.fdopen(handle, "wb") as new:
+            new.write(content)
             new.flush()
-            os.fchmod(new.fileno(), stat.S_IMODE(before.st_mode) if before else NEW_MODE)
+            os.fchmod(new.fileno(), NEW_MODE if mode is None else mode)
             try:
-                if before:
-                    os.fchown(new.fileno(), before.st_uid, before.st_gid)
+                if kept:
+                    os.fchown(new.fileno(), *kept)
             except PermissionError:
                 # The file of another user in a directory of ours becomes ours.
-                pass
+                if owner:
+                    raise
             if synced:
                 os.fsync(new.fileno())
         os.replace(name, file)
@@ -42,11 +55,10 @@ def replace(file: Path, text: str, *, synced: bool = True) -> None:
         raise
 
 
-def sync(file: Path) -> None:
-    """Wait until the disk has the file and its name."""
-    for path in (file, file.parent):
-        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+def sync(path: Path) -> None:
+    """Wait until the disk has this file, or the names in this directory."""
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -64,7 +64,7 @@ def require_tomlkit() -> None:
     except ImportError:
         raise ExitError(
             Exit.FAILURE,
-            f"--write needs the library tomlkit; run: {install('mcu')}, or leave --write out and "
+            f"--write needs the library tomlkit; run: {install('write')}, or leave --write out and "
             "paste the lines",
         ) from None
 
@@ -77,7 +77,7 @@ def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = Fal
     """
     try:
         place, text, given = _changed(file, keys, new)
-        replace(place, text)
+        replace(place, text.encode())
         return given
     except (OSError, ValueError, ConfigError) as error:
         raise _left(file, error) from None

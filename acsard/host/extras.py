@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote, urlsplit
 
-Extra = Literal["foxglove", "lan", "mcu", "report", "shell", "web"]
+Extra = Literal["foxglove", "report", "shell", "tls", "web", "write"]
 
 
 def install(extra: Extra) -> str:

@@ -11,7 +11,7 @@ from msgspec import Struct
 from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
 from acsard.host.processes import called
 
-OURS = ("bin", "acsard", "acsard.service.d", "acsard-door.service.d", "acsard-web.service.d")
+OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
 """Directories that are removed with the last file in them."""
 
 RUN_S = 60.0

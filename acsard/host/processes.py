@@ -1,4 +1,4 @@
-"""Finds the processes that have a device open, runs a command, and ends a child with its parent.
+"""Finds the processes that have a device open, and runs a command.
 
 Procfs shows the open files, and no file is opened. Only files below a /dev directory are examined:
 a file on a network disk that hangs would block this process.
@@ -6,9 +6,7 @@ a file on a network disk that hangs would block this process.
 
 from __future__ import annotations
 
-import ctypes
 import os
-import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -173,18 +171,6 @@ def _name(process: Path) -> str:
 
 def _comm(process: Path) -> str:
     return (process / "comm").read_text().strip()
-
-
-# From linux/prctl.h.
-PR_SET_PDEATHSIG = 1
-
-
-def end_with_parent(number: signal.Signals) -> None:
-    """Ask the kernel for this signal when the thread that started this process ends.
-
-    The child process calls it. It then ends with its parent even if the parent crashes.
-    """
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
 
 
 def called(words: tuple[str, ...], within_s: float) -> subprocess.CompletedProcess[str]:

@@ -83,8 +83,8 @@ def _closed(path: Path) -> Path | None:
     return None
 
 
-UNIT, DOOR, PAGE = "acsard.service", "acsard-door.service", "acsard-web.service"
-ALL = (UNIT, DOOR, PAGE)
+UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
+ALL = (UNIT, GATEWAY, PAGE)
 STOP = "acsard-stop"
 UNITS = Path("/etc/systemd/system")
 ETC = Path("/etc/acsard")
@@ -156,9 +156,9 @@ def admitting(directory: Path) -> Write | Keep | None:
     loopback only and reads none of root's files. A drop-in that exists keeps its networks, which an
     administrator may have narrowed.
     """
-    if os.geteuid() != 0 or not (UNITS / DOOR).exists():
+    if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
         return None
-    file = lan_drop_in(DOOR)
+    file = lan_drop_in(GATEWAY)
     return admitted(file, file.found(), directory)
 
 

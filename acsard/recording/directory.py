@@ -25,6 +25,7 @@ from msgspec import Struct, field
 
 from acsard.core.config.settings import RECORD, RecordConfig
 from acsard.core.values import NS_PER_S, Instant
+from acsard.host.atomic_file import sync
 from acsard.recording.end_record import CUTS
 from acsard.recording.file import MODE, About, Writing
 from acsard.recording.recovery import recover
@@ -235,7 +236,8 @@ class Ring:
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
         path = self._directory / f"{number:06}-{stamp}{PART}"
         writing = Writing(path, about, OPEN_MODE if self._open else MODE)
-        self._sync()
+        # The names of the files must be on the disk as well as their content.
+        sync(self._directory)
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
@@ -247,7 +249,7 @@ class Ring:
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
         writing.path.rename(path)
         self._run.numbers.add(_number(path) or 0)
-        self._sync()
+        sync(self._directory)
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
@@ -266,7 +268,7 @@ class Ring:
             # Another process may have removed the file.
             with suppress(FileNotFoundError):
                 path.rename(path.with_name(_stem(path) + NEAR))
-            self._sync()
+            sync(self._directory)
 
     def tend(self, now: Instant) -> None:
         """Delete the oldest files when the disk is low, and in every `TRIM_ROUNDS`-th call.
@@ -333,11 +335,3 @@ class Ring:
         if not told.f_blocks:
             return Disk(0, self._bytes)
         return Disk(told.f_blocks * told.f_frsize, told.f_bavail * told.f_frsize)
-
-    def _sync(self) -> None:
-        """Sync the directory, so that the names of the files are on the disk."""
-        handle = os.open(self._directory, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

@@ -291,7 +291,7 @@ class Writing:
 def _definitions() -> Iterator[McapRecord]:
     """Yield the schema and the channels, as they are at the beginning and in the summary."""
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
-    yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.Told")
+    yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
     for topic, number in NUMBERS.items():
         encoding, of = ("json", EVENTS_SCHEMA) if topic == "events" else (f"acsard-{topic}", 0)
         yield Channel(number, topic, encoding, {}, of)

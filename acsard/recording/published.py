@@ -99,7 +99,7 @@ def _recorded(message: Any) -> Any:
     """Return the message without the fields that a recording does not hold."""
     match message:
         case RobotState():
-            return replace(message, certificate="", figures={})
+            return replace(message, certificate_expiry="", latencies={})
         case DiagnosticArray():
             rows = [row for row in message.status if row.name not in MEASURED]
             return DiagnosticArray(message.header, rows)

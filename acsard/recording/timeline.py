@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from acsard.core.formatting import many
-from acsard.core.link.host_stalls import is_ours
+from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.values import Event
 from acsard.recording.recorded_steps import MICRO, Step
 
@@ -121,7 +121,7 @@ NEWS = {
     "mcu_restarted": "board restart",
     "commander": "change of commander",
     "command_refused": "refused command",
-    "wheels_doubted": "doubted wheel",
+    "wheel_fault": "wheel fault",
     "link_up": "",
 }
 """Words for the events in a summary; "" for an event that only ends another one."""

@@ -108,7 +108,7 @@ def reasons(course: Course) -> list[tuple[str, str, str, float]]:
     one, represented by the one that lasted longest.
     """
     found: dict[tuple[str, str, str], dict[str, float]] = {}
-    for name, band in course.commanders.bands.items():
+    for name, band in course.sources.bands.items():
         for span in band.spans():
             if span.kind != "drives":
                 alike = NUMBER.sub("#", span.words)

@@ -14,13 +14,13 @@ from collections.abc import Mapping
 from msgspec import Struct
 
 from acsard.core.config.settings import Config
-from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.link.link_state import WATCHDOG_S
 from acsard.core.robot import Robot
 from acsard.core.thinning import Band, Curve, Place, Point, Track
 from acsard.core.values import NS_PER_S, Outputs, Twist
 from acsard.recording.recorded_steps import MICRO, Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
-from acsard.report.commanders import LOOK_S, MOST_TEXT, Commanders
+from acsard.report.command_sources import LOOK_S, MOST_TEXT, CommandSources
 
 GOOD = "lines"
 """Name of the counter of lines that were parsed."""
@@ -28,7 +28,7 @@ GOOD = "lines"
 BAD = "line_"
 """Prefix of the counters of dropped lines."""
 
-IMPOSSIBLE = "line_impossible"
+IMPOSSIBLE = "line_implausible"
 """Counter of lines that were parsed but whose content was impossible."""
 
 NS_PER_MS = 1_000_000
@@ -164,7 +164,7 @@ class Lateness:
         return max([point.value for point in self.points()], default=0.0)
 
 
-MODES = ("fault", "stopped", "leaving", "waiting", "inactive", "driving", "ready")
+MODES = ("fault", "stopped", "shutdown", "waiting", "inactive", "driving", "ready")
 """Robot modes, in the order in which they win when short spans are merged."""
 
 LINKS = ("down", "stale", "booting", "up")
@@ -234,7 +234,7 @@ class Course:
         self.asked, self.turned = [Curve() for _ in range(4)], [Curve() for _ in range(4)]
         """Commanded and measured wheel speeds, rad/s, in `WHEELS` order."""
         self.modes, self.links = Band(MODES), Band(LINKS)
-        self.commanders = Commanders(config.commands.sources)
+        self.sources = CommandSources(config.commands.sources)
         self.link = Link()
         self.lateness = Lateness(config.rate_hz)
         self.marks = Marks()
@@ -277,7 +277,7 @@ class Course:
             self.began = wall
         t = max(self.seconds, wall - (self.began or wall))
         self._drive(step, t, counts)
-        refused = self.commanders.hear(step, t, robot)
+        refused = self.sources.hear(step, t, robot)
         told = list(self._story.step(step))
         if counts:
             if not known:
@@ -294,7 +294,7 @@ class Course:
     def end(self) -> None:
         """Finish after the last step."""
         t = self.seconds
-        for band in (self.modes, self.links, *self.commanders.bands.values()):
+        for band in (self.modes, self.links, *self.sources.bands.values()):
             band.end(t)
         self.link.end()
 
@@ -324,10 +324,10 @@ class Course:
             self._jumps = True
 
     def _driven(self, source: str) -> Driven:
-        return self.driven.setdefault(self.commanders.name(source), Driven())
+        return self.driven.setdefault(self.sources.name(source), Driven())
 
     def _speeds(self, step: Step, outputs: Outputs, t: float) -> None:
-        wish = self.commanders.wish(outputs)
+        wish = self.sources.wish(outputs)
         curves = ((self.linear, "linear"), (self.angular, "angular"))
         for curve, axis in curves:
             curve["wished"].add(t, None if wish is None else getattr(wish, axis))
@@ -365,7 +365,7 @@ class Course:
         inputs, left = step.inputs, step.said.left is not None
         session = robot.session
         rejected = {f"line_{reason}": count for reason, count in session.rejects.items()}
-        impossible = {"line_impossible": robot.counters["line_impossible"]}
+        impossible = {"line_implausible": robot.counters["line_implausible"]}
         self.link.step(t, left, {"lines": session.good_lines} | rejected | impossible)
         if inputs.tick:
             self.lateness.tick(t, inputs.now.mono_ns, inputs.missed, known)
@@ -379,4 +379,4 @@ class Course:
         self._status, self._looked = status, t
         self.modes.add(t, mode[:MOST_TEXT], reason[:MOST_TEXT])
         self.links.add(t, link[:MOST_TEXT])
-        self.commanders.look(step, t, robot)
+        self.sources.look(step, t, robot)

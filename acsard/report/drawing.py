@@ -26,7 +26,7 @@ END = "#8668b8"
 
 COLOURS = {
     "driving": "#159a6b", "ready": "#8fb8de", "waiting": "#e0b400", "stopped": "#e08600",
-    "fault": "#d43d3d", "inactive": "#9a9a9a", "leaving": END,
+    "fault": "#d43d3d", "inactive": "#9a9a9a", "shutdown": END,
     "up": "#8fb8de", "booting": "#e0b400", "stale": "#e08600", "down": "#d43d3d",
     "drives": "#159a6b", "sends": "#8fb8de", "waits": "#e0b400", "refused": "#d43d3d",
     "info": "#2f7ed8", "warning": "#e08600", "error": "#d43d3d",
@@ -86,6 +86,11 @@ def numbers(values: Iterable[float]) -> dict[str, str]:
     """Encode a column of numbers as doubles in base64."""
     data = struct.pack(f"<{len(values := list(values))}d", *values)
     return {"dtype": "f8", "bdata": binascii.b2a_base64(data, newline=False).decode()}
+
+
+def scatter(name: str, x: Iterable[float], y: Iterable[float], **look: object) -> Trace:
+    """Return a curve, or a mark at each place."""
+    return {"type": "scatter", "name": name, "x": numbers(x), "y": numbers(y), **look}
 
 
 def sentence(mark: Mark) -> str:
@@ -168,20 +173,14 @@ def _noted(name: str, marks: Marks, dot: dict[str, Any]) -> Trace | None:
     if not here:
         return None
     trace = _places(name.replace("_", " "), [at for _, at in here], "markers", marker=dot)
-    words = [sentence(mark) for mark, _ in here]
-    return trace | {"hovertext": words, "hovertemplate": "%{hovertext}<extra></extra>"}
+    del trace["hovertemplate"]
+    return trace | {"hovertext": [sentence(mark) for mark, _ in here], "hoverinfo": "text"}
 
 
 def _places(name: str, places: list[Place], mode: str, **look: object) -> Trace:
-    return {
-        "type": "scatter",
-        "mode": mode,
-        "name": name,
-        "x": numbers(place.x for place in places),
-        "y": numbers(place.y for place in places),
-        "hovertemplate": f"{name}: x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>",
-        **look,
-    }
+    hover = f"{name}: x %{{x:.3f}} m, y %{{y:.3f}} m<extra></extra>"
+    x, y = [place.x for place in places], [place.y for place in places]
+    return scatter(name, x, y, mode=mode, hovertemplate=hover, **look)
 
 
 def _broken(places: list[Place]) -> list[Place]:

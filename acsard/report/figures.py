@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from acsard.core.thinning import Point, Span
 from acsard.core.values import WHEELS
-from acsard.report.commanders import OTHERS
+from acsard.report.command_sources import OTHERS
 from acsard.report.course import Course, Mark
 from acsard.report.drawing import (
     COLOURS,
@@ -27,6 +27,7 @@ from acsard.report.drawing import (
     note,
     numbers,
     path,
+    scatter,
     sentence,
 )
 
@@ -44,6 +45,9 @@ class Line(NamedTuple):
     width: float = 1.6
     """Line width, px."""
 
+
+GAP_PX = 30
+"""Height of the gap above each of several pictures, for its title."""
 
 BENEATH = 3.4
 """Width of a curve that another one nearly covers, so that its colour shows on both sides."""
@@ -190,7 +194,7 @@ class Pictures:
             ("mode", course.modes.spans()),
             ("link", course.links.spans()),
         ]
-        for name, band in course.commanders.bands.items():
+        for name, band in course.sources.bands.items():
             if band.spans():
                 rows.append((name, band.spans()))
             elif name != OTHERS:
@@ -228,7 +232,7 @@ class Pictures:
             "width": 0.5,
             "marker": marker,
             "hovertext": [f"<b>{label(kind)}</b><br>{label(span.words)}" for _, span in spans],
-            "hovertemplate": "%{hovertext}<extra></extra>",
+            "hoverinfo": "text",
             "text": [label(kind) for _ in spans],
             "textposition": "inside",
             "insidetextanchor": "middle",
@@ -251,16 +255,15 @@ class Pictures:
         return Figure("events", "Events", caption, keys, 230, data, axes)
 
     def _marks(self, level: str, at: int, marks: list[Mark]) -> Trace:
-        return {
-            "type": "scatter",
-            "mode": "markers",
-            "name": level,
-            "x": numbers(self._ms(mark.t) for mark in marks),
-            "y": numbers(at for _ in marks),
-            "marker": {"symbol": "diamond", "size": 11, "color": COLOURS[level]},
-            "hovertext": [sentence(mark) for mark in marks],
-            "hovertemplate": "%{hovertext}<extra></extra>",
-        }
+        return scatter(
+            level,
+            [self._ms(mark.t) for mark in marks],
+            [at for _ in marks],
+            mode="markers",
+            marker={"symbol": "diamond", "size": 11, "color": COLOURS[level]},
+            hovertext=[sentence(mark) for mark in marks],
+            hoverinfo="text",
+        )
 
     # Shared parts.
 
@@ -279,28 +282,28 @@ class Pictures:
 
     def _stack(self, name: str, title: str, caption: str, parts: list[Part], px: int) -> Figure:
         """Draw pictures above each other, with one time axis and one legend."""
-        axes, data, notes = self._timed(), list[Trace](), list[dict[str, Any]]()
-        share, gap = 1 / len(parts), 30 / (px * len(parts))
-        for at, part in enumerate(parts):
-            top, n = 1 - at * share, "" if not at else str(at + 1)
-            axes[f"yaxis{n}"] = {"domain": [top - share, top - gap], "rangemode": "tozero"}
-            where = {"xref": "paper", "yref": "paper", "yanchor": "bottom"}
-            notes.append(note(part.title, 0, top - gap) | where)
+        data, notes = list[Trace](), list[dict[str, Any]]()
+        axes = self._timed()
+        axes["margin"] |= {"t": GAP_PX}
+        # Each cell of the grid is a picture. The x axis belongs to all of them.
+        names = ["", *map(str, range(2, len(parts) + 1))]
+        axes["grid"] = {"subplots": [[f"xy{n}"] for n in names], "ygap": GAP_PX / px}
+        for n, part in zip(names, parts, strict=True):
+            axes[f"yaxis{n}"] = {"rangemode": "tozero"}
+            notes.append(note(part.title, 0, 1) | {"yref": f"y{n} domain", "yanchor": "bottom"})
             data += [self._line(line, f"y{n}") for line in part.lines]
-        axes["xaxis"]["anchor"] = f"y{len(parts)}" if len(parts) > 1 else "y"
         axes["annotations"] = notes
         lines = dict.fromkeys((line.name, line.colour) for part in parts for line in part.lines)
         keys = [Key("━", colour, meaning) for meaning, colour in lines]
         return Figure(name, title, caption, keys, px * len(parts) + 70, data, axes)
 
     def _line(self, line: Line, axis: str) -> Trace:
-        return {
-            "type": "scatter",
-            "mode": "lines",
-            "name": line.name,
-            "x": numbers(self._ms(point.t) for point in line.points),
-            "y": numbers(point.value for point in line.points),
-            "yaxis": axis,
-            "line": {"color": line.colour, "width": line.width, "shape": line.shape},
-            "hovertemplate": f"{line.name} %{{y:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>",
-        }
+        return scatter(
+            line.name,
+            [self._ms(point.t) for point in line.points],
+            [point.value for point in line.points],
+            mode="lines",
+            yaxis=axis,
+            line={"color": line.colour, "width": line.width, "shape": line.shape},
+            hovertemplate=f"{line.name} %{{y:.3~f}}<br>%{{x|%H:%M:%S.%L}}<extra></extra>",
+        )

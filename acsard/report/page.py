@@ -203,8 +203,8 @@ def _events(course: Course, clock: Clock) -> str:
         for mark in marks
     ]
     more = (
-        f'<p class="soft">{left_out} more of the same names are left out; acsard log show tells '
-        "all.</p>"
+        f'<p class="soft">{left_out} more of the same names are left out; '
+        "acsard recording show tells all.</p>"
         if left_out
         else ""
     )

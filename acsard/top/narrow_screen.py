@@ -81,19 +81,19 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     """Return the lines about the serial link, the commands and the refusals."""
     before = seen.before or state
     lines = [rule(width, [(0, title(seen, state))])]
-    if state.certificate:
+    if state.certificate_expiry:
         lines += flow([certificate(state)], width, 2)
     counted = rates(seen, state, before)
     told = [Text(f"{what} {counted(name)}") for what, name in LINES]
     superseded = state.counters.get("lines_superseded", 0)
     told += [Text(f"superseded {count(superseded)}"), missed(state, before), overrun(state)]
-    if met := state.counters.get("commands_first_contact", 0):
-        told.append(Text(f"first contact {count(met)}"))
+    if met := state.counters.get("commands_of_new_senders", 0):
+        told.append(Text(f"of new senders {count(met)}"))
     lines += flow([one for one in told if one], width, 0)
     if state.gyro != "off":
         lines += folded(f"gyro {clean(state.gyro)}", width, 2)
-    if state.track:
-        lines += folded(f"track {clean(state.track)}", width, 2)
+    if state.effective_track:
+        lines += folded(f"track {clean(state.effective_track)}", width, 2)
     kinds = refused(state, before)
     for kind, parts in kinds:
         lines += flow([Text(f"rejected {kind}"), *parts], width, 2)
@@ -112,7 +112,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
     for since, last in (("last minute", True), ("since start", False)):
         lines.append(Text(f"{since:<16}{heads}", "dim"))
         for name in NAMES:
-            one = state.figures.get(name)
+            one = state.latencies.get(name)
             figures = None if one is None else one.last_minute if last else one.since_start
             lines.append(Text(f"{name:<16}").append_text(spread(figures)))
     return lines

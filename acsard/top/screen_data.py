@@ -10,7 +10,7 @@ MODES = {
     "driving": "bold white on green",
     "ready": "bold white on blue",
     "waiting": "bold black on yellow",
-    "leaving": "bold black on yellow",
+    "shutdown": "bold black on yellow",
     "inactive": "bold black on white",
     "stopped": "bold white on red",
     "fault": "bold white on red",

@@ -1,10 +1,17 @@
-"""The screens of `top`, `fleet` and `drive`, and `top` as plain text."""
+"""The screens of `top`, `fleet` and `drive`, and `top` as plain text.
+
+A screen ends with a key or a signal. ^Z suspends it, and `fg` resumes.
+"""
 
 from __future__ import annotations
 
+import io
+import os
+import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -14,11 +21,15 @@ from acsard.core.values import AcsardError
 from acsard.terminal.output import plain
 from acsard.top.feed import Feed
 from acsard.top.fleet import Fleet
-from acsard.top.key_reader import keys
+from acsard.top.key_reader import keys, until_told
 from acsard.top.roster import table
-from acsard.top.screen import PERIOD_S, be_lenient, hold, steer
 from acsard.top.teleop import Teleop, lines
 from acsard.top.view import screen
+
+PERIOD_S = 0.25
+
+KEYS_S = 0.05
+"""Interval at which the keys are read and the robot is driven."""
 
 ONCE_S = 0.5
 """Time over which `--once` averages rates; a person waits for it."""
@@ -29,7 +40,7 @@ def once(feed: Feed) -> str:
     feed.ask()
     time.sleep(ONCE_S)
     feed.ask()
-    be_lenient()
+    _be_lenient()
     width = Console().width
     return plain(screen(feed.seen(), width), width=width)
 
@@ -40,19 +51,19 @@ def live(feed: Feed) -> None:
     with suppress(AcsardError):
         feed.ask()
     console = Console()
-    hold(lambda suspend: _watch(feed, console, suspend))
+    _hold(lambda suspend: _watch(feed, console, suspend))
 
 
 def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
     """Pass the typed keys to `step`, "" if none, and show the result of `seen`, until a signal."""
     console = Console()
-    hold(lambda suspend: steer(step, seen, _teleop(console), suspend))
+    _hold(lambda suspend: _steer(step, seen, _teleop(console), suspend))
 
 
 def roster(fleet: Fleet) -> None:
     """Show a line for each robot and update them until a key or a signal."""
     console = Console()
-    hold(lambda suspend: _roster(fleet, console, suspend))
+    _hold(lambda suspend: _roster(fleet, console, suspend))
 
 
 def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
@@ -100,3 +111,49 @@ def _screen(console: Console) -> Live:
         redirect_stdout=False,
         redirect_stderr=False,
     )
+
+
+def _hold(shows: Callable[[list[bool]], bool]) -> None:
+    """Show a screen until a signal arrives or `shows` returns False.
+
+    `shows` gets a list that becomes non-empty when the user presses ^Z. It must then leave its
+    screen and return True, and is called again after `fg`.
+    """
+    _be_lenient()
+    suspend: list[bool] = []
+    signal.signal(signal.SIGTSTP, lambda *_: suspend.append(True))
+    with until_told():
+        while shows(suspend):
+            suspend.clear()
+            os.kill(os.getpid(), signal.SIGSTOP)  # suspend as ^Z does; fg resumes here
+
+
+def _steer(
+    step: Callable[[str], None],
+    seen: Callable[[], Teleop],
+    screen: AbstractContextManager[Callable[[Teleop], None]],
+    suspend: list[bool],
+) -> bool:
+    """Pass the typed keys to `step`, "" if none, and show the screen.
+
+    Return True at ^Z and False when the input ends.
+    """
+    with keys() as read, screen as show:
+        due = 0.0
+        while not suspend:
+            typed = read(KEYS_S)
+            if typed is None:
+                return False
+            step(typed)
+            if typed or time.monotonic() >= due:
+                due = time.monotonic() + PERIOD_S
+                show(seen())
+    for letter in ("k", "", ""):
+        step(letter)  # stop the robot: no steps run while suspended
+    return True
+
+
+def _be_lenient() -> None:
+    """Replace characters that the terminal's encoding lacks, instead of failing."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")

@@ -131,7 +131,7 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
     before = seen.before or state
     head = title(seen, state)
     titles: list[tuple[int, str | Text]] = [(0, head)]
-    if state.certificate:
+    if state.certificate_expiry:
         told = certificate(state)
         titles.append((max(head.cell_len + 2, width - told.cell_len - 4), told))
     counted = rates(seen, state, before)
@@ -143,14 +143,14 @@ def link(seen: ScreenData, state: RobotState, width: int) -> list[Text]:
         ),
         row("commands", f"   {counted('commands'):<21} ").append_text(missed(state, before)),
     ]
-    if met := state.counters.get("commands_first_contact", 0):
-        lines[-1].append(f"  first contact {count(met)}", "dim")
+    if met := state.counters.get("commands_of_new_senders", 0):
+        lines[-1].append(f"  of new senders {count(met)}", "dim")
     if lost := overrun(state):
         lines[-1].append("  ").append_text(lost)
     if state.gyro != "off":
         lines.append(_gyro(state.gyro))
-    if state.track:
-        lines.append(row("track", clean(state.track)))
+    if state.effective_track:
+        lines.append(row("track", clean(state.effective_track)))
     lines += _refusals(state, before)
     return lines
 
@@ -166,8 +166,8 @@ def title(seen: ScreenData, state: RobotState) -> Text:
 
 def certificate(state: RobotState) -> Text:
     """Return the remaining validity of the certificate."""
-    style = "" if state.certificate.startswith("valid for") else "bold red"
-    return Text(f"certificate {clean(state.certificate)}", style)
+    style = "" if state.certificate_expiry.startswith("valid for") else "bold red"
+    return Text(f"certificate {clean(state.certificate_expiry)}", style)
 
 
 def rates(seen: ScreenData, state: RobotState, before: RobotState) -> Callable[[str], str]:
@@ -247,7 +247,7 @@ def timing(state: RobotState, width: int) -> list[Text]:
     lines = [rule(width, at), Text(f"{'':{start}}{heads}{heads}", "dim")]
     for name in NAMES:
         line = Text(f"{name:<16}").append(FIGURES[name][long].ljust(room), "dim")
-        one = state.figures.get(name)
+        one = state.latencies.get(name)
         for figures in (one.last_minute, one.since_start) if one else (None, None):
             line.append_text(spread(figures))
         lines.append(line)

@@ -16,6 +16,7 @@ from aiohttp import web
 from msgspec.structs import replace
 
 from acsard.host import clock
+from acsard.host.rate_limits import Buckets
 from acsard.host.threads import in_thread
 from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
 from acsard.web.callers import (
@@ -32,7 +33,7 @@ from acsard.web.callers import (
 from acsard.web.counts import Counts
 from acsard.web.frames import MAX_BYTES
 from acsard.web.gate import Gate
-from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS, Buckets
+from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS
 from acsard.web.routes import Route
 from acsard.web.tokens import Vault
 

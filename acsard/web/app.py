@@ -20,8 +20,8 @@ from msgspec import Meta, Struct
 
 from acsard import __version__
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
-from acsard.daemon.bus.access import least_role
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi
@@ -40,8 +40,8 @@ from acsard.web.limits import Seats
 from acsard.web.recordings import BlackBox, Recording
 from acsard.web.reports import POLICY, Reports, ReportState, State
 from acsard.web.robots import Robots
-from acsard.web.routes import FORM, JSON, Body, Route, services, values
-from acsard.web.settings import Setting, rows
+from acsard.web.routes import FORM, JSON, RECORDINGS, Body, Route, services, values
+from acsard.web.settings_form import Setting, rows
 from acsard.web.streams import as_json
 from acsard.web.tokens import Vault
 from acsard.web.viewer import HEARTBEAT_S, Viewer
@@ -311,20 +311,20 @@ ROUTES: tuple[Route, ...] = (
         "the settings that srv/set accepts, with values, ranges, and when each may change",
         gives={200: Body("A list.", list[Setting])}),
     Route("GET", "/api/guide", Begin.least, Page.guide,
-        "the values that `begin` on the WebSocket accepts: ways to calibrate, ports to check",
+        "the values that `begin` on the WebSocket accepts: methods of calibration, ports to check",
         gives={200: Body("The choices.", Choices)}),
     Route("GET", "/api/recordings", "viewer", Page.recordings,
         "the recordings of the black box, oldest first",
         gives={200: Body("A list.", list[Recording])}),
-    Route("GET", "/api/recordings/{name}", "operator", Page.recording,
+    Route("GET", "/api/recordings/{name}", RECORDINGS, Page.recording,
         "one recording as a file",
         gives={200: Body("MCAP.", media="application/octet-stream")}),
-    Route("POST", "/api/recordings/{name}/report", "operator", Page.draw,
+    Route("POST", "/api/recordings/{name}/report", RECORDINGS, Page.draw,
         "draws the report of a recording, or reports the progress; ask again until 200",
         gives={200: Body("It is drawn, and at `href`.", ReportState),
                202: Body("This report or another one is being drawn.", ReportState),
                503: Body("The report cannot be drawn; the reason is in the answer.", ReportState)}),
-    Route("GET", "/report/{name}", "operator", Page.report,
+    Route("GET", "/report/{name}", RECORDINGS, Page.report,
         "the report of a recording, once it is drawn",
         gives={200: Body("A page.", str, "text/html")}),
     *values(Page.value),

@@ -17,8 +17,8 @@ from typing import Literal
 
 from msgspec import Struct
 
-from acsard.core.values import ROLES, AcsardError, Role
-from acsard.daemon.bus.access import MAY
+from acsard.core.messages.permissions import MAY, has
+from acsard.core.values import AcsardError, Role
 
 Reason = Literal[
     "host", "origin", "no_token", "bad_token", "plain", "role", "too_many", "too_fast",
@@ -64,13 +64,16 @@ class Who(Struct, frozen=True):
 
     def may(self, least: Role) -> bool:
         """Return whether the client has at least this role."""
-        return ROLES.index(self.role) >= ROLES.index(least)
+        return has(self.role, least)
 
     def require(self, least: Role, what: str) -> None:
         """Raise `RefusedError` unless the client has at least this role, the least for `what`."""
         if not self.may(least):
-            text = f"{what} is for {least}s; you are {self.role}: {MAY[self.role]}"
-            raise RefusedError("role", text)
+            raise RefusedError("role", f"{what} is {self.barred(least)}: {MAY[self.role]}")
+
+    def barred(self, least: Role) -> str:
+        """Return why the client may not do something that needs the role `least`."""
+        return f"for {least}s; you are {self.role}"
 
 
 MAINTAINER = Who("maintainer", HERE)

@@ -11,12 +11,13 @@ from typing import Any, NamedTuple, TypeVar
 
 from acsard.client import Client
 from acsard.core.messages.encodings import DecodeError
+from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.topics import SERVICES
 from acsard.daemon.bus import robot_discovery
-from acsard.daemon.bus.access import SERVICE_ROLES
 from acsard.daemon.bus.address import require_id
 from acsard.host.errors import MendableError, UsageError
+from acsard.host.rate_limits import Places
 from acsard.host.threads import in_thread
 from acsard.web.callers import RefusedError, Who
 from acsard.web.robots import Robots
@@ -57,7 +58,9 @@ class Calls:
     def __init__(self, robots: Robots, ends: Callable[[], Awaitable[Ending]] = _nothing) -> None:
         """Store the robots, and `ends`, which ends the server's check or calibration."""
         self._robots, self._ends = robots, ends
-        self._running, self._stops, self._elsewhere = 0, Stops(), 0
+        self._stops = Stops()
+        self._asks = Places(AT_ONCE, AT_ONCE)
+        self._elsewhere = Places(ELSEWHERE_AT_ONCE, ELSEWHERE_AT_ONCE)
 
     async def call(
         self, who: Who, verb: str, payload: Mapping[str, Any], robot: str = ""
@@ -118,12 +121,9 @@ class Calls:
 
         Slots are limited, so a robot id that does not exist cannot block other callers.
         """
-        if self._elsewhere < ELSEWHERE_AT_ONCE:
-            self._elsewhere += 1
-            try:
+        with self._elsewhere.held() as free:
+            if free:
                 return await in_thread(request, ANSWER_S)
-            finally:
-                self._elsewhere -= 1
         await in_thread(
             lambda: robot_discovery.stop(
                 client.session, [robot], _named(client, robot, who).caller
@@ -133,13 +133,10 @@ class Calls:
         return ServiceReply(False, f"{robot} was told to stop; check that it did: {BUSY}")
 
     async def _ask(self, call: Callable[[], T]) -> T:
-        if self._running >= AT_ONCE:
-            raise MendableError(BUSY)
-        self._running += 1
-        try:
+        with self._asks.held() as free:
+            if not free:
+                raise MendableError(BUSY)
             return await in_thread(call, ANSWER_S)
-        finally:
-            self._running -= 1
 
 
 class Stops:

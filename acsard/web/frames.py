@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 import msgspec
 from msgspec import Meta, Struct
 
+from acsard.core.messages.permissions import COMMAND_ROLE
 from acsard.core.messages.signature import MOST
 from acsard.core.values import AcsardError, Role
 
@@ -78,7 +79,7 @@ class Command(_Frame, frozen=True):
     `stamp` is the time of the command in ms by the sender's own clock.
     """
 
-    least: ClassVar[Role] = "operator"
+    least: ClassVar[Role] = COMMAND_ROLE
     cmd: Wish
     stamp: float
     steady: bool = False
@@ -111,14 +112,14 @@ class Ping(_Frame, frozen=True):
 
 
 class Begin(_Frame, frozen=True):
-    """Check the board at `port`, or calibrate by a `way`; "" selects the default way."""
+    """Check the board at `port`, or calibrate by a `method`; "" selects the default method."""
 
     least: ClassVar[Role] = "maintainer"  # both turn wheels and write configuration files
     begin: Literal["check", "calibrate"]
     port: Device = ""
-    way: Short = ""
+    method: Short = ""
     positions: Short = ""
-    """The key on which positions arrive, for the way `positions` only."""
+    """The key on which positions arrive, for the method `positions` only."""
 
 
 class Reply(_Frame, frozen=True):

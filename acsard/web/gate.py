@@ -14,10 +14,10 @@ from typing import Any
 from aiohttp import web
 from aiohttp.web_protocol import RequestHandler
 
+from acsard.host.rate_limits import Places
 from acsard.web.answers import HEADERS, problem
 from acsard.web.callers import unmapped
 from acsard.web.counts import Counts
-from acsard.web.limits import Places
 
 SOCKETS, SOCKETS_OF_ONE = 256, 64
 """Maximum number of TCP connections per listening address, in all and from one client address. A
@@ -41,7 +41,7 @@ class Gate:
 
     def __init__(self, counts: Counts) -> None:
         self.counts = counts
-        self._doors: dict[asyncio.BaseTransport, _Door] = {}
+        self._connections: dict[asyncio.BaseTransport, _Connection] = {}
 
     def guarded(self, inner: Factory) -> Factory:
         """Wrap a protocol factory so that each connection passes this gate first.
@@ -50,21 +50,21 @@ class Gate:
         from the network can never lock out a browser on the robot itself.
         """
         places = Places(SOCKETS, SOCKETS_OF_ONE)
-        return lambda: _Door(self, places, inner)
+        return lambda: _Connection(self, places, inner)
 
     def spoke(self, transport: asyncio.BaseTransport | None) -> None:
         """Cancel the time limit of this connection, because a request has arrived."""
-        if transport is not None and (door := self._doors.get(transport)) is not None:
-            door.hurry(False)
+        if transport is not None and (connection := self._connections.get(transport)) is not None:
+            connection.hurry(False)
 
-    def opened(self, transport: asyncio.BaseTransport, door: _Door) -> None:
-        self._doors[transport] = door
+    def opened(self, transport: asyncio.BaseTransport, connection: _Connection) -> None:
+        self._connections[transport] = connection
 
     def closed(self, transport: asyncio.BaseTransport) -> None:
-        self._doors.pop(transport, None)
+        self._connections.pop(transport, None)
 
 
-class _Door(asyncio.Protocol):
+class _Connection(asyncio.Protocol):
     """One connection. The inner protocol is created only if the limits allow it."""
 
     def __init__(self, gate: Gate, places: Places, inner: Factory) -> None:

@@ -1,6 +1,6 @@
 """Runs a board check or a calibration for a browser, as a child process of the same command.
 
-Only one runs at a time. The child's lines (`--json-lines`, see prompts/json_lines.py) go to the
+Only one runs at a time. The child's lines (`--json-lines`, see prompts/json_prompt.py) go to the
 connection that started it, and only that connection may send answers and key presses. If the
 connection ends, the child is interrupted as by Ctrl-C, so it still sends its zeros to the board.
 The child also watches its standard input and does not outlive this server. Nothing is queued: a
@@ -12,16 +12,17 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
+from asyncio.subprocess import PIPE, Process
 from collections.abc import Callable, Sequence
 
 import msgspec
 from msgspec import Struct
 
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
-from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.child import acsard, running
 from acsard.host.errors import WORDS, Exit
+from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
 from acsard.web.calls import Ending
@@ -32,15 +33,12 @@ from acsard.web.socket_messages import Ended, Guided, Running
 ENDING_S = 1.0
 """Longest time that the answer to a STOP waits for the child to end."""
 
-LINE_BYTES = 65536
-"""Maximum length of one line of the child's output."""
-
 LAST_BYTES = 4000
 """Number of bytes that are kept from the end of the child's standard error."""
 
-RELAY_NS = NS_PER_S // 20
-"""Minimum interval between signs of life that are relayed to the child. The browser sends them at
-about half this rate (page/guide.js), so none is lost."""
+RELAYED = Rate(20.0)
+"""Rate of the signs of life that are relayed to the child. The browser sends them at about half
+this rate (page/guide.js), so none is lost."""
 
 PATIENCE_S = 6.0
 """Time for the child to send zeros and exit after an interrupt, before it is killed."""
@@ -72,10 +70,10 @@ class Board(Struct, frozen=True):
 class Choices(Struct, frozen=True):
     """The checks and calibrations that the page may start."""
 
-    ways: dict[str, str]
-    """Description of the requirements of each calibration way."""
-    way: str
-    """The recommended way; "" selects the default."""
+    methods: dict[str, str]
+    """Description of the requirements of each calibration method."""
+    method: str
+    """The recommended method; "" selects the default."""
     advice: str
     """Reason for the recommendation and the alternatives."""
     ports: Sequence[Board]
@@ -242,11 +240,11 @@ class _Errand:
     def __init__(self, viewer: object, by: str, name: str, say: Say) -> None:
         self.viewer, self.by, self.name, self.say = viewer, by, name, say
         self.left = False
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: Process | None = None
         self._question = 0
         """Number of the open question; 0 if none is open."""
         self._leg = self._rides = False
-        self._relayed_ns = 0
+        self._relayed = Bucket(RELAYED)
         self._last = b""
 
     def about(self, viewer: object) -> Guided:
@@ -260,20 +258,12 @@ class _Errand:
         """
         if self.left:
             return int(Exit.FAILURE), ""
-        # The child gets a session of its own, so a Ctrl-C at this server's terminal reaches it
-        # once, from this server.
-        process = self._process = await asyncio.create_subprocess_exec(
-            sys.executable, "-P", "-m", "acsard", *given, limit=LINE_BYTES, start_new_session=True,
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-        )  # fmt: skip
-        if self.left:
-            self._interrupt()
-        try:
+        async with running(acsard(*given), stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
+            self._process = process
+            if self.left:
+                self._interrupt()
             await asyncio.gather(self._hear(process), self._overhear(process))
             code = await process.wait()
-        finally:
-            self.kill()
         return code if code >= 0 else 128 - code, self._words()
 
     def answer(self, reply: Reply) -> bool:
@@ -295,9 +285,7 @@ class _Errand:
 
     def relay(self) -> None:
         """Send a sign of life: the operator who can stop the robot is still connected."""
-        now_ns = clock.mono_ns()
-        if now_ns - self._relayed_ns >= RELAY_NS:
-            self._relayed_ns = now_ns
+        if self._relayed.take(clock.mono_ns()):
             self._write({})
 
     def leave(self) -> None:
@@ -326,12 +314,12 @@ class _Errand:
             assert self._process.stdin is not None
             self._process.stdin.write(msgspec.json.encode(message) + b"\n")
 
-    async def _hear(self, process: asyncio.subprocess.Process) -> None:
+    async def _hear(self, process: Process) -> None:
         assert process.stdout is not None
         try:
             async for line in process.stdout:
                 self._take(line)
-        except ValueError:  # a line over LINE_BYTES
+        except ValueError:  # a line that is too long
             self.leave()
             while await process.stdout.read(4096):
                 pass
@@ -347,7 +335,7 @@ class _Errand:
             self._rides = False
         self.say(Guided(msgspec.Raw(line)))
 
-    async def _overhear(self, process: asyncio.subprocess.Process) -> None:
+    async def _overhear(self, process: Process) -> None:
         assert process.stderr is not None
         while said := await process.stderr.read(4096):
             self._last = (self._last + said)[-LAST_BYTES:]

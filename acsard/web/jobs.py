@@ -35,8 +35,8 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     """Return the arguments after `acsard`. Raises `FrameError` if the request is not allowed."""
     config = [f"--config={reach.config}"] if reach.config else []
     if begin.begin == "check":
-        if begin.way or begin.positions:
-            raise FrameError("begin", "way and positions are only for calibrate")
+        if begin.method or begin.positions:
+            raise FrameError("begin", "method and positions are only for calibrate")
         if begin.port not in ports:
             raise FrameError("begin", f"port is one of {', '.join(sorted(ports))}")
         return ["mcu", "check", "--json-lines", *config, f"--port={begin.port}"]
@@ -45,15 +45,15 @@ def words(begin: Begin, reach: Reach, ports: Collection[str]) -> list[str]:
     given = [f"--connect={reach.endpoint}", f"--id={reach.robot_id}"]
     if reach.tls:
         given.append(f"--tls={reach.tls}")
-    return ["calibrate", "--json-lines", *config, *given, *_way(begin)]
+    return ["calibrate", "--json-lines", *config, *given, *_method(begin)]
 
 
-def _way(begin: Begin) -> list[str]:
-    if begin.way and begin.way not in NEEDS:
-        raise FrameError("begin", f"way is one of {', '.join(NEEDS)}")
-    if (begin.way == POSITIONS) != bool(begin.positions):
-        raise FrameError("begin", "positions is the key of the positions, for the way positions")
+def _method(begin: Begin) -> list[str]:
+    if begin.method and begin.method not in NEEDS:
+        raise FrameError("begin", f"method is one of {', '.join(NEEDS)}")
+    if (begin.method == POSITIONS) != bool(begin.positions):
+        raise FrameError("begin", "positions is the key of the positions, for the method positions")
     if begin.positions and not KEY.match(begin.positions):
         raise FrameError("begin", "positions must be a key like sim/pose: letters, digits, _ / -")
-    options = {"way": begin.way, "positions": begin.positions}
+    options = {"method": begin.method, "positions": begin.positions}
     return [f"--{name}={value}" for name, value in options.items() if value]

@@ -78,7 +78,7 @@ class Minute:
         if len(measured) != MEASURED:
             measured = [None] * MEASURED
         twist = [wished.linear.x, wished.angular.z] if wished else [None, None]
-        figure = state.figures.get("period_lateness")
+        figure = state.latencies.get("period_lateness")
         late = figure.last_minute if figure else None
         lateness = [late.p99 * MS, late.max * MS] if late else [None, None]
         row = [*measured, *twist, *lateness]

@@ -103,7 +103,7 @@ def require_certificate(listen: Sequence[Listen], tls: str) -> None:
     away = [one for one in listen if one.secure]
     if away and not tls:
         raise CertificateError(
-            f"{away[0].url} needs a certificate: `acsard lan init` makes one; then set bus.tls, "
+            f"{away[0].url} needs a certificate: `acsard tls init` makes one; then set bus.tls, "
             "or --tls DIRECTORY"
         )
     if away:

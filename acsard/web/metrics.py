@@ -76,11 +76,11 @@ def _of_robot(state: RobotState) -> Iterator[tuple[str, Kind, str, Iterable[Samp
         yield "wheel_speed_radps", "gauge", "measured", wheels
     yield "robot_total", "counter", "the daemon's counters", _by("what", state.counters)
     figures: list[Sample] = []
-    for name, figure in state.figures.items():
+    for name, figure in state.latencies.items():
         spread = figure.last_minute
         for at, value in (("p50", spread.p50), ("p99", spread.p99), ("max", spread.max)):
-            figures.append(({"figure": name, "at": at}, value * US))
-    yield "figure_seconds", "gauge", "latencies of the daemon, over the last minute", figures
+            figures.append(({"latency": name, "at": at}, value * US))
+    yield "latency_seconds", "gauge", "latencies of the daemon, over the last minute", figures
 
 
 def _by(label: str, counts: Mapping[str, int]) -> list[Sample]:

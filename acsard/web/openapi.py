@@ -14,8 +14,9 @@ import msgspec
 from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
-from acsard.core.messages.topics import IMU, PUBLISHED
-from acsard.web import job_lines, socket_messages
+from acsard.core.messages.topics import FOLLOWED
+from acsard.prompts import json_messages
+from acsard.web import socket_messages
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route
 
@@ -33,17 +34,19 @@ VALUE = "Value."
 GUIDED = "Guided"
 
 SENT = (
-    socket_messages.Hello, socket_messages.Way, socket_messages.LastMinute, socket_messages.Answer,
-    socket_messages.Rows, socket_messages.Pong, socket_messages.Refused, socket_messages.Gone,
+    socket_messages.Hello, socket_messages.DrivenPath, socket_messages.LastMinute,
+    socket_messages.Answer, socket_messages.Rows, socket_messages.Pong, socket_messages.Refused,
+    socket_messages.Gone,
 )  # fmt: skip
 
 LINES = (
-    socket_messages.Running, socket_messages.Ended, job_lines.Subject, job_lines.JobProgress,
-    job_lines.Doing, job_lines.Progress, job_lines.Question, job_lines.Found, job_lines.Result,
+    socket_messages.Running, socket_messages.Ended, json_messages.Subject,
+    json_messages.JobMessage, json_messages.Doing, json_messages.Progress, json_messages.Question,
+    json_messages.Found, json_messages.Result,
 )  # fmt: skip
 """Types of the content of `guide`."""
 
-KEYS = {topic.key: topic.type for topic in PUBLISHED} | {IMU: "Imu"}
+KEYS = {topic.key: topic.type for topic in FOLLOWED}
 """Type of each key that can be subscribed to."""
 
 

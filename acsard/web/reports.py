@@ -1,6 +1,7 @@
 """Draws reports of recordings for the page, one at a time, in a child process.
 
-The child runs `acsard log report` at the lowest priority. Its time, memory and output are bounded.
+The child runs `acsard recording report` at the lowest priority. Its time, memory and output are
+bounded.
 The child is killed when this server ends or no client asks for the report any more. The finished
 report is kept compressed in memory until another one is drawn or nobody has asked for it for 15
 minutes; no file is written.
@@ -15,13 +16,9 @@ from __future__ import annotations
 
 import asyncio
 import gzip
-import os
-import resource
 import signal
-import sys
-from asyncio.subprocess import DEVNULL, PIPE, Process
+from asyncio.subprocess import PIPE, Process
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -29,10 +26,8 @@ from msgspec import Meta, Struct
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.child import Limits, acsard, how_it_ended, running
 from acsard.host.threads import in_thread
-
-# -P runs the installed package, not files in the current directory.
-COMMAND = (sys.executable, "-P", "-m", "acsard", "log", "report", "--held")
 
 POLICY = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src "
@@ -44,10 +39,6 @@ report's own policy names the allowed scripts by their hashes, and the browser e
 policies."""
 
 NICE = 19
-
-FIRST_TO_GO = b"1000"
-"""Value for `oom_score_adj`: when the computer runs out of memory, the kernel kills the child
-before the page's server."""
 
 DRAW_S = 600.0
 """Time limit of a drawing: a full file of the black box, one to four hours, takes minutes on a
@@ -72,16 +63,19 @@ SAID = 2000
 
 TOO_LONG = (
     f"it takes longer than {DRAW_S / 60:.0f} min here: fetch the recording, and draw it on a "
-    "faster machine with acsard log report"
+    "faster machine with acsard recording report"
 )
 TOO_MUCH = (
-    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, with acsard log report"
+    f"it takes over {MEMORY >> 20} MB of memory: draw it on another machine, with "
+    "acsard recording report"
 )
 KILLED = (
     "the system ended it, most likely because memory ran out: draw it on another machine, with "
-    "acsard log report"
+    "acsard recording report"
 )
-TOO_BIG = f"it has over {BYTES >> 20} MB: draw a part of it, with acsard log report --from --to"
+TOO_BIG = (
+    f"it has over {BYTES >> 20} MB: draw a part of it, with acsard recording report --from --to"
+)
 
 State = Literal["drawing", "ready", "failed", "busy"]
 
@@ -117,8 +111,9 @@ class _Drawing:
 class Reports:
     """The newest report."""
 
-    def __init__(self, command: Sequence[str] = COMMAND) -> None:
-        self._command = command
+    def __init__(self, command: Sequence[str] = ()) -> None:
+        """Draw by `acsard recording report`, or by another command."""
+        self._command = command or acsard("recording", "report", "--supervised")
         self._one: _Drawing | None = None
         self._work: asyncio.Task[None] | None = None
 
@@ -183,22 +178,18 @@ class Reports:
 
     async def _drawn(self, one: _Drawing) -> bytes:
         """Run the child and return the report. Raises `_FailedError` with the child's message."""
-        child = await asyncio.create_subprocess_exec(
-            *self._command, str(one.path), stdin=DEVNULL, stdout=PIPE, stderr=PIPE,
-            start_new_session=True,
-        )  # fmt: skip
-        try:
-            _hold_down(child)
-            body, said = await asyncio.gather(_body(child), _listened(child, one))
+        command, limits = [*self._command, str(one.path)], Limits(NICE, MEMORY)
+        async with running(command, limits, stdout=PIPE, stderr=PIPE) as child:
+            listening = asyncio.create_task(_listened(child, one))
+            try:
+                body, said = await _body(child), await listening
+            finally:
+                listening.cancel()
             code = await child.wait()
-        finally:
-            if child.returncode is None:
-                child.kill()
-                await child.wait()
         if code == -signal.SIGKILL:
             raise _FailedError(KILLED)
         if code:
-            raise _FailedError(_why(said) or f"the drawing program ended with {code}")
+            raise _FailedError(_why(said) or f"the drawing program {how_it_ended(code)}")
         return body
 
 
@@ -212,17 +203,6 @@ def _why(said: str) -> str:
     if last.startswith("MemoryError"):
         return TOO_MUCH
     return last if said.startswith("Traceback") else said
-
-
-def _hold_down(child: Process) -> None:
-    """Give the child the lowest CPU priority and limit its memory."""
-    try:
-        with suppress(OSError):
-            Path(f"/proc/{child.pid}/oom_score_adj").write_bytes(FIRST_TO_GO)
-        os.setpriority(os.PRIO_PROCESS, child.pid, NICE)
-        resource.prlimit(child.pid, resource.RLIMIT_DATA, (MEMORY, MEMORY))
-    except ProcessLookupError:
-        pass  # it has ended already, and its output says why
 
 
 async def _body(child: Process) -> bytes:

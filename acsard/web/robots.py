@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -15,6 +14,7 @@ from msgspec import Struct
 from acsard.client import Client
 from acsard.client.commander import LONGEST_S
 from acsard.client.follower import Follower, restarted
+from acsard.client.watch import ANSWERS
 from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Info, PoseStamped, RobotState, Twist, TwistStamped
 from acsard.core.thinning import Place, Track
@@ -24,6 +24,7 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
 from acsard.host.errors import MendableError, UnreachableError
+from acsard.host.mailbox import Mailbox
 from acsard.host.threads import in_thread
 from acsard.web.commands import SOURCE
 from acsard.web.counts import Counts
@@ -97,8 +98,8 @@ class Robots:
         self._wishes = Decoder(TwistStamped)
         self._asks = asyncio.Event()
         self._follower = Follower(0.0)
-        self._answers: deque[zenoh.Sample] = deque()
-        """Answers to queries of the state. A thread of Zenoh appends them here."""
+        self._answers = Mailbox[zenoh.Sample](ANSWERS)
+        """Answers to queries of the state. A thread of Zenoh puts them here."""
 
     async def run(self) -> None:
         """Follow the robot until cancelled. Raises a `MendableError` that a retry cannot fix."""
@@ -156,8 +157,8 @@ class Robots:
                 seen, asked = states.number, states.asked
                 self._take(states.raw() or ("", b""), states.at_ns, now_ns, asked=asked)
             # Replies come last: `answered` compares stamps, and `published` does not.
-            while self._answers:
-                self._take(encoded(self._answers.popleft()), now_ns, now_ns, asked=True)
+            for answer in self._answers.take():
+                self._take(encoded(answer), now_ns, now_ns, asked=True)
             if follower.asks(now) and (asking is None or asking.done()):
                 asking = asyncio.create_task(self._ask_state())
             quiet = follower.silent(now)
@@ -199,7 +200,7 @@ class Robots:
         client = self.client
         assert client is not None
         with suppress(*UNREADY):
-            await in_thread(lambda: client.ask("state", self._answers.append), None)
+            await in_thread(lambda: client.ask("state", self._answers.put), None)
 
     def _wished(self, now_ns: int) -> Twist | None:
         """Return the commanded twist if it is recent and a viewer of this server follows it."""

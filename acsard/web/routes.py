@@ -14,17 +14,17 @@ from typing import Any, Literal
 from msgspec import Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import TOPICS, VERBS, Topic
-from acsard.core.values import Role, Verb
-from acsard.daemon.bus.access import SERVICE_ROLES, least_role
+from acsard.core.values import ROLES, Role, Verb
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
 """Takes the page and the request, and returns the response."""
 
-JSON, FORM = "application/json", "application/x-www-form-urlencoded"
+RECORDINGS: Role = "operator"
+"""The least role that may fetch recordings and have them drawn."""
 
-NOT_ASKED = ("alive", "json/<key>", "whoami/<role>")
-"""Topics without a value that this interface can return."""
+JSON, FORM = "application/json", "application/x-www-form-urlencoded"
 
 PARAMETERS = {"type": "[A-Za-z0-9_]{1,80}"}
 """Pattern of a path parameter. A parameter that is not listed is any text without a slash."""
@@ -101,7 +101,8 @@ class Route(Struct, frozen=True):
 
 def asked(topic: Topic) -> bool:
     """Return whether the topic has a value that a program may request."""
-    return topic.direction in ("out", "query") and topic.key not in NOT_ASKED
+    own = topic.direction in ("out", "query") and "<key>" not in topic.key
+    return own and topic.query in ROLES
 
 
 def values(handler: Handler) -> Iterator[Route]:

@@ -22,8 +22,8 @@ from acsard.core.config.settings import Config
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
+from acsard.host.child import BEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
-from acsard.host.processes import end_with_parent
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.calls import Calls
@@ -38,7 +38,7 @@ from acsard.web.listen import Listen, bound, own_name, require_certificate
 from acsard.web.robots import About, Robots
 from acsard.web.tokens import Vault
 
-BEAT_S, TIDY_S, TELL_S = 0.5, 1.0, 1.0
+TIDY_S, TELL_S = 1.0, 1.0
 
 NICE = 5
 """Niceness when the daemon starts this server: the daemon must come first."""
@@ -156,31 +156,20 @@ async def _tell(counts: Counts, log: Log) -> None:
 
 
 async def _held(leaving: asyncio.Event) -> None:
-    """Send signs of life to the parent on standard input (a socket), and leave when it closes."""
-    holder = sys.stdin.fileno()
-    os.set_blocking(holder, False)
+    """Send signs of life to the parent, and leave when it closes standard input."""
+    parent, loop = Parent(sys.stdin.fileno()), asyncio.get_running_loop()
 
     def look() -> None:
-        try:
-            ended = os.read(holder, 64) == b""
-        except OSError:
-            ended = True
-        if ended:
+        if parent.gone():
             leaving.set()
 
-    loop = asyncio.get_running_loop()
-    loop.add_reader(holder, look)
+    loop.add_reader(parent.fd, look)
     try:
         while True:
-            try:
-                os.write(holder, b".")
-            except BlockingIOError:
-                pass  # the parent is not reading now
-            except OSError:
-                leaving.set()
+            parent.beat()
             await asyncio.sleep(BEAT_S)
     finally:
-        loop.remove_reader(holder)
+        loop.remove_reader(parent.fd)
 
 
 def _connected(address: Address) -> Client:

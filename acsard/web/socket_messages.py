@@ -6,7 +6,7 @@ built in to_browser.py instead, because their values are already JSON.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 from msgspec import Struct
@@ -36,6 +36,9 @@ class Greeting(Struct, frozen=True):
     simulated: bool
     state_rate: float
     """Rate of the key `state`, Hz."""
+    barred: Mapping[str, str]
+    """The actions that this viewer's role does not allow, each with the reason: services, and
+    "drive", "recordings" and "begin"."""
 
 
 class Hello(Struct, frozen=True):
@@ -44,7 +47,7 @@ class Hello(Struct, frozen=True):
     hello: Greeting
 
 
-class Way(Struct, frozen=True):
+class DrivenPath(Struct, frozen=True):
     """Path of the robot in the last ten minutes: m in the odom frame, oldest first."""
 
     path: Sequence[Point]

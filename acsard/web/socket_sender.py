@@ -15,8 +15,8 @@ import aiohttp
 import msgspec
 from aiohttp import web
 
-from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.rate_limits import Buckets, Rate
 from acsard.web.callers import Reason
 from acsard.web.counts import Counts
 from acsard.web.socket_messages import Refused
@@ -31,8 +31,8 @@ UNREAD_FRAMES = 200
 CLOSES_S = 1.0
 """Time limit for the client's answer to a close; the connection is cut after that."""
 
-TELL_NS = NS_PER_S
-"""Minimum interval between two reported refusals with the same reason. All refusals are counted."""
+REPORTS = Rate(1.0)
+"""Rate of the reported refusals with the same reason. All refusals are counted."""
 
 
 class Following:
@@ -64,7 +64,7 @@ class Outgoing:
         """Subscribed keys by (robot, key)."""
         self._out: deque[bytes] = deque(maxlen=UNREAD_FRAMES)
         self._news = asyncio.Event()
-        self._told: dict[str, int] = {}
+        self._reports = Buckets(REPORTS)
         self._closing = False
 
     def say(self, message: object) -> None:
@@ -79,9 +79,7 @@ class Outgoing:
     def refuse(self, what: str, reason: Reason, text: str) -> None:
         """Count a refusal, and report it to the client at most once a second for each reason."""
         self._counts.refuse(reason, self._origin)
-        now_ns = clock.mono_ns()
-        if now_ns - self._told.get(reason, -TELL_NS) >= TELL_NS:
-            self._told[reason] = now_ns
+        if self._reports.take(reason, clock.mono_ns()):
             self.say(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:

@@ -17,7 +17,7 @@ import zenoh
 
 from acsard.client import Client
 from acsard.core.messages.encodings import DecodeError, detect
-from acsard.core.messages.topics import PUBLISHED
+from acsard.core.messages.topics import FOLLOWED
 from acsard.daemon.bus.subscription import encoded, on
 from acsard.host import clock
 from acsard.host.errors import UsageError
@@ -26,7 +26,7 @@ from acsard.web.limits import STREAMS, STREAMS_OF_ONE, Shares
 
 Take = Callable[[zenoh.Sample], None]
 
-KEYS = frozenset(topic.key for topic in PUBLISHED) | {"imu"}
+KEYS = frozenset(topic.key for topic in FOLLOWED)
 """Keys that a viewer may follow."""
 
 DECLARE_S = 3.0

@@ -10,7 +10,6 @@ import hashlib
 import hmac
 import os
 import secrets
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ import msgspec
 from msgspec import Struct
 
 from acsard.core.values import Role
+from acsard.host.atomic_file import replace
 from acsard.host.errors import NotPermittedError, UsageError
 from acsard.web.callers import Who
 
@@ -173,21 +173,10 @@ class Vault:
             ) from None
 
     def _write(self, tokens: list[Token]) -> None:
-        directory = self.path.parent
-        handle, name = tempfile.mkstemp(dir=directory, prefix=f".{FILE}.")
-        try:
-            with os.fdopen(handle, "wb") as new:
-                new.write(msgspec.json.encode(tokens))
-                new.flush()
-                os.fchmod(new.fileno(), MODE)
-                owner = directory.stat()
-                if os.geteuid() == 0:  # the service reads it as its own user
-                    os.fchown(new.fileno(), owner.st_uid, owner.st_gid)
-                os.fsync(new.fileno())
-            os.replace(name, self.path)
-        except BaseException:
-            os.unlink(name)
-            raise
+        # If root writes the file, the service still reads it as its own user.
+        directory = self.path.parent.stat()
+        owner = (directory.st_uid, directory.st_gid) if os.geteuid() == 0 else None
+        replace(self.path, msgspec.json.encode(tokens), mode=MODE, owner=owner)
 
 
 def place() -> Path:

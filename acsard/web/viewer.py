@@ -15,10 +15,12 @@ import aiohttp
 from aiohttp import web
 
 from acsard.client.commander import Commander, Sender, Wish
+from acsard.core.messages.permissions import COMMAND_ROLE, SERVICE_ROLES
 from acsard.core.messages.signature import public_name
-from acsard.core.values import Twist
+from acsard.core.values import Role, Twist
 from acsard.host import clock
 from acsard.host.own_identity import sender_id
+from acsard.host.rate_limits import Bucket
 from acsard.web import socket_messages
 from acsard.web.callers import RefusedError, Who
 from acsard.web.calls import Calls
@@ -40,9 +42,18 @@ from acsard.web.frames import (
 )
 from acsard.web.guide import Guide
 from acsard.web.keys import Keys
-from acsard.web.limits import MESSAGES, OVERRUNS, Bucket
+from acsard.web.limits import MESSAGES, OVERRUNS
 from acsard.web.robots import Robots
+from acsard.web.routes import RECORDINGS
 from acsard.web.socket_sender import Outgoing
+
+ACTIONS: dict[str, Role] = {
+    **{str(verb): role for verb, role in SERVICE_ROLES.items()},
+    "drive": COMMAND_ROLE,
+    "recordings": RECORDINGS,
+    "begin": Begin.least,
+}
+"""The least role for each action of which the page shows a control."""
 
 HEARTBEAT_S = 10.0
 """Ping interval. The connection ends if the client has not answered after half of it."""
@@ -79,7 +90,7 @@ class Viewer:
         self._socket = socket
         self._robots, self._hand, self._calls = robots, hand, calls
         self._fleet, self._guide, self._counts = fleet, guide, counts
-        self._bucket = Bucket(MESSAGES, clock.mono_ns())
+        self._bucket = Bucket(MESSAGES)
         self._overruns = self._calling = 0
         self._out = Outgoing(socket, request, counts, who.origin)
         self._keys = Keys(self._out, robots, self._start, who.token or who.name)
@@ -94,7 +105,7 @@ class Viewer:
     async def run(self) -> None:
         """Serve the connection until either side ends it."""
         self._greet()
-        self._out.say(socket_messages.Way(**self._robots.way()))
+        self._out.say(socket_messages.DrivenPath(**self._robots.way()))
         self._out.say(socket_messages.LastMinute(self._robots.minute()))
         self._guide.join(self, self._out.say)
         pump = asyncio.create_task(self._out.pump(self._look_around))
@@ -250,6 +261,11 @@ class Viewer:
             socket_messages.Limits(about.linear, about.angular),
             about.simulated,
             about.state_hz,
+            {
+                what: self.who.barred(least)
+                for what, least in ACTIONS.items()
+                if not self.who.may(least)
+            },
         )
         self._out.say(socket_messages.Hello(greeting))
 

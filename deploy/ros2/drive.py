@@ -1,7 +1,7 @@
 """Drive the robot from a ROS machine: zeros first, then one speed for a while, then zeros.
 
-acsard follows a publisher only after it has sent a zero. `ros2 topic pub` of a speed never sends one, so
-use this script instead.
+acsard follows a publisher only after it has sent a zero. `ros2 topic pub` of a speed never sends
+one, so use this script instead.
 
     python3 drive.py [LINEAR m/s] [ANGULAR rad/s] [SECONDS] [--ros-args -r __ns:=/robot1]
 """

@@ -56,7 +56,7 @@ def rig(
     words: Sequence[str] = ACSARD,
     *,
     port: str = "",
-    unprompted: float = 0.0,
+    free_running: float = 0.0,
     wire_baud_rate: int = 0,
 ) -> Iterator[Rig]:
     """Run the program until its link is up."""
@@ -67,7 +67,7 @@ def rig(
             file,
             words=words,
             port=port,
-            unprompted=unprompted,
+            free_running=free_running,
             wire_baud_rate=wire_baud_rate,
         ) as running:
             yield running

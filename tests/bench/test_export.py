@@ -69,7 +69,6 @@ def recorded(path: Path, seconds: float) -> Path:
     config = replace(Config(), record=replace(Config().record, directory=str(path.parent)))
     box = Streamed(path, config, START)
     world = World(config, recorder=box)
-    world.bus.wanted = set()
     world.drive(0.3, 0.2, 1.0)
     while world.now_ns - START.mono_ns < seconds * 1e9:
         for linear, angular in ((0.4, 0.3), (-0.2, 0.5), (0.0, -0.8), (0.5, 0.0)):
@@ -118,7 +117,7 @@ def test_an_hour_needs_hardly_more_memory_than_a_minute(
 ) -> None:
     options = [] if kind == "mcap" else [f"--{kind}"]
     little, much = (
-        cost("log", "export", str(path), str(tmp_path / path.stem), *options) for path in both
+        cost("recording", "export", str(path), str(tmp_path / path.stem), *options) for path in both
     )
     new = tmp_path / "hour"
     written = sum(p.stat().st_size for p in [new, *new.rglob("*")] if p.is_file()) / 1e6
@@ -136,7 +135,9 @@ def test_a_report_of_an_hour_has_room_beside_the_page_in_its_service(
 ) -> None:
     unit = (ROOT / "deploy/systemd/acsard-web.service").read_text()
     room = int(unit.partition("MemoryMax=")[2].partition("M")[0])
-    little, much = (cost("log", "report", str(path), str(tmp_path / path.stem)) for path in both)
+    little, much = (
+        cost("recording", "report", str(path), str(tmp_path / path.stem)) for path in both
+    )
     print(
         f"\na report of an hour: {much.seconds:.0f} s ({much.processor:.0f} s of a processor), "
         f"{much.megabytes:.0f} MB resident at most (a minute: {little.megabytes:.0f} MB)"

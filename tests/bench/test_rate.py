@@ -93,7 +93,7 @@ def test_the_lateness_of_a_period_idle_and_busy(realtime: bool) -> None:
             running.follow(10.0)
             state = running.state()
             running.leave()
-        late = state.figures["period_lateness"].since_start
+        late = state.latencies["period_lateness"].since_start
         missed = state.counters.get("missed_periods", 0)
         print(
             f"\nlateness at 100 Hz, {'all cores busy' if busy else 'idle'}, "

@@ -73,7 +73,7 @@ def cost(where: Path, records: bool) -> Cost:
             used, span = processor_s(daemon.pid) - used, time.monotonic() - began
             written = size(where) - written
             state = bus.state()
-    late = state["figures"]["period_lateness"]["since_start"]
+    late = state["latencies"]["period_lateness"]["since_start"]
     missed = int(state["counters"].get("missed_periods", 0))
     return Cost(100 * used / span, late["p50"], late["p99"], missed, written / span)
 

@@ -117,7 +117,7 @@ def test_a_faster_microcontroller_leaves_no_backlog_here_and_a_growing_one_there
     backlog: dict[str, list[int]] = {}
     for name, words in (("acsard", ACSARD), ("polled", POLLED)):
         one = config(reply_period=1 / hz)
-        with rig(one, words, unprompted=1 / hz) as running:
+        with rig(one, words, free_running=1 / hz) as running:
             running.follow(seconds)
             record = running.end()
         fates = feedback_fates(one, record)

@@ -107,7 +107,7 @@ class Run:
         # The board reports by its own clock, so that the daemon estimates the period, and counts
         # show.
         self.reports = ExitStack()
-        self.reports.enter_context(made.mcu.unprompted(0.01))
+        self.reports.enter_context(made.mcu.free_running(0.01))
         made.run(1.5)
         made.drive(0.0, 0.0, 0.2)
         made.bus.wanted = {"odom"}
@@ -116,8 +116,7 @@ class Run:
         robot, self.heard = made.loop.robot, list[Received]()
         self.lines = Timed(robot._odometry, "fold")
         self.parts = {"odometry": self.lines, "session": Timed(robot.session, "update")}
-        if robot._gyro is not None:
-            self.parts["gyro"] = Timed(robot._gyro, "hear")
+        self.parts["gyro"] = Timed(robot._odometry.checks, "hear")
         self.took = dict.fromkeys((*self.parts, "step", "simplest"), 0)
         simplest = Simplest()
 
@@ -165,7 +164,7 @@ def test_what_a_step_has_grown_by_is_told_beside_what_it_may() -> None:
         rounds.append(found | {"added": added, "share": added / (found["step"] - added)})
     told = {name: median(one[name] for one in rounds) for name in rounds[0]}
     assert run.world.state.gyro == "used"
-    assert run.world.loop.robot.session.snapping.counts == (400,) * 4
+    assert run.world.loop.robot.session.count_recovery.counts == (400,) * 4
     share = told.pop("share")
     print("\nus a line: " + ", ".join(f"{name} {value:.1f}" for name, value in told.items()))
     print(f"added is {share:.0%} of the rest of the step; it may be {ALLOWED / STEP:.0%}")

@@ -100,7 +100,7 @@ def watched(page: Page, daemon: Daemon, bus: Bus) -> tuple[float, int, Periods, 
     time.sleep(SECONDS)
     share = (cpu_seconds(page.pid) - cpu) / (time.monotonic() - at)
     last = bus.state()
-    late = last["figures"]["period_lateness"]["last_minute"]["p99"]
+    late = last["latencies"]["period_lateness"]["last_minute"]["p99"]
     return share, resident_kb(page.pid), Periods.between(first, last), late
 
 

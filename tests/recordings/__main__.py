@@ -56,7 +56,6 @@ def main() -> None:
     for name, config, drive in DRIVES:
         tape = Tape()
         world = World(config, recorder=tape)
-        world.bus.wanted = set()
         drive(world)
         path = HERE / f"{name}.mcap"
         path.unlink(missing_ok=True)

@@ -225,7 +225,7 @@ def test_what_the_daemon_says_of_itself_is_what_happened(world: World) -> None:
     between_ticks(world, 1.0)
     world.send(0.5)
     world.run(1.1)
-    figures = world.state.figures
+    figures = world.state.latencies
     waited = figures["command_to_wire"].since_start
     assert waited.max == pytest.approx((GAP_NS - 1 * MS) / 1000)
     assert figures["mcu_round_trip"].since_start.count == 0, "no plain reply tells what it answers"
@@ -235,6 +235,6 @@ def test_what_the_daemon_says_of_itself_is_what_happened(world: World) -> None:
 def test_checked_replies_tell_how_long_the_microcontroller_takes() -> None:
     world = World(Config(mcu=McuConfig(link_check="require")))
     world.run(1.0)
-    round_trip = world.state.figures["mcu_round_trip"].since_start
+    round_trip = world.state.latencies["mcu_round_trip"].since_start
     assert round_trip.count > 50
     assert 6_700 <= round_trip.p50 <= 12_000

@@ -15,8 +15,7 @@ from tests.scenarios.world import World
 def driven(counts: int, reporting: bool) -> World:
     """Drive about for ten seconds and stop. The board reports by its own clock or when prompted."""
     world, dice = World(Config(sim=SimConfig(encoder_counts=counts))), random.Random(4)
-    world.bus.wanted = set()
-    with world.mcu.unprompted(0.01) if reporting else nullcontext():
+    with world.mcu.free_running(0.01) if reporting else nullcontext():
         world.run(0.5)
         for _ in range(4):
             world.drive(dice.choice((-1, 1)) * dice.uniform(0.3, 0.9), dice.uniform(-1, 1), 2.5)
@@ -36,9 +35,9 @@ def off(world: World) -> float:
 )
 def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -> None:
     world = driven(counts, reporting=True)
-    assert world.state.encoders == [counts] * 4
-    assert "line_impossible" not in world.state.counters
-    assert not [event for event in world.events if event.name in ("fault", "lines_dropped")]
+    assert world.state.encoder_counts == [counts] * 4
+    assert "line_implausible" not in world.state.counters
+    assert not [event for event in world.events if event.name in ("fault", "lines_implausible")]
     # a count of each wheel at either end, twice that through the heading, and the shape of the arcs
     assert off(world) < 0.005 + 3 * math.tau / counts * 0.05
 
@@ -46,6 +45,6 @@ def test_a_robot_that_reports_by_its_own_clock_shows_its_encoders(counts: int) -
 @pytest.mark.parametrize("counts", [20, pytest.param(40, marks=pytest.mark.slow)])
 def test_no_line_of_a_robot_that_answers_at_uneven_times_is_dropped(counts: int) -> None:
     world = driven(counts, reporting=False)
-    assert "line_impossible" not in world.state.counters
+    assert "line_implausible" not in world.state.counters
     assert not [event for event in world.events if event.name == "fault"]
-    assert world.state.encoders == [0] * 4
+    assert world.state.encoder_counts == [0] * 4

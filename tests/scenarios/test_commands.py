@@ -12,6 +12,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Header, Time, Twist, TwistStamped, Vector3
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S
+from tests.each import each
 from tests.scenarios.speakers import Speaker, Way
 from tests.scenarios.world import World
 
@@ -125,7 +126,7 @@ def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) ->
     assert world.state.mode == "inactive"
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "payload", "put", "reason"),
     [
         ("cmd/app", b"{", True, "malformed"),
@@ -155,8 +156,10 @@ def test_a_robot_stopped_while_inactive_is_inactive_after_clear(world: World) ->
     ],
 )
 def test_a_bad_command_is_refused_whole_and_counted(
-    world: World, key: str, payload: bytes, put: bool, reason: str
+    key: str, payload: bytes, put: bool, reason: str
 ) -> None:
+    world = World()
+    world.run(0.2)
     world.drive(0.3, seconds=0.5)
     world.run(0.2)
     world.put(key, payload, put)
@@ -201,11 +204,11 @@ def test_state_says_that_a_sender_is_not_known_yet_and_counts_what_did_not_count
     client.hold(0.0, 0.2)
     assert world.state.reason.startswith("app is new: it drives once its delays")
     assert "app is new" in {s.name: s.waits_for for s in world.state.sources}["app"]
-    assert world.state.counters["commands_first_contact"] == 4
+    assert world.state.counters["commands_of_new_senders"] == 4
     # Every sender begins like this: nothing is refused, and no warning is logged.
     assert not [name for name in world.state.counters if name.startswith("command_")]
     assert world.state.refused == ""
-    (told,) = [event for event in world.events if event.name == "first_contact"][:1]
+    (told,) = [event for event in world.events if event.name == "new_sender"][:1]
     assert told.level == "info"
     client.hold(0.4, 0.3)
     assert world.state.mode == "driving"
@@ -239,7 +242,7 @@ def test_hardware_whose_controller_failed_holds_the_robot_but_not_in_silence(wor
         "driving: held by ros2_control, which sends only zeros for over 10 s; nav sends "
         "speeds and must wait"
     )
-    (told,) = [event.text for event in world.events if event.name == "kept_waiting"]
+    (told,) = [event.text for event in world.events if event.name == "commands_without_effect"]
     assert "held by ros2_control" in told
     assert "nav sends speeds" in told
     world.run(0.3)
@@ -255,7 +258,7 @@ def test_the_first_try_of_a_ros_user_is_answered_in_words(world: World, way: Way
     assert world.state.x == 0.0
     assert "send a zero first: app must send a zero" in world.state.reason
     assert "`ros2 topic pub` of a speed never sends one" in world.state.reason
-    (told,) = [event for event in world.events if event.name == "kept_waiting"]
+    (told,) = [event for event in world.events if event.name == "commands_without_effect"]
     assert told.text == f"app: {world.state.reason}"
 
 
@@ -294,8 +297,9 @@ def test_a_get_on_everything_stops_nothing(world: World) -> None:
 
 
 def test_state_is_published_ten_times_a_second_and_at_once_on_change(world: World) -> None:
-    published = world.bus.published["state"]
+    world.bus.wanted.add("state")
     world.run(0.5)
+    published = world.bus.published["state"]
     before = len(published)
     world.run(5.0)
     assert len(published) - before == 50
@@ -322,7 +326,7 @@ def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
     world.loop.leaving = True
     world.hold(0.9, seconds=0.35)
     assert world.loop.at_rest
-    assert world.state.mode == "leaving"
+    assert world.state.mode == "shutdown"
     assert not world.call("activate").success
 
 

@@ -10,6 +10,7 @@ import pytest
 from acsard.core.config.settings import CommandsConfig, Config, Source
 from acsard.core.motion.freshness import FORGIVE_NS, FORGIVE_RATE
 from acsard.core.values import NS_PER_S
+from tests.each import each
 from tests.scenarios.speakers import FOREIGN, STAMPED, Speaker, Way, moved, over
 from tests.scenarios.world import World
 
@@ -20,7 +21,6 @@ MARGIN_S = 0.1
 
 def quiet() -> World:
     world = World()
-    world.bus.wanted = set()
     world.run(0.3)
     return world
 
@@ -46,11 +46,14 @@ def driven_over(way: Way, delay: Callable[[float], float], seconds: float) -> tu
     return oldest, obeyed
 
 
-@pytest.mark.variations(3)
-@pytest.mark.parametrize("share", [0.02, 0.01, 0.05, 0.095])
+@pytest.mark.variations(4)
+@pytest.mark.parametrize(
+    ("share", "seconds"), [(0.095, 30.0), (0.01, 60.0), (0.02, 60.0), (0.05, 60.0)]
+)
 @pytest.mark.parametrize("way", STAMPED)
-def test_delays_that_grow_slowly_are_not_taken_for_a_clock(way: Way, share: float) -> None:
-    seconds = 60.0
+def test_delays_that_grow_slowly_are_not_taken_for_a_clock(
+    way: Way, share: float, seconds: float
+) -> None:
     oldest, obeyed = driven_over(way, lambda t: share * t, seconds)
     assert obeyed > 20
     assert oldest <= bound(way, seconds)
@@ -62,7 +65,7 @@ def test_delays_that_grow_slowly_are_not_taken_for_a_clock(way: Way, share: floa
 def test_a_constant_delay_that_comes_by_a_jump_is_not_taken_for_a_clock(
     way: Way, plateau: float
 ) -> None:
-    seconds = 20.0
+    seconds = 12.0
     oldest, obeyed = driven_over(way, lambda t: plateau if t > 3.0 else 0.0, seconds)
     assert obeyed > 20
     assert oldest <= bound(way, seconds)
@@ -129,9 +132,9 @@ def test_what_is_forgiven_to_a_foreign_clock_is_counted_in_state() -> None:
     world = quiet()
     speaker = Speaker(world, "rmw")
     speaker.open()
-    assert "clocks_forgiven_ms" not in world.state.counters
+    assert "clock_adjustments_ms" not in world.state.counters
     over(world, speaker, lambda t: BASE_S + (0.6 if t > 1.0 else 0.0), lambda t: 0.0, 6.0)
-    assert 550 <= world.state.counters["clocks_forgiven_ms"] <= 650
+    assert 550 <= world.state.counters["clock_adjustments_ms"] <= 650
 
 
 @pytest.mark.parametrize("way", ["rmw", "header", "zenoh"])
@@ -152,8 +155,8 @@ def test_a_zenoh_clock_that_stands_until_it_was_caught_up_is_an_adjustment(way: 
 # order
 
 
-@pytest.mark.parametrize("timeout", [0.25, 5.0])
-@pytest.mark.parametrize("way", STAMPED)
+@each("timeout", [0.25, 5.0])
+@each("way", STAMPED)
 def test_an_older_command_behind_a_newer_one_is_not_obeyed(way: Way, timeout: float) -> None:
     """The defect moved the robot 0.26 m, and 2.5 m at a timeout of 5 s."""
     world = World(Config(commands=CommandsConfig(sources=(Source("app", 50, timeout),))))

@@ -47,7 +47,7 @@ def test_a_source_that_is_refused_is_a_warning_as_long_as_it_is_refused(world: W
 def test_a_sender_whose_clock_is_new_here_is_no_warning(world: World) -> None:
     client = Speaker(world, "signed", ahead=-3600.0)
     client.hold(0.0, 0.2)
-    assert world.state.counters["commands_first_contact"] == 4
+    assert world.state.counters["commands_of_new_senders"] == 4
     assert row(world, "commands").level == OK
 
 

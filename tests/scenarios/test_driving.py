@@ -69,6 +69,7 @@ def test_one_line_goes_out_every_period(world: World) -> None:
 
 
 def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
+    world.bus.wanted |= {"odom", "tf", "wheel_states"}
     world.drive(0.5, seconds=0.5)
     published = world.bus.published
     for odom, tf, wheels in zip(
@@ -81,6 +82,7 @@ def test_every_message_of_a_sample_has_its_stamp(world: World) -> None:
 
 
 def test_what_is_applied_ramps_by_the_acceleration(world: World) -> None:
+    world.bus.wanted.add("cmd_vel_out")
     world.drive(0.5, seconds=1.0)
     twists = world.bus.published["cmd_vel_out"]
     lines = [

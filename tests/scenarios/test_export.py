@@ -40,8 +40,9 @@ from acsard.recording.file import Recording
 from acsard.recording.published import MEASURED, Publisher
 from acsard.recording.replay import lived
 from acsard.recording.replayed import Course
+from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
-from tests.scenarios.world import World
+from tests.scenarios.world import EVERY_KEY, World
 
 CHECKED = replace(
     Config(),
@@ -59,7 +60,7 @@ def driven(config: Config) -> tuple[World, Tape]:
     The client in it subscribed to everything.
     """
     tape = Tape()
-    world = World(config, recorder=tape)
+    world = World(config, recorder=tape, wanted=EVERY_KEY)
     world.bus.publish("tf_static", world.loop.report.tf_static())
     drive_through_faults(world, 4.0)
     happenings(world, random.Random(1))
@@ -116,7 +117,7 @@ def assert_same(then: Sequence[Message], now: Sequence[Message]) -> None:
     assert len(then) == len(now) > 0
 
 
-@pytest.mark.parametrize("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out"])
+@each("key", ["odom", "tf", "tf_static", "wheel_states", "cmd_vel_out"])
 def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> None:
     world, _, said = both
     assert_same(world.bus.published[key], said[key])
@@ -124,7 +125,7 @@ def test_every_message_is_the_one_that_was_published(key: str, both: Any) -> Non
 
 def test_every_state_is_the_same_but_for_what_the_daemon_measures_of_itself(both: Any) -> None:
     world, _, said = both
-    then = [replace(one, figures={}) for one in world.bus.published["state"]]
+    then = [replace(one, latencies={}) for one in world.bus.published["state"]]
     assert all(isinstance(one, RobotState) and one.counters["lines"] for one in then[20:])
     assert_same(then, said["state"])
 
@@ -140,7 +141,7 @@ def test_every_diagnostics_has_the_same_rows_but_those(both: Any) -> None:
     assert {row.name for row in then[-1].status} >= {"acsard: mode", "acsard: commands"}
 
 
-COUNTED = {"lines_rejected", "missed_periods", "command_refused", "first_contact"}
+COUNTED = {"lines_rejected", "missed_periods", "command_refused", "new_sender"}
 """Events that repeat. `events` has them in one row with a total, and the log has a line each time.
 """
 

@@ -170,7 +170,7 @@ def test_a_sample_that_cannot_be_is_counted_and_changes_nothing() -> None:
     made.put("imu", b'{"angular_velocity": {"z": 1e9}}')
     made.put("imu", b'{"angular_velocity": {"z": NaN}}')
     made.run(1.0)
-    assert made.state.counters["imu_absurd"] == 1
+    assert made.state.counters["imu_out_of_range"] == 1
     assert made.state.counters["imu_malformed"] == 1
     assert made.state.gyro == "used"
     assert made.state.yaw == 0.0
@@ -190,7 +190,6 @@ def test_without_the_setting_nobody_listens_to_a_gyro() -> None:
 
 def gone_silent(made: World, seed: int) -> Drive:
     """The gyro teaches for a while and dies; then only the wheels remain."""
-    made.bus.wanted = {"odom"}
     wandering(made, seed, seconds=30.0)
     made.gyro_dead = True
     made.hold(0.0, 0.0, 1.0)
@@ -202,13 +201,13 @@ def gone_silent(made: World, seed: int) -> Drive:
 def test_without_its_gyro_the_heading_is_good_by_the_track_that_it_taught() -> None:
     plain, asked = gone_silent(world(), 11), gone_silent(world(learned_track=True), 11)
     print(f"the gyro is silent: by the configured track {plain.error:.0%} of {plain.all:.1f} rad, "
-          f"by the learned one {asked.error:.1%}; {asked.world.state.track}")  # fmt: skip
+          f"by the learned one {asked.error:.1%}; {asked.world.state.effective_track}")  # fmt: skip
     assert asked.error < 0.1 * plain.error
-    assert " in use, configured 1.000" in asked.world.state.track
-    assert plain.world.state.track.endswith("(only shown), configured 1.000 in use")
-    (told,) = [event for event in asked.world.events if event.name == "track"]
+    assert " in use, configured 1.000" in asked.world.state.effective_track
+    assert plain.world.state.effective_track.endswith("(only shown), configured 1.000 in use")
+    (told,) = [event for event in asked.world.events if event.name == "learned_track"]
     assert told.text.endswith(" in use, configured 1.000")
-    assert not [event for event in plain.world.events if event.name == "track"]
+    assert not [event for event in plain.world.events if event.name == "learned_track"]
 
 
 @pytest.mark.slow
@@ -231,9 +230,8 @@ def test_the_covariance_knows_how_well_the_track_is_known() -> None:
 def test_what_was_learned_is_lived_again_to_the_last_bit() -> None:
     tape = Tape()
     made = world(learned_track=True, recorder=tape)
-    made.bus.wanted = set()
     wandering(made, 13, seconds=25.0)
-    assert " in use, configured" in made.state.track
+    assert " in use, configured" in made.state.effective_track
     made.gyro_dead = True
     made.drive(0.3, 0.8, 1.0)
     tape.cut = True

@@ -27,9 +27,7 @@ SHORT, SLOW, LONG = 2, 10, 60
 
 def live(minutes: int) -> dict[str, object]:
     """Drive, turn, stop, unplug, reset, stutter: each minute differs, and nothing is random."""
-    world = World()
-    # published messages have their own tests; this one is about behaviour
-    world.bus.wanted = {"state"}
+    world = World(wanted={"state"})
     dice = random.Random(2026)
     trace = 0
 

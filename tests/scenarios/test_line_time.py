@@ -25,10 +25,11 @@ class Drive:
 
     def __init__(self, made: World, reports: bool, batched: bool = False) -> None:
         self.world, self.faults = made, ExitStack()
+        made.bus.wanted.add("wheel_states")
         if batched:
             self.faults.enter_context(made.mcu.ftdi())
         if reports:
-            self.faults.enter_context(made.mcu.unprompted(0.01))
+            self.faults.enter_context(made.mcu.free_running(0.01))
         made.run(1.5)
         made.drive(0.0, 0.0, 0.2)
 

@@ -229,7 +229,7 @@ def test_noise_costs_at_most_the_line_it_hits(world: World) -> None:
 
 def test_an_mcu_that_speaks_unprompted_at_ten_hertz_can_drive() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.1)))
-    with world.mcu.unprompted(0.1):
+    with world.mcu.free_running(0.1):
         world.run(1.0)
         assert world.state.link == "up"
         world.drive(0.5, seconds=4.0)
@@ -275,7 +275,7 @@ def test_blocked_output_is_superseded_and_never_delivered_late(world: World) -> 
 def test_after_a_long_block_the_robot_starts_over_from_rest(world: World) -> None:
     world.drive(0.5, seconds=1.0)
     world.port.blocked = True
-    with world.mcu.unprompted(0.05):
+    with world.mcu.free_running(0.05):
         world.hold(0.5, seconds=0.5)
         sent = len(world.port.sent)
         world.port.blocked = False
@@ -289,8 +289,7 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
     seconds: float,
 ) -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.05)))
-    world.bus.wanted = set()
-    with world.mcu.unprompted(0.05):
+    with world.mcu.free_running(0.05):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
         world.events.clear()
@@ -315,7 +314,7 @@ def test_a_blocked_output_is_not_driving_and_requires_neutral_after_a_second(
 
 def test_a_short_blocked_output_only_ramps_up_again() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.05)))
-    with world.mcu.unprompted(0.05):
+    with world.mcu.free_running(0.05):
         world.run(0.5)
         world.drive(0.5, seconds=1.0)
         world.port.blocked = True
@@ -329,7 +328,7 @@ def test_a_short_blocked_output_only_ramps_up_again() -> None:
 def test_an_output_that_is_blocked_from_the_opening_on_is_reported_before_the_link_is_up() -> None:
     world = World(Config(mcu=McuConfig(reply_period=0.2)), plugged=False)
     world.port.blocked = True
-    with world.mcu.unprompted(0.2):
+    with world.mcu.free_running(0.2):
         world.port.plug(world.mcu)
         world.run(4.0)
         assert (world.state.mode, world.state.link) == ("waiting", "booting")
@@ -345,7 +344,7 @@ def test_the_first_line_after_a_reopening_is_zero_even_when_the_output_was_block
     world = World(plugged=False)
     world.run(0.1)
     world.port.blocked = True
-    with world.mcu.unprompted(0.02):
+    with world.mcu.free_running(0.02):
         world.port.plug(world.mcu)
         world.run(0.1)
         world.drive(0.5, seconds=0.1)
@@ -428,12 +427,12 @@ def test_a_loop_that_did_not_run_is_told_so_and_a_board_that_is_silent_as_that(
         world.run(0.02)
         assert world.state.link == "stale"
         assert world.state.reason.startswith("this computer did not run for 0.2")
-    assert world.state.counters["link_lost_late"] == world.state.counters["link_lost"] == 1
+    assert world.state.counters["link_lost_host_stall"] == world.state.counters["link_lost"] == 1
     world.hold(0.5, seconds=1.0)
     with world.mcu.mute():
         world.run(0.2)
     assert world.state.counters["link_lost"] == 2
-    assert world.state.counters["link_lost_late"] == 1
+    assert world.state.counters["link_lost_host_stall"] == 1
 
 
 def test_the_mcu_watchdog_is_fed_while_the_host_lives(world: World) -> None:
@@ -473,7 +472,7 @@ def test_a_board_that_is_silent_now_and_then_is_counted() -> None:
 
 
 def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
-    world = World(Config(sim=SimConfig(faults=("mute",))))
+    world = World(Config(sim=SimConfig(faults=("mute",))), wanted={"state"})
     world.run(10.0)
     states = [one for one in world.bus.published["state"] if isinstance(one, RobotState)]
     assert {state.link for state in states} == {"booting"}
@@ -495,7 +494,7 @@ def test_a_simulator_that_the_file_makes_mute_never_links() -> None:
 def test_a_silent_or_garbled_board_is_told_by_what_was_heard(
     fault: str, heard: str, mend: str
 ) -> None:
-    world = World()
+    world = World(wanted={"state"})
     with world.mcu.having(named(fault)):
         world.run(2.9)
         assert "first good lines" in world.state.reason

@@ -400,7 +400,7 @@ def test_nav2_drives_a_goal_that_was_cancelled_and_sent_again_a_good_second_late
     nav2.idle(cancelled_at + 1.1)
     drives(world, lambda: nav2.goal(FAST, 0.5))
     nav2.cancel()
-    nav2.idle(10.0)
+    nav2.idle(3.0)
     drives(world, lambda: nav2.goal(FAST, 0.5))
 
 

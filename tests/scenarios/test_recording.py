@@ -32,7 +32,6 @@ SLOW_LIMITS = replace(PLAIN, limits=replace(PLAIN.limits, linear_speed=0.3))
 def taped(config: Config, seconds: float) -> Tape:
     tape = Tape()
     world = World(config, recorder=tape)
-    world.bus.wanted = set()
     drive_through_faults(world, seconds)
     return tape
 
@@ -77,7 +76,6 @@ def test_a_recording_that_begins_within_a_ramp_knows_how_long_that_may_take(afte
 def test_a_drive_through_every_fault_is_lived_again_to_the_last_bit(config: Config) -> None:
     tape = Tape()
     world = World(config, recorder=tape)
-    world.bus.wanted = set()
     assert {*drive_through_faults(world, 45.0)} == {*FAULTS, *WITH_ARGUMENTS}
     inputs = [taken.inputs for taken in tape.taken]
     for has in ("superseded", "missed", "refusals", "requests", "port_trouble", "commands"):
@@ -107,7 +105,6 @@ def test_settings_that_were_changed_meanwhile_are_lived_again_too() -> None:
 def test_it_goes_on_from_any_moment_of_such_a_drive() -> None:
     tape = Tape(every=397)
     world = World(FULL, recorder=tape)
-    world.bus.wanted = set()
     drive_through_faults(world, 20.0)
     assert len(tape.states) > 5
     for first in tape.states:

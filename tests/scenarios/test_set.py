@@ -188,12 +188,12 @@ def test_a_clock_stays_known_when_the_pause_changes(world: World) -> None:
     speaker = Speaker(world, "signed")
     speaker.open()
     world.run(1.5)
-    proved = world.state.counters["commands_first_contact"]
-    assert sets(world, commands__pause=2.0).success
+    proved = world.state.counters["commands_of_new_senders"]
+    assert sets(world, commands__neutral_pause=2.0).success
     speaker.hold(0.0, 0.1)
     speaker.hold(0.4, 0.2)
     assert world.state.mode == "driving"
-    assert world.state.counters["commands_first_contact"] == proved > 0
+    assert world.state.counters["commands_of_new_senders"] == proved > 0
     late = speaker.message(0.4)
     world.run(0.4)
     speaker.deliver(late)
@@ -205,7 +205,7 @@ def test_a_new_pause_counts_for_senders_that_are_known(world: World) -> None:
     speaker = Speaker(world, "plain")
     speaker.open()
     world.run(1.5)
-    assert sets(world, commands__pause=2.0).success
+    assert sets(world, commands__neutral_pause=2.0).success
     for zeros, mode in ((1.5, "ready"), (2.2, "driving")):
         speaker.hold(0.0, zeros)
         speaker.hold(0.4, 0.3)
@@ -220,7 +220,7 @@ def test_rates_and_covariances_hold_from_the_next_message_on(world: World) -> No
         odometry__covariance="constant",
         odometry__pose_covariance_diagonal=diagonal,
     ).success
-    world.bus.published["odom"].clear()
+    world.bus.wanted.add("odom")
     world.run(2.0)
     found = world.bus.published["odom"]
     assert 19 <= len(found) <= 21

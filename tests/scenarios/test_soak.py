@@ -38,12 +38,6 @@ def long(count: int, seconds: int) -> object:
     return pytest.param(count, marks=[pytest.mark.soak, pytest.mark.timeout(seconds)])
 
 
-def quiet_bus(world: World) -> World:
-    """Make the bus encode nothing, because the publications have tests of their own."""
-    world.bus.wanted = set()
-    return world
-
-
 def wheels(line: bytes) -> tuple[float, ...]:
     """Return the wheel speeds of a line that we sent, rad/s."""
     return tuple(
@@ -121,7 +115,7 @@ def test_after_silence_the_ramp_starts_within_the_timeout_and_a_tick(count: int)
                 control=ControlConfig(rate=rate),
                 commands=CommandsConfig(sources=(Source("other", 50), source)),
             )
-            world = quiet_bus(World(config))
+            world = World(config)
             world.run(1.0)
         took = silence(world, dice, timeout)
         late = (took - timeout) * rate
@@ -145,7 +139,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
     fast = dice.uniform(-0.9, 0.9)
     match kind:
         case "restart":
-            again = quiet_bus(World(world.config, plugged=False))
+            again = World(world.config, plugged=False)
             again.now_ns = again.next_period_ns = world.now_ns + dice.randrange(3 * NS_PER_S)
             again.mcu = world.mcu
             again.port.plug(world.mcu)
@@ -184,7 +178,7 @@ def start_over(world: World, kind: str, dice: random.Random) -> World:
 @pytest.mark.parametrize("count", [8, slow(48), long(1_000, 1800)])
 def test_nothing_moves_before_neutral_after_whatever_started_over(count: int) -> None:
     dice, kept, seen = random.Random(2), 0, Counter[str]()
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     for trial in range(count):
         kind = STARTS_OVER[trial % len(STARTS_OVER)]
@@ -224,7 +218,7 @@ def blackhole(dice: random.Random, slow: bool, seconds: float) -> tuple[int, int
     command that would be stale on arrival requests backward motion, every other one forward motion.
     """
     timeout_ns, pause_ns = NS_PER_S // 4, int(NS_PER_S / dice.choice((20, 30, 50)))
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     clock_ns = dice.randrange(2 * DAY_NS)
     queue: deque[int] = deque()
@@ -367,7 +361,7 @@ def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memor
 ) -> None:
     # the silence is not that of a late simulator
     board = Config(mcu=McuConfig(port="/dev/a-board"))
-    dice, world, unexplained = random.Random(4), quiet_bus(World(board)), list[str]()
+    dice, world, unexplained = random.Random(4), World(board), list[str]()
     kinds, modes = Counter[str](), Counter[str]()
     settled, faults = min(60, minutes // 2), minutes if minutes > 60 else len(TROUBLES)
     baseline = last = 0
@@ -412,7 +406,7 @@ def test_a_day_with_a_fault_every_minute_leaves_nothing_unexplained_and_no_memor
 def walk(count: int, jumps: bool) -> tuple[int, int, list[int], object]:
     """Drive about while the wall clock jumps `count` times, or does not."""
     dice, clock = random.Random(5), random.Random(6)
-    world, ticks, trace = quiet_bus(World()), 0, [0, 0]
+    world, ticks, trace = World(), 0, [0, 0]
 
     def watch(outputs: Outputs) -> None:
         nonlocal ticks
@@ -456,7 +450,7 @@ def test_a_wall_clock_that_jumps_a_day_loses_no_tick_and_moves_no_odometry(count
 
 def poured_out(dice: random.Random, way: Way, running: bool) -> bool:
     """Return whether the late backlog of a sender that has ended moves the robot."""
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     ahead = dice.choice((0.0, 0.3, -0.3, -2.0, 2.0, -3600.0, 86400.0))
     # Zenoh's own stamp does not survive being ahead: its sender is unstamped then.
@@ -503,7 +497,7 @@ def test_a_replay_at_the_pace_it_was_sent_counts_of_one_never_heard_as_a_clock_t
     If the sender is known, the zeros with which it opens do not count.
     """
     for known in (False, True):
-        world = quiet_bus(World())
+        world = World()
         world.run(0.3)
         speaker, held = Speaker(world, way), []
         if known:
@@ -567,7 +561,7 @@ def stepped(dice: random.Random, way: Way, ahead: float, step: float) -> str:
 
     Returns the failure, or "".
     """
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     speaker = Speaker(world, way, ahead=ahead)
     speaker.open()
@@ -602,7 +596,7 @@ def test_a_sender_s_clock_may_be_anything_and_be_set_at_any_time(count: int) -> 
 def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
     way: Way, rate: float
 ) -> None:
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     speaker = Speaker(world, way)
     speaker.open()
@@ -624,7 +618,7 @@ def test_a_sender_whose_clock_is_slewed_drives_on_or_again_after_a_zero(
 )
 @pytest.mark.parametrize("way", ["signed", "rmw", "header", "zenoh"])
 def test_two_senders_never_arm_each_other_whatever_their_clocks(way: Way, ahead: float) -> None:
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     holding, other = Speaker(world, way, "a", ahead), Speaker(world, way, "b", ahead)
     holding.open()
@@ -648,7 +642,7 @@ KINDS = ("steady", "stalls", "cuts", "another")
 
 def stuck(dice: random.Random, way: Way, hz: float, kind: str) -> bool:
     """Return whether a sender that is never neutral, through stop and clear, moves the robot."""
-    world = quiet_bus(World())
+    world = World()
     world.run(0.3)
     speaker = Speaker(world, way)
     speaker.open(hz=10.0)
@@ -707,7 +701,7 @@ def test_another_s_zeros_while_one_that_looks_like_it_is_stalled_do_not_set_that
 ) -> None:
     dice, found = random.Random(10), 0
     for trial in range(count):
-        world = quiet_bus(World())
+        world = World()
         world.run(0.3)
         speaker, hz = Speaker(world, way), RATES_HZ[trial % 4]
         speaker.open(hz=10.0)

@@ -7,7 +7,7 @@ applies the same gate as the real one; the wire's pace is the fake MCU's.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import msgspec
 
@@ -32,6 +32,8 @@ from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.recording.recorded_steps import BlackBox
 
 START = Instant(5 * NS_PER_S, 1_800_000_000 * NS_PER_S)
+
+EVERY_KEY = frozenset(topic.key for topic in PUBLISHED if not topic.latched)
 
 LET_GO_NS = 4 * NS_PER_S // 10
 """A zero counts so long after a speed, for commanders of 5 Hz and more."""
@@ -94,10 +96,10 @@ class VirtualPort:
 
 
 class MemoryBus:
-    """Collects what is published; hands in what the test sends."""
+    """Collects the messages on the keys that are wanted; hands in what the test sends."""
 
-    def __init__(self) -> None:
-        self.wanted = {topic.key for topic in PUBLISHED if not topic.latched}
+    def __init__(self, wanted: Collection[str]) -> None:
+        self.wanted = set(wanted)
         self.published: dict[str, deque[Message]] = {}
         self.replies: dict[int, list[Reply]] = {}
         self.finished: set[int] = set()
@@ -135,7 +137,9 @@ class World:
         recorder: BlackBox | None = None,
         latches: Latches = Latches(),  # noqa: B008
         keeper: LatchKeeper | None = None,
+        wanted: Collection[str] = (),
     ) -> None:
+        """Messages are made only for the `wanted` keys. `state` and `odom` need no such key."""
         self.config = config or Config()
         self.now_ns = START.mono_ns
         self.wall_offset_ns = START.wall_ns - START.mono_ns
@@ -157,7 +161,7 @@ class World:
         )
         if plugged:
             self.port.plug(self.mcu)
-        self.bus = MemoryBus()
+        self.bus = MemoryBus(wanted)
         self.events: list[Event] = []
         self.watch: Callable[[Outputs], None] = lambda outputs: None
         info = Info("acsar", "0", 1, "sim", True, self.config.rate_hz, [], [])
@@ -359,7 +363,7 @@ class World:
 
     @property
     def odom(self) -> Odometry:
-        message = self.bus.published["odom"][-1]
+        message = self.loop.report.current("odom", self.loop._look)
         assert isinstance(message, Odometry)
         return message
 

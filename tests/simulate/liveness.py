@@ -17,8 +17,8 @@ from tests.simulate.roads import NS, Message, Sample
 if TYPE_CHECKING:
     from tests.simulate.actors import Run
 
-MOST_HELD = 2000
-"""Entries of the largest container of a daemon: a thousand clocks and as many numbers."""
+MOST_HELD = 1500
+"""Entries of the largest container of a daemon: it remembers 1024 clocks, and more of nothing."""
 
 SETTLES_NS = 3 * NS
 """After the last event a lawful sender drives within this time."""
@@ -134,8 +134,10 @@ class Liveness:
         if plan["lawful"] != "a new client" and own:
             sender = own[0]
         zeros_s = run.witness.pause_ns / NS + 1.0
-        speed = 0.5 * run.witness.limits["linear_speed"]
-        turn = 0.25 * run.witness.limits["angular_speed"]
+        # A share above 1 shows whether the limits of before a restart are still in force.
+        share = plan.get("share", 0.5)
+        speed = share * run.witness.limits["linear_speed"]
+        turn = share / 2 * run.witness.limits["angular_speed"]
         end_ns = begin_ns + int((zeros_s + 3.0) * NS)
         while run.true_ns < end_ns:
             zero = run.true_ns - begin_ns < zeros_s * NS
@@ -162,12 +164,12 @@ class Liveness:
         """The robot drives as it was told, or slower on the same curve."""
         run = self.run
         witness, limits = run.witness, run.witness.limits
-        takes_s = speed / limits["linear_acceleration"] + turn / limits["angular_acceleration"]
+        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
+        takes_s = told[0] / limits["linear_acceleration"] + told[1] / limits["angular_acceleration"]
         if takes_s > 2.5 or limits.get("linear_jerk") or limits.get("angular_jerk"):
             return
         if witness.unsure:
             return
-        got, told = witness.twist(witness.last), witness.clamped(speed, turn)
         room = witness.radius * 0.02, witness.radius * 0.02 / witness.half
         if any(abs(a - b) > r for a, b, r in zip(got, told, room, strict=True)):
             raise BrokenError("the robot drives as told", run.true_ns, f"{got} for {told}")

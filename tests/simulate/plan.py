@@ -46,9 +46,9 @@ LIES = (
 def made(seed: int, seconds: float | None = None) -> Plan:
     """Return the plan of this seed."""
     dice = random.Random(f"plan {seed}")
-    share = dice.choice((0.15, 0.4, 0.6))
+    share = dice.choice((0.2, 0.5, 0.7))
     kinds = sorted(kind for kind in KINDS if dice.random() < share)
-    length = seconds or round(dice.choice((60, 120, 180, 300)) * dice.uniform(0.8, 1.2), 1)
+    length = seconds or round(dice.choice((40, 60, 60, 90, 240)) * dice.uniform(0.8, 1.2), 1)
     while True:
         config, extras = _config(dice, "odd configuration" in kinds)
         if not problems(config):
@@ -63,6 +63,7 @@ def made(seed: int, seconds: float | None = None) -> Plan:
         ],
         "events": [],
         "lawful": dice.choice(("a new client", "a sender of the plan")),
+        "share": dice.choice((0.5, 0.5, 2.0)),
         **extras,
     }
     if "shared identities" in kinds:
@@ -70,7 +71,8 @@ def made(seed: int, seconds: float | None = None) -> Plan:
             if dice.random() < 0.5:
                 first = plan["senders"][0]
                 sender.update(id=first["id"], way=first["way"], source=first["source"])
-    plan["events"] = sorted(_events(dice, kinds, length, config), key=lambda one: one["at"])
+    events = _events(dice, kinds, length, config, plan["senders"])
+    plan["events"] = sorted(events, key=lambda one: one["at"])
     return plan
 
 
@@ -106,6 +108,8 @@ def _config(dice: random.Random, odd: bool) -> tuple[dict[str, Any], dict[str, A
     extras: dict[str, Any] = {"board": []}
     if odd:
         _make_odd(dice, config, extras)
+    if "odometry" not in config and dice.random() < 0.3:
+        config["sim"]["motor_time_constant"] = round(dice.uniform(0.2, 0.4), 3)
     return config, extras
 
 
@@ -137,10 +141,10 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
             extras["board"] = [["comma_latched"], ["trailing_comma"]]
         case 4:
             mcu["reply_period"] = 0.1
-            extras["board"] = [["unprompted", 0.1]]
+            extras["board"] = [["free_running", 0.1]]
     commands = config["commands"]
     commands["neutral_first"] = dice.random() < 0.85
-    commands["pause"] = dice.choice((0.5, 1.0, 2.0))
+    commands["neutral_pause"] = dice.choice((0.5, 1.0, 2.0))
     names = [*SOURCES, "twin"]
     commands["sources"] = [
         {
@@ -153,13 +157,12 @@ def _make_odd(dice: random.Random, config: dict[str, Any], extras: dict[str, Any
     if dice.random() < 0.3:
         config["odometry"] = {"gyro": True}
         sim.update(gyro_bias=0.01, gyro_noise=0.005, gyro_delay=0.01)
-    elif dice.random() < 0.4:
-        sim["motor_time_constant"] = round(dice.uniform(0.2, 0.4), 3)
 
 
-def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:
+def _phases(dice: random.Random, seconds: float, lawful: bool) -> list[list[Any]]:
     """A sender's habit: from each time on a speed and a turn rate, or None for silence."""
-    habit = dice.choice(("stop and go",) * 4 + ("never neutral", "pauses", "pauses", "wild"))
+    habits = ["stop and go"] * 3 + ["pauses"] * 3
+    habit = dice.choice(habits if lawful else [*habits, "never neutral", "wild"])
     phases: list[list[Any]] = []
     t = 0.0 if habit == "never neutral" else dice.uniform(0.0, 3.0)
     while t < seconds:
@@ -180,7 +183,7 @@ def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:
                     t += dice.uniform(0.5, 3.0)
                 continue
         phases.append([round(t, 3), 0.0, 0.0])
-        t += dice.choice((0.2, 0.6, 1.3, 2.5))
+        t += dice.choice((0.2, 0.6, 1.3, 1.3, 2.5, 3.5))
         phases.append([round(t, 3), speed, turn])
         t += dice.uniform(0.5, 10.0)
         if habit == "pauses" or dice.random() < 0.2:
@@ -195,6 +198,8 @@ def _phases(dice: random.Random, seconds: float) -> list[list[Any]]:
 
 def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> dict[str, Any]:
     way = dice.choice(WAYS)
+    # Most plans need a sender that drives: a robot at rest hides most defects.
+    lawful = n == 0 and dice.random() < 0.8
     begin = round(dice.choice((0.0, 0.0, dice.uniform(0.0, seconds / 2))), 3)
     sender: dict[str, Any] = {
         "name": f"s{n}",
@@ -210,7 +215,7 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
         "drift": dice.choice((0.0, 1e-5, -1e-4)),
         "delay": dice.choice((0.001, 0.005, 0.03)),
         "jitter": dice.choice((0.0, 0.0, 0.002, 0.02)),
-        "phases": _phases(dice, seconds),
+        "phases": _phases(dice, seconds, lawful),
         "congestion": [],
         "clock": [],
         "junk": 0.0,
@@ -224,20 +229,24 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
     if "disorder" in kinds:
         sender["twice"], sender["swap"] = dice.choice((0.0, 0.05)), dice.choice((0.0, 0.05))
     shared = way in ("header", "plain", "bridge", "bridged")
-    if "hostile senders" in kinds and dice.random() < (0.8 if shared else 0.4):
-        sender["junk"] = dice.choice((0.02, 0.3))
-        sender["churn"] = dice.random() < 0.6 and way in ("client", "signed", "rmw")
-        if dice.random() < 0.2 and not shared:
+    if "hostile senders" in kinds and dice.random() < (0.8 if shared else 0.6):
+        sender["junk"] = dice.choice((0.02, 0.3, 0.3))
+        sender["churn"] = not lawful and dice.random() < 0.6 and way in ("client", "signed", "rmw")
+        if dice.random() < 0.1 and not shared:
             sender["hz"] = 400.0
         elif sender["churn"]:
-            sender["hz"] = 50.0  # enough names to fill a table that has no bound
+            sender["hz"] = 100.0  # enough names to fill a table that has no bound
     if "congestion" in kinds:
-        t = dice.uniform(0.0, 20.0)
+        # A sender whose first messages wait is new to the daemon when they pour in.
+        first = max(begin, sender["phases"][0][0])
+        t = dice.choice((first, first, dice.uniform(0.0, 20.0)))
         while t < seconds:
             length = dice.choice((dice.uniform(0.5, 5.0), dice.uniform(5.0, 25.0)))
-            shape = dice.choice(("grow", "jump", "hole", "drain", "burst"))
+            shape = dice.choice(("grow", "grow", "jump", "jump", "hole", "drain", "burst"))
+            if shape == "grow":
+                length *= 1.5
             size = {
-                "grow": dice.choice((0.01, 0.03, 0.08, 0.5)),
+                "grow": dice.choice((0.01, 0.03, 0.045, 0.08, 0.5)),
                 "jump": dice.choice((0.3, 0.6, 1.0, 3.0, 8.0)),
                 "hole": 0.0,
                 "drain": dice.uniform(1.2, 6.0),
@@ -258,16 +267,44 @@ def _sender(dice: random.Random, n: int, kinds: list[str], seconds: float) -> di
 
 
 def _events(
-    dice: random.Random, kinds: list[str], seconds: float, config: dict[str, Any]
+    dice: random.Random,
+    kinds: list[str],
+    seconds: float,
+    config: dict[str, Any],
+    senders: list[dict[str, Any]],
 ) -> list[dict[str, Any]]:
     events: list[dict[str, Any]] = []
+    changes = [
+        phase[0]
+        for sender in senders
+        for phase in sender["phases"]
+        if sender["from"] <= phase[0] < sender["to"]
+    ]
+
+    def moment() -> float:
+        """Return a bad moment: half of them lie just behind what a sender or an event begins."""
+        chance = dice.random()
+        if chance < 0.3 and changes:
+            at = dice.choice(changes) + dice.choice((0.3, 3.0)) * dice.random()
+        elif chance < 0.5 and events:
+            at = dice.choice(events)["at"] + dice.uniform(0.0, 3.0)
+        else:
+            at = dice.uniform(1.0, seconds)
+        return float(round(max(1.0, min(at, seconds)), 3))
 
     def add(kind: str, every: float) -> list[float]:
         """Return times for events of this kind, about one in `every` s."""
         if kind not in kinds:
             return []
         count = dice.randrange(1, max(2, int(2 * seconds / every)))
-        return [round(dice.uniform(1.0, seconds), 3) for _ in range(count)]
+        return [moment() for _ in range(count)]
+
+    def series(at: float) -> list[float]:
+        """Return this time, or a series of times from it on in which a ramp may lie."""
+        if dice.random() < 0.6:
+            return [at]
+        gap, count = dice.uniform(0.3, 1.5), dice.randrange(3, 15)
+        return [one for n in range(count) if (one := round(at + n * gap, 3)) < seconds]
 
     def board(at: float, length: float, *fault: Any) -> None:
         events.append({"at": at, "do": "board", "for": round(length, 3), "fault": list(fault)})
@@ -310,16 +347,18 @@ def _events(
     for at in add("unplugging", 60):
         once(at, "unplug", **{"for": round(dice.uniform(0.05, 5.0), 3)}, new=dice.random() < 0.4)
     for at in add("blocked output", 40):
-        if dice.random() < 0.5:
-            once(at, "block", **{"for": dice.choice((0.02, 0.2, 0.6, 2.0))})
-        else:
-            once(at, "tear", taken=dice.randrange(40))
+        times = series(at)
+        lasts = dice.choice((0.02, 0.2, 0.6, 2.0) if len(times) == 1 else (0.02, 0.1, 0.2))
+        for each in times:
+            if dice.random() < 0.5:
+                once(each, "block", **{"for": lasts})
+            else:
+                once(each, "tear", taken=dice.randrange(40))
     for at in add("stalls", 30):
-        once(
-            at,
-            dice.choice(("stall", "stall in step")),
-            **{"for": dice.choice((0.015, 0.06, 0.2, 0.4, 1.5))},
-        )
+        times, how = series(at), dice.choice(("stall", "stall in step"))
+        lasts = dice.choice((0.015, 0.06, 0.2, 0.4, 1.5) if len(times) == 1 else (0.015, 0.1, 0.2))
+        for each in times:
+            once(each, how, **{"for": lasts})
     for at in add("suspends", 90):
         once(
             at,
@@ -354,7 +393,9 @@ def _events(
         for _ in range(dice.randrange(4)):
             after = round(at + dice.choice((0.0, 0.05, 1.0, 3.0)) + dice.uniform(0.0, 2.0), 3)
             call(after, "clear", named=dice.random() < 0.7)
-    if "stops" not in kinds and "lying board" in kinds:
+        if dice.random() < 0.8:
+            call(round(at + dice.uniform(2.0, 8.0), 3), "clear", named=True)
+    if "lying board" in kinds:
         for at in [round(dice.uniform(1.0, seconds), 3) for _ in range(int(seconds / 10))]:
             call(at, "clear", named=True)
     for at in add("activation", 20):
@@ -362,6 +403,8 @@ def _events(
         for _ in range(dice.randrange(1, 3)):
             after = round(at + dice.choice((0.0, 2.5)) + dice.uniform(0.0, 2.0), 3)
             call(after, "activate", named=dice.random() < 0.7)
+        if dice.random() < 0.8:
+            call(round(at + dice.uniform(2.0, 8.0), 3), "activate", named=True)
     for at in add("poses", 40):
         if dice.random() < 0.5:
             call(at, "reset_odometry")
@@ -386,11 +429,14 @@ def _events(
 def _settings(dice: random.Random, config: dict[str, Any]) -> dict[str, float]:
     """Settings to change, legal or not: the daemon has to know."""
     limits, found = config["limits"], {}
-    for name in dice.sample(sorted(limits), dice.randrange(1, 3)):
-        found[f"limits.{name}"] = round(limits[name] * dice.choice((0.1, 0.5, 0.8, 1.3, 3.0)), 3)
-    if dice.random() < 0.2:
+    what = dice.choice(("limits", "limits", "commands", "both"))
+    if what != "commands":
+        for name in dice.sample(sorted(limits), dice.randrange(1, 3)):
+            share = dice.choice((0.1, 0.5, 0.8, 1.3, 3.0))
+            found[f"limits.{name}"] = round(limits[name] * share, 3)
+    if what != "limits":
         source = dice.choice(config["commands"]["sources"])["name"]
-        found[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 1.0))
-    if dice.random() < 0.1:
-        found["commands.pause"] = dice.choice((0.5, 1.0, 3.0))
+        found[f"commands.sources.{source}.timeout"] = dice.choice((0.1, 0.25, 0.4, 1.0))
+        if dice.random() < 0.3:
+            found["commands.neutral_pause"] = dice.choice((0.5, 1.0, 3.0))
     return found

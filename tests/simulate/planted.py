@@ -10,6 +10,7 @@ breaks or the time is over. A finding counts only if the same seed breaks no pro
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import os
 import re
@@ -64,6 +65,14 @@ class Row(NamedTuple):
     """Processor time until then, core-minutes."""
     simulated: str
     """Simulated time until then, minutes."""
+    plans: str
+    """The version of the plans that were played."""
+
+
+def version() -> str:
+    """Return a digest of the code that makes plans: another one gives a seed another plan."""
+    code = b"".join(Path(__file__).with_name(name).read_bytes() for name in ("plan.py", "roads.py"))
+    return hashlib.sha256(code).hexdigest()[:6]
 
 
 def plant(fault: Fault, tree: Path) -> None:
@@ -115,9 +124,8 @@ def hunt(fault: Fault, minutes: float) -> Row:
 
 
 def _row(fault: Fault, promise: str, seed: str, cpu_s: float, simulated_s: float) -> Row:
-    return Row(
-        fault.name, fault.breaks, promise, seed, f"{cpu_s / 60:.2f}", f"{simulated_s / 60:.1f}"
-    )
+    core, simulated = f"{cpu_s / 60:.2f}", f"{simulated_s / 60:.1f}"
+    return Row(fault.name, fault.breaks, promise, seed, core, simulated, version())
 
 
 @cache
@@ -164,14 +172,14 @@ breaks a promise of the sound product does not count. Core-minutes are the proce
 process that plays, on a machine that other work kept busy.
 
 A fault must be found within {fault:g} core-minutes, a case within {case:g}. A row keeps its last
-measurement: a change of the plans may let another seed find the fault. "not found" says that no
-seed did in the core-minutes of that row; `--missing` plays those faults again, and all without a
-row.
+measurement, and its last column says by which version of the plans. The present one is {version}.
+By it other seeds may find the faults of older rows, earlier or later. "not found" says that no seed
+did in the core-minutes of that row; `--missing` plays those faults again, and all without a row.
 """
 
 COLUMNS = """
-| name | what it breaks | the promise that found it | seed | core-minutes | simulated minutes |
-|---|---|---|---|---|---|
+| name | what it breaks | the promise that found it | seed | core-min | simulated min | plans |
+|---|---|---|---|---|---|---|
 """
 
 
@@ -184,14 +192,15 @@ def read() -> dict[str, Row]:
     return {row[0]: Row(*row) for row in rows if len(row) == len(Row._fields)}
 
 
-def write(rows: dict[str, Row]) -> None:
-    """Write the table in the order of the lists."""
-    text = HEAD.format(seed=FIRST_SEED, fault=FAULT_MINUTES, case=CASE_MINUTES)
+def text_of(rows: dict[str, Row]) -> str:
+    """Return the page with these rows, in the order of the lists."""
+    minutes = {"fault": FAULT_MINUTES, "case": CASE_MINUTES}
+    text = HEAD.format(seed=FIRST_SEED, version=version(), **minutes)
     for title, faults in (("Faults", FAULTS), ("Cases that were once true", CASES)):
         known = [rows[fault.name] for fault in faults if fault.name in rows]
         text += f"\n## {title}\n{COLUMNS}"
         text += "".join("| " + " | ".join(row) + " |\n" for row in known)
-    TABLE.write_text(text, encoding="utf-8")
+    return text
 
 
 def main() -> int:
@@ -213,11 +222,12 @@ def main() -> int:
         row = hunt(fault, limit)
         with lock:
             lost += not row.seed
-            write(read() | {row.name: row})
+            TABLE.write_text(text_of(read() | {row.name: row}), encoding="utf-8")
             print(f"{row.name}: {row.promise}, seed {row.seed}, {row.core} core-min", flush=True)
 
     with ThreadPoolExecutor(options.jobs) as pool:
         list(pool.map(one, chosen))
+    TABLE.write_text(text_of(read()), encoding="utf-8")
     print(f"{len(chosen) - lost} of {len(chosen)} found")
     return min(1, lost)
 

@@ -63,6 +63,9 @@ class Freshness(Freshness):
         self.lowest[clock] = min(delay, self.lowest.get(clock, delay))
         newer = command.stamp_ns > self.newest.get(clock, 0)
         self.newest[clock] = max(command.stamp_ns, self.newest.get(clock, 0))
+        for held in (self.lowest, self.newest, self.began, self.late_since, self.believed):
+            if len(held) > 1000:
+                del held[next(iter(held))]
         return {rule}
 
     def proof_time_is_over(self, verdict, clock, at_ns, timeout_ns):

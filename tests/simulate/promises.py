@@ -20,13 +20,16 @@ from tests.simulate.roads import NS, Message, Sample
 
 LINE = re.compile(rb"a([pn]\d\d\.\d\d),b([pn]\d\d\.\d\d),c([pn]\d\d\.\d\d),d([pn]\d\d\.\d\d)")
 ZERO = (0.0, 0.0, 0.0, 0.0)
-MODES = {"leaving", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
+MODES = {"shutdown", "fault", "stopped", "inactive", "waiting", "driving", "ready"}
 
 RAMP_NS = 300_000_000
 """Allowed beyond the longest ramp: a pause of the daemon this long stops the board by itself."""
 
 BLOCKED_NS = 500_000_000
 """After so long without a line that left, the daemon knows it. The board stops itself earlier."""
+
+LATE_NS = 150_000_000
+"""Allowed beyond a ramp from the speeds that were seen at its beginning."""
 
 STAND_NS = 2 * NS
 """After a ramp to rest: time for motors with a lag of 0.4 s to stand."""
@@ -74,7 +77,7 @@ class Witness:
         self.neutral_first = commands.get("neutral_first", True)
         self.priority = {s["name"]: s["priority"] for s in commands["sources"]}
         self.file_timeout = {s["name"]: int(s["timeout"] * NS) for s in commands["sources"]}
-        self.file_pause_ns = int(commands.get("pause", 1.0) * NS)
+        self.file_pause_ns = int(commands.get("neutral_pause", 1.0) * NS)
         rate = config["control"].get("rate", 100.0)
         self.period_ns = int(NS / rate)
         quiet = max(0.1, 4 / rate, 3 * config["mcu"].get("reply_period", 0.0))
@@ -94,8 +97,8 @@ class Witness:
         """Board faults and when each was last active."""
         self.blocked_ns: int | None = None
         """Since when the kernel takes no line."""
-        self.braking: tuple[int, float] | None = None
-        """When a robot that must not move was first seen to move, and how fast."""
+        self.braking: tuple[int, tuple[float, ...]] | None = None
+        """When a robot that must not move was first seen to move, and its wheel speeds."""
         self.cut = False
         """The link was lost since the last line, so the speed starts over from zero."""
         self.pending = False
@@ -125,7 +128,8 @@ class Witness:
         self.last: tuple[float, ...] = ZERO
         self.last_ns = at_ns
         self.wished_ns = at_ns
-        self.coasting: tuple[int, float] | None = None
+        self.coasting: tuple[int, tuple[float, ...]] | None = None
+        """Since when no wish explains the motion, and the wheel speeds then."""
         self.delivered = 0
         if not self.config["control"].get("auto_activate", True):
             self.dormant_ns = at_ns
@@ -228,7 +232,7 @@ class Witness:
                 )
                 continue
             before_ns = self.pause_ns, dict(self.timeout)
-            if parts[1] == "pause":
+            if parts[1] == "neutral_pause":
                 self.pause_ns = int(value * NS)
             else:
                 self.timeout[parts[2]] = int(value * NS)
@@ -338,7 +342,7 @@ class Witness:
         if held is None:
             self.braking = None
         else:
-            self._held(at_ns, held, grows, line, max(map(abs, wheels)))
+            self._held(at_ns, held, grows, line, wheels)
         self._wished(at_ns, wheels, before, grows, line)
         self.last, self.last_ns, self.cut = wheels, made_ns, False
 
@@ -387,7 +391,7 @@ class Witness:
                 raise BrokenError("no speed is over its limit", at_ns, f"{name} {new:.4f}")
             up = self._most(f"{name}_acceleration", at_ns)
             down = self._most(f"{name}_deceleration", at_ns)
-            if self.mode in ("stopped", "fault", "leaving"):
+            if self.mode in ("stopped", "fault", "shutdown"):
                 down = max(down, self._most(f"{name}_stop_deceleration", at_ns))
             gained = abs(new) - abs(old) if new * old >= 0 else abs(new)
             if gained > up * seconds + 2 * room:
@@ -402,28 +406,41 @@ class Witness:
                     f"{name} {old:.4f} to {new:.4f} in {dt / NS:.4f} s",
                 )  # fmt: skip
 
-    def ramp_ns(self, stop: bool) -> int:
-        """Return how long the softest limits of this drive allow a ramp to rest to take."""
+    def ramp_ns(self, stop: bool, wheels: tuple[float, ...] | None = None) -> int:
+        """Return how long the softest limits of this drive allow a ramp to rest to take.
+
+        The ramp begins at these wheel speeds, or else at the highest ones.
+        """
         low = self.softest
         rim = low["wheel_speed"] * self.radius
+        linear, angular = min(low["linear_speed"], rim), min(low["angular_speed"], rim / self.half)
+        if wheels is not None:
+            v, w = self.twist(wheels)
+            linear, angular = abs(v), abs(w)
         word = "stop_deceleration" if stop else "deceleration"
-        linear = min(low["linear_speed"], rim) / low[f"linear_{word}"]
-        angular = min(low["angular_speed"], rim / self.half) / low[f"angular_{word}"]
-        return int(max(linear, angular) * NS)
+        return int(max(linear / low[f"linear_{word}"], angular / low[f"angular_{word}"]) * NS)
 
     def _held(
-        self, at_ns: int, held: tuple[int, str], grows: bool, line: bytes, fastest: float
+        self,
+        at_ns: int,
+        held: tuple[int, str],
+        grows: bool,
+        line: bytes,
+        wheels: tuple[float, ...],
     ) -> None:
         since_ns, why = held
         name = f"nothing moves after {why}"
         if grows and at_ns > since_ns + self.period_ns:
             raise BrokenError(name, at_ns, f"{line!r} grows, held since {since_ns / NS:.3f} s")
-        first_ns, then = self.braking = self.braking or (at_ns, fastest)
-        if at_ns - first_ns > 300_000_000 and fastest > then - 0.02:
+        first_ns, then = self.braking = self.braking or (at_ns, wheels)
+        if at_ns - first_ns > 300_000_000 and _fastest(wheels) > _fastest(then) - 0.02:
             raise BrokenError(name, at_ns, f"{line!r} as fast as at {first_ns / NS:.3f} s")
-        ramp_ns = self.ramp_ns(stop=why != "being switched off")
-        if at_ns > since_ns + ramp_ns + RAMP_NS + self.period_ns:
+        soft = why == "being switched off"
+        if at_ns > since_ns + self.ramp_ns(not soft) + RAMP_NS + self.period_ns:
             raise BrokenError(name, at_ns, f"{line!r} still, held since {since_ns / NS:.3f} s")
+        if at_ns > first_ns + self.ramp_ns(not soft, then) + LATE_NS + self.period_ns:
+            text = f"{line!r} still, on a ramp from {then} at {first_ns / NS:.3f} s"
+            raise BrokenError(name, at_ns, text)
 
     def wheels(self, at_ns: int, fastest: float) -> None:
         """Judge the true wheels: those of a robot that is held must stand in the end."""
@@ -457,13 +474,10 @@ class Witness:
             raise BrokenError(
                 "motion needs a fresh wish of an armed sender", at_ns, f"{line!r}: {why}"
             )
-        fastest = max(map(abs, wheels))
-        if self.coasting is None:
-            self.coasting = at_ns, fastest
-        since_ns, then = self.coasting
-        if at_ns - since_ns > 300_000_000 and fastest > then - 0.02:
+        since_ns, then = self.coasting = self.coasting or (at_ns, wheels)
+        if at_ns - since_ns > 300_000_000 and _fastest(wheels) > _fastest(then) - 0.02:
             raise BrokenError("without a wish the robot slows down", at_ns, f"{line!r}: {why}")
-        if at_ns - since_ns > self.ramp_ns(stop=False) + RAMP_NS:
+        if at_ns - since_ns > self.ramp_ns(False, then) + LATE_NS + self.period_ns:
             raise BrokenError("without a wish the robot comes to rest", at_ns, f"{line!r}: {why}")
 
     def _explains(
@@ -534,3 +548,7 @@ class Witness:
         if rim:
             scale = min(scale, limits["wheel_speed"] / rim)
         return v * scale, w * scale
+
+
+def _fastest(wheels: tuple[float, ...]) -> float:
+    return max(map(abs, wheels))

@@ -77,7 +77,7 @@ def judge_state(at_ns: int, state: dict[str, Any], fed_ns: int, quiet_ns: int) -
 def judge_counts(at_ns: int, state: dict[str, Any], expected: int) -> None:
     """Hold the counters against the number of commands that arrived: each is in one of them."""
     counters = state["counters"]
-    counted = counters.get("commands", 0) + counters.get("commands_first_contact", 0)
+    counted = counters.get("commands", 0) + counters.get("commands_of_new_senders", 0)
     counted += sum(n for name, n in counters.items() if name.startswith("command_"))
     if counted != expected:
         text = f"{expected} arrived, {counted} are counted: {counters}"

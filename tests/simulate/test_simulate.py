@@ -152,6 +152,43 @@ def test_the_witness_sees_what_must_not_be(what: Callable[[Witness], None], prom
     assert broken.value.promise == promise
 
 
+def ramp(witness: Witness, fastest: float, share: float) -> None:
+    """Put lines on the wire that fall from this speed by a share of the deceleration."""
+    radius, fall = witness.radius, witness.limits["linear_deceleration"]
+    for n in range(1, 400):
+        speed = fastest - n * 0.01 * share * fall / radius
+        if speed <= 0.0:
+            return
+        words = [letter + b"p%05.2f" % speed for letter in (b"a", b"b", b"c", b"d")]
+        at_ns = NS + n * NS // 100
+        witness.line(at_ns, b",".join(words) + b"\r\n", at_ns, at_ns)
+
+
+@pytest.mark.parametrize(
+    ("stopped", "promise"),
+    [
+        (False, "without a wish the robot comes to rest"),
+        (True, "nothing moves after being switched off"),
+    ],
+)
+def test_a_ramp_that_takes_twice_as_long_as_from_its_own_speed_is_a_finding(
+    stopped: bool, promise: str
+) -> None:
+    for share in (1.0, 0.5):
+        witness = witnessed()
+        fastest = 0.6 * witness.limits["linear_deceleration"] / witness.radius
+        witness.limits["wheel_speed"] = witness.softest["wheel_speed"] = 2 * fastest
+        witness.limits["linear_speed"] = witness.softest["linear_speed"] = 99.0
+        witness.last, witness.last_ns = (fastest,) * 4, NS
+        if stopped:
+            witness.offs.append(NS)
+        if share == 1.0:
+            ramp(witness, fastest, share)
+        else:
+            with pytest.raises(BrokenError, match=promise):
+                ramp(witness, fastest, share)
+
+
 def test_a_clear_that_its_sender_sent_before_the_stop_must_not_release_it() -> None:
     witness = witnessed()
     witness.stops.append(5 * NS)

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from acsard.certificates.authority import Authority
 from acsard.daemon.gateway.fleet_router import router_file
-from acsard.lan.authority import Authority
 from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import words
 
@@ -72,7 +72,7 @@ def tls_settings(own: Path) -> dict[str, object]:
 
 
 def for_two(where: Path) -> Path:
-    """Write the file that `acsard lan router` makes of router.json5 for both robots."""
+    """Write the file that `acsard tls router` makes of router.json5 for both robots."""
     file = where / "router.json5"
     file.write_text(router_file(ROUTER_FILE.read_text(), ROBOTS, {}))
     return file

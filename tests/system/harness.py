@@ -275,7 +275,7 @@ class Daemon(Program):
         self.config = write_config(where / f"{name}.toml", given)
         self._ready = ready
         listens = given["bus"].get("mode") != "client"
-        self._has_door = listens and "'tls/" in str(given["bus"]["listen"])
+        self._has_gateway = listens and "'tls/" in str(given["bus"]["listen"])
         run = [*before, *acsard("run", "--config", str(self.config), *words)]
         if shell:
             run = ["sh", "-c", f'exec "$@" {shell}', "sh", *run]
@@ -288,19 +288,19 @@ class Daemon(Program):
         if self._ready:
             try:
                 self.says("bus ")
-                if self._has_door:
-                    self.door_opens()
+                if self._has_gateway:
+                    self.gateway_opens()
             except BaseException:
                 self.__exit__()
                 raise
         return self
 
-    def door_opens(self, times: int = 1) -> None:
+    def gateway_opens(self, times: int = 1) -> None:
         """Wait until the TLS gateway has opened this number of times."""
         until(
-            lambda: sum("door_open" in line for line in list(self.err)) >= times,
+            lambda: sum("gateway_open" in line for line in list(self.err)) >= times,
             START_S,
-            f"the door opens\n{self}",
+            f"the gateway opens\n{self}",
         )
 
     def events(self, name: str) -> list[dict[str, Any]]:
@@ -803,7 +803,7 @@ class Bus:
                 neutral = waits.startswith("send a zero first")
                 if (
                     neutral
-                    or counters.get("commands_first_contact")
+                    or counters.get("commands_of_new_senders")
                     or time.monotonic() > said + 0.5
                 ):
                     self.put(commander.key, ZERO, commander.sender)
@@ -856,7 +856,7 @@ class Periods(NamedTuple):
             last["counters"].get(c, 0) - first["counters"].get(c, 0) for c in counters
         )
         elapsed = 100.0 * (seconds(last["stamp"]) - seconds(first["stamp"]))
-        latest = last["figures"]["period_lateness"]["since_start"]["max"] / 10_000
+        latest = last["latencies"]["period_lateness"]["since_start"]["max"] / 10_000
         return cls(elapsed, sent, superseded, missed, commands, latest)
 
     @property

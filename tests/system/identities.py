@@ -8,7 +8,7 @@ from typing import Literal
 
 import zenoh
 
-from acsard.lan.authority import Authority
+from acsard.certificates.authority import Authority
 from tests.system.harness import acsard, client_config, finish, free_endpoint
 
 Identity = Literal[
@@ -16,7 +16,7 @@ Identity = Literal[
 ]
 
 ADMITTED: tuple[Identity, ...] = ("local", "viewer", "operator", "maintainer")
-"""Plain TCP on this machine, and the certificates that `acsard lan init` makes."""
+"""Plain TCP on this machine, and the certificates that `acsard tls init` makes."""
 
 STRANGERS: tuple[Identity, ...] = ("unlisted", "nobody", "foreign", "expired")
 """A valid but unlisted certificate, no certificate, another CA's operator, and an expired one."""
@@ -43,7 +43,7 @@ class Certificates:
 
     @staticmethod
     def _made(*words: str) -> None:
-        done = finish(acsard("lan", *words), "/")
+        done = finish(acsard("tls", *words), "/")
         assert done.code == 0, done
 
     def issue(self, directory: Path, name: str, days: float) -> None:

@@ -154,7 +154,7 @@ config.insert_json5("connect", json.dumps({
 }))
 session, sequence = zenoh.open(config), 0
 while True:
-    speed = 0.0 if time.monotonic() % 2.0 < 0.3 else 0.3
+    speed = 0.0 if time.monotonic() % 1.0 < 0.3 else 0.3
     sequence += 1
     session.put(
         "acsard/acsar/cmd/app",
@@ -166,7 +166,7 @@ while True:
     time.sleep(0.05)
 """
 )
-"""Sends zeros for 0.3 s every 2 s and 0.3 m/s in between, for ever, also to the next daemon."""
+"""Sends zeros for 0.3 s every second and 0.3 m/s in between, for ever, also to the next daemon."""
 
 CODED_FLOOD = (
     _OPEN

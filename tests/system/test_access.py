@@ -422,7 +422,7 @@ def _heard(state: Any) -> int:
     A new sender's commands do not count at once.
     """
     counters = state["counters"]
-    return sum(counters.get(name, 0) for name in ("commands", "commands_first_contact"))
+    return sum(counters.get(name, 0) for name in ("commands", "commands_of_new_senders"))
 
 
 def _subscribed(session: zenoh.Session, row: Try, on_sample: Callable[[zenoh.Sample], None]) -> Any:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from acsard.bench.measure import bench_config, measure
 from acsard.core.config.settings import Config, ControlConfig
 from acsard.host.errors import Exit, ExitError
+from tests.each import each
 from tests.system.harness import (
     ZERO_LINE,
     Daemon,
@@ -24,6 +25,7 @@ from tests.system.harness import (
     finish,
     until,
 )
+from tests.system.typed import typed
 
 CHECKED = """\
 [mcu]
@@ -81,14 +83,14 @@ def says_what_it_could_not_see(result: dict[str, Any]) -> None:
 
 
 def test_a_port_that_is_not_there_is_66(tmp_path: Path) -> None:
-    done = finish(acsard("bench", "--port", str(tmp_path / "nothing")), tmp_path)
+    done = typed("bench", "--port", str(tmp_path / "nothing"))
     assert (done.code, done.out) == (66, "")
     assert "does not exist" in done.err
 
 
-@pytest.mark.parametrize("what", ["/tmp", "/etc/passwd"])
-def test_a_port_that_is_no_device_is_66_at_once(tmp_path: Path, what: str) -> None:
-    done = finish(acsard("bench", "--port", what), tmp_path)
+@each("what", ["/tmp", "/etc/passwd"])
+def test_a_port_that_is_no_device_is_66_at_once(what: str) -> None:
+    done = typed("bench", "--port", what)
     assert (done.code, done.out) == (66, "")
     assert done.err.startswith(f"acsard: {what} is not a serial port")
 

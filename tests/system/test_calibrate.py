@@ -7,6 +7,7 @@ import json
 import math
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,16 +19,19 @@ import numpy as np
 import pytest
 import zenoh
 
-from acsard.calibration.guided.legs import Ask, GuideError
-from acsard.client import legs
-from acsard.client.legs import POSITIONS, Sensor
-from acsard.client.riding import HELD_UP, Recorder, Sample
+from acsard.calibration.guided import robot_on_bus
+from acsard.calibration.guided.leg_driver import HELD_UP, Recorder, Sample
+from acsard.calibration.guided.legs import GuideError, Leg, Move
+from acsard.calibration.guided.robot_on_bus import POSITIONS, RobotOnBus, Sensor
+from acsard.client import Client
 from acsard.core.config.parsing import parse
-from acsard.core.config.settings import JointsConfig
-from acsard.core.link.host_stalls import is_ours
+from acsard.core.config.settings import Config, JointsConfig
+from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
+from acsard.prompts.prompt import Ask
+from acsard.prompts.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -35,11 +39,11 @@ from tests.system.harness import (
     Peer,
     Program,
     acsard,
-    finish,
     free_endpoint,
     until,
 )  # fmt: skip
 from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.typed import typed
 from tests.unit.calibration.guided.played import Player
 from tests.unit.calibration.robots import Robot
 
@@ -220,7 +224,7 @@ Reads = Callable[[str], str]
 
 def goes_through(daemon: Daemon, bus: Bus, way: str, reads: Reads) -> str:
     """Go through every leg and question of a way to the written file; return the output."""
-    with calibrating(daemon, "--way", way, "--write") as (terminal, program):
+    with calibrating(daemon, "--method", way, "--write") as (terminal, program):
         seen = 0
         while program.process.poll() is None:
             words = until(lambda: question(terminal, program, seen), RIDES_S, "a question")  # noqa: B023
@@ -363,7 +367,7 @@ def test_the_simulator_is_calibrated_by_its_true_pose_without_a_person(tmp_path:
         with Program(acsard(*words, "--config", str(daemon.config)), tmp_path) as program:
             assert program.ended(RIDES_S) == 0, program.stderr
         found = json.loads(program.stdout)
-    assert found["way"] == "positions"
+    assert found["reference"] == "positions"
     assert abs(found["wheel_separation_multiplier"] - 1.6 * 1.06) < 0.1
     assert found["left_wheel_radius"] == pytest.approx(0.0495, abs=0.0001)
 
@@ -401,7 +405,7 @@ def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free
 def test_what_is_no_position_and_what_does_not_come_is_told(
     free: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(legs, "FIRST_S", 0.2)
+    monkeypatch.setattr(robot_on_bus, "FIRST_S", 0.2)
     with router(free) as said, client_session(free, "") as heard:
         sensor = Sensor(heard, "slam/pose", POSITIONS)
         with pytest.raises(GuideError, match="does not arrive on slam/pose"):
@@ -415,10 +419,30 @@ def test_what_is_no_position_and_what_does_not_come_is_told(
             until(came, 5.0, "a sample")
 
 
+def test_a_state_that_cannot_be_read_ends_the_leg_and_says_so(free: str) -> None:
+    with router(free) as said, client_session(free, "") as heard:
+        client = Client(heard, "acsar", "app")
+        ended = threading.Event()
+
+        def publish() -> None:
+            while not ended.wait(0.05):
+                said.put(client.key("state"), b"\xc1")
+
+        publisher = threading.Thread(target=publish)
+        publisher.start()
+        try:
+            robot = RobotOnBus(client, Config(), NoPrompt())
+            with pytest.raises(GuideError, match="state cannot be read"):
+                robot.ride(Leg("ahead", "", (Move(1.0, 0.1),)))
+        finally:
+            ended.set()
+            publisher.join()
+
+
 def test_nothing_real_moves_without_a_person(tmp_path: Path, peer: Peer) -> None:
     with Daemon(tmp_path, port=peer.path) as daemon, Bus(daemon.endpoint) as bus:
         bus.linked()
         for words, why in ((["--yes"], "this robot is real"), ([], "terminal")):
-            ended = finish(acsard("calibrate", *words, "--config", str(daemon.config)), tmp_path)
+            ended = typed("calibrate", *words, "--config", str(daemon.config))
             assert ended.code == 2
             assert why in ended.err

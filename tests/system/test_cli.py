@@ -26,6 +26,7 @@ import pytest
 from acsard.client import connect
 from acsard.daemon.bus.quiet import Around
 from acsard.daemon.bus.robot_discovery import around
+from tests.each import each
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -78,7 +79,7 @@ def test_help_lists_the_verbs_the_exit_codes_and_what_to_try(tmp_path: Path) -> 
     print(f"--help: {ended.seconds:.2f} s")
 
 
-@pytest.mark.parametrize("verb", VERBS)
+@each("verb", VERBS)
 def test_every_verb_has_a_help_that_says_what_it_does(verb: str) -> None:
     ended = typed(verb, "--help")
     assert (ended.code, ended.err) == (0, "")
@@ -86,28 +87,30 @@ def test_every_verb_has_a_help_that_says_what_it_does(verb: str) -> None:
     assert "--config" in ended.out
 
 
-def test_version(tmp_path: Path) -> None:
-    ended = finish(acsard("--version"), tmp_path)
+def test_version() -> None:
+    ended = typed("--version")
     assert (ended.code, ended.out.split()[0]) == (0, "acsard")
 
 
-@pytest.mark.parametrize("words", [["dirve"], ["call", "halt"], ["echo"], ["sim", "--fault", "x"]])
+@each(
+    "words",
+    [["dirve"], ["call", "halt"], ["echo"], ["sim", "--fault", "x"], ["run", "--prot", "sim"]],
+)
 def test_a_mistyped_command_ends_with_2(words: list[str]) -> None:
     ended = typed(*words)
     assert (ended.code, ended.out) == (2, "")
     assert "usage: acsard" in ended.err
 
 
-def test_without_a_verb_it_runs(tmp_path: Path) -> None:
+def test_without_a_verb_it_runs_by_the_options_and_the_file_at_hand(tmp_path: Path) -> None:
     endpoint = free_endpoint()
-    for words in (["--listen", endpoint], []):
-        config = tmp_path / "acsard.toml"
-        config.write_text(f'[bus]\nlisten = ["{endpoint}"]\n')
-        with Program(acsard(*words), tmp_path) as daemon:
-            assert endpoint in daemon.says("bus ")
-            assert "SIMULATOR" in daemon.stdout
-            daemon.signal(signal.SIGINT)
-            assert daemon.ended(3.0) == 0
+    (tmp_path / "acsard.toml").write_text('[robot]\nid = "handy"\n')
+    with Program(acsard("--listen", endpoint), tmp_path) as daemon:
+        told = daemon.says("bus ")
+        assert (endpoint in told, "acsard/handy/" in told) == (True, True)
+        assert "SIMULATOR" in daemon.stdout
+        daemon.signal(signal.SIGINT)
+        assert daemon.ended(3.0) == 0
 
 
 def test_the_banner_names_the_simulator_the_bus_the_keys_and_three_commands(
@@ -139,8 +142,11 @@ def test_topics_json_is_what_the_bus_answers(shared: Daemon, bus: Bus) -> None:
     assert json.loads(ended.out) == bus.get("topics")
 
 
-def test_check_prints_a_toml_document_that_checks_again(tmp_path: Path) -> None:
-    ended = finish(acsard("check"), tmp_path)
+def test_check_prints_a_toml_document_that_checks_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = typed("check")
     assert (ended.code, ended.err) == (0, "")
     assert ended.out.startswith("# effective configuration from built-in defaults")
     assert tomllib.loads(ended.out)["drive"]["wheel_radius"] == 0.05
@@ -158,7 +164,7 @@ def test_check_json_is_the_configuration_in_force(shared: Daemon, bus: Bus) -> N
 
 def test_check_of_a_bad_file_ends_with_78_and_the_mend(tmp_path: Path) -> None:
     (tmp_path / "acsard.toml").write_text("[drive]\nwheel_radus = 0.05\n")
-    ended = finish(acsard("check"), tmp_path)
+    ended = typed("check", "--config", str(tmp_path / "acsard.toml"))
     assert (ended.code, ended.out) == (78, "")
     assert "drive.wheel_radus" in ended.err
     assert "did you mean wheel_radius?" in ended.err
@@ -272,7 +278,7 @@ def test_echo_into_a_reader_that_leaves_ends_quietly(shared: Daemon, bus: Bus) -
     assert ended.err == "code 0"
 
 
-@pytest.mark.parametrize("words", [["topics"], ["check"], ["--help"]])
+@pytest.mark.parametrize("words", [["topics"], ["--help"]])
 def test_printing_to_a_reader_that_has_left_ends_quietly(tmp_path: Path, words: list[str]) -> None:
     env = {key: value for key, value in environment().items() if key != "PYTHONUNBUFFERED"}
     reader, writer = os.pipe()
@@ -333,7 +339,7 @@ def test_a_robot_of_another_id_is_not_reached_and_that_is_said(shared: Daemon) -
     assert "there is acsar: --id acsar" in ended.err
 
 
-@pytest.mark.parametrize("robot_id", ["a/b*", "", "**", "robot 1"])
+@each("robot_id", ["a/b*", "", "**", "robot 1"])
 def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
     shared: Daemon, robot_id: str
 ) -> None:
@@ -343,8 +349,8 @@ def test_what_is_no_id_is_told_as_one_before_anybody_is_asked(
         assert f"{robot_id!r} is not a robot's id" in ended.err
 
 
-@pytest.mark.parametrize("verb", ["top", "hz", "whoami", "set", "drive", "odom", "calibrate"])
-@pytest.mark.parametrize("ids", ["*", "robot1,robot2"])
+@each("verb", ["top", "hz", "whoami", "set", "drive", "accuracy", "calibrate"])
+@each("ids", ["*", "robot1,robot2"])
 def test_a_verb_for_one_robot_says_which_are_for_many(shared: Daemon, verb: str, ids: str) -> None:
     words = {"hz": ["odom"]}.get(verb, [])
     ended = tool(shared, verb, *words, "--id", ids)
@@ -533,7 +539,7 @@ def test_get_prints_what_a_query_key_answers_on_one_line_of_json(shared: Daemon)
     assert json.loads(line)["pid"] == shared.pid
 
 
-@pytest.mark.parametrize("key", ["config", "schema/Odometry", "state", "odom"])
+@each("key", ["config", "schema/Odometry", "state", "odom"])
 def test_get_answers_on_every_kind_of_key(shared: Daemon, key: str) -> None:
     ended = tool(shared, "get", key)
     assert (ended.code, ended.err) == (0, "")
@@ -547,7 +553,7 @@ def test_get_of_a_service_does_not_call_it(shared: Daemon, bus: Bus) -> None:
     assert bus.state()["mode"] != "stopped"
 
 
-@pytest.mark.parametrize("verb", ["echo", "hz"])
+@each("verb", ["echo", "hz"])
 def test_what_is_only_asked_is_not_waited_for(shared: Daemon, verb: str) -> None:
     ended = tool(shared, verb, "info")
     assert (ended.code, ended.out) == (2, "")

@@ -46,7 +46,7 @@ SCREENS = [
     (["echo", "state", "--short"], WAITS),
     (["echo", "state"], WAITS),
     (["doctor"], "configuration"),
-    (["log", "--directory", "."], "no recording"),
+    (["recording", "--directory", "."], "no recording"),
     (["run", "--port", "nowhere", "--id", "other"], "nowhere"),
 ]
 
@@ -95,7 +95,7 @@ def shown(words: Sequence[str], where: Path, text: str, **more: str) -> str:
 
 def typed_at(daemon: Daemon, words: Sequence[str]) -> list[str]:
     """Run this command line at a terminal, with that daemon's file."""
-    file = [] if words[0] in ("run", "log") else ["--config", str(daemon.config)]
+    file = [] if words[0] in ("run", "recording") else ["--config", str(daemon.config)]
     return [sys.executable, "-c", ON_TERMINAL, *words, *file]
 
 
@@ -129,7 +129,7 @@ def test_no_help_and_no_usage_error_at_a_terminal_has_a_colour_then(tmp_path: Pa
     [
         ["doctor"], ["top"], ["fleet"], ["echo", "state", "-n1", "--short"],
         ["echo", "odom", "-n1"],
-        ["hz", "odom", "-n2"], ["topics"], ["check"], ["set"], ["whoami"], ["odom"],
+        ["hz", "odom", "-n2"], ["topics"], ["check"], ["set"], ["whoami"], ["accuracy"],
         ["get", "nonsense"], ["call", "nonsense"], ["set", "limits.linear_speed", "-1"], ["drive"],
     ],
     ids=" ".join,

@@ -102,7 +102,7 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
         "ros": {"namespace": "two"},
     }
     with one, Daemon(tmp_path, config=config, name="two", endpoint=free_endpoint()) as two:
-        assert one.endpoint in told(two, "no_router", 1)
+        assert one.endpoint in told(two, "not_a_router", 1)
         with Bus(two.endpoint, robot_id="two") as bus:
             until(lambda: "is not a router" in row(bus)["message"], 2.0, "diagnostics say it")
         toml = f'[robot]\nid = "two"\n[bus]\nlisten = ["{two.endpoint}"]\n'
@@ -112,7 +112,7 @@ def test_two_daemons_that_see_each_other_directly_say_so_and_a_tool_how_many_it_
         stopped = finish(acsard("call", "stop", "--id", "*", "--connect", one.endpoint), tmp_path)
         assert stopped.out.startswith("one: stopped")
         assert f"all robots visible at {one.endpoint}: 1 robot" in stopped.err
-        assert one.events("no_router") == []  # `one` has no router to connect to
+        assert one.events("not_a_router") == []  # `one` has no router to connect to
         with Bus(two.endpoint, robot_id="two") as bus:
             assert bus.state()["mode"] != "stopped"
 

@@ -112,7 +112,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Any:
         daemon.process.terminate()
         assert daemon.ended(5.0) == 0
     (path,) = (where / "record").glob("*.mcap")
-    ended = finish(acsard("log", "export", str(path), str(where / "bag"), "--rosbag2"), where)
+    ended = finish(acsard("recording", "export", str(path), str(where / "bag"), "--rosbag2"), where)
     assert ended.code == 0, ended
     return seen, static, bag(where / "bag")
 
@@ -164,7 +164,7 @@ ALIKE = (
     "link",
     "source",
     "sender",
-    "doubt",
+    "wheel_fault",
 )
 
 
@@ -215,7 +215,7 @@ def test_times_in_the_file_are_when_it_was_published(both: Any) -> None:
 
 
 def test_a_full_disk_is_a_sentence_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    words = acsard("log", "export", str(RECORDED), "new.mcap")
+    words = acsard("recording", "export", str(RECORDED), "new.mcap")
     full = ["sh", "-c", 'ulimit -f 16; exec "$@"', "sh", *words]  # blocks of 512 bytes per file
     ended = finish(full, tmp_path)
     assert (ended.code, ended.err) == (1, "acsard: cannot write new.mcap: File too large")

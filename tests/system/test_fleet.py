@@ -325,7 +325,7 @@ class Visitor:
         def commands() -> list[int]:
             # A first command of a new clock passes the router, and the daemon does not believe it
             # yet.
-            heard = ("commands", "commands_first_contact")
+            heard = ("commands", "commands_of_new_senders")
             return [sum(map(robot.count, heard)) for robot in fleet.robots]
 
         def obeyed() -> bool:
@@ -561,7 +561,7 @@ def test_the_lines_for_a_robot_are_a_configuration_without_surprises() -> None:
     assert not warnings(config)
     assert config.bus.mode == "client"
     router = config.bus.connect[0].removeprefix("tls/").partition(":")[0]
-    assert config.access.maintainers == (router,)  # `lan add NAME` makes it valid for that name
+    assert config.access.maintainers == (router,)  # `tls add NAME` makes it valid for that name
 
 
 def test_the_router_names_the_keys_of_the_topic_table_and_the_default_sources(

@@ -298,7 +298,7 @@ def test_whatever_a_source_commands_by_is_shown_as_an_export_has_it(tmp_path: Pa
         daemon.process.terminate()
         assert daemon.ended(5.0) == 0
     (path,) = (tmp_path / "record").glob("*.mcap")
-    ended = finish(acsard("log", "export", str(path), str(tmp_path / "new.mcap")), tmp_path)
+    ended = finish(acsard("recording", "export", str(path), str(tmp_path / "new.mcap")), tmp_path)
     assert ended.code == 0, ended
     told = exported(tmp_path / "new.mcap")
     for source in sources:

@@ -14,8 +14,8 @@ from typing import Any, cast
 import aiohttp
 import pytest
 
-from acsard.lan.authority import Authority
-from acsard.prompts.json_lines import HEARD_S
+from acsard.certificates.authority import Authority
+from acsard.prompts.json_prompt import HEARD_S
 from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost
@@ -34,7 +34,7 @@ async def beside(call: Callable[[], Any]) -> Any:
 async def drives(guided: Guided, standing: Bus) -> None:
     """Wait until the first leg moves. Starts it again if a busy machine has ended it."""
     for _ in range(4):
-        await guided.begin("calibrate", way="umbmark")
+        await guided.begin("calibrate", method="umbmark")
         await guided.answer(await guided.asks("How wide"), 300)
         await guided.starts("1. Set the robot")
         said = await guided.says(lambda said: said.get("progress", 0.0) > 0.15 or "ended" in said)
@@ -151,7 +151,7 @@ def test_a_browser_that_goes_in_the_middle_of_a_drive_leaves_zeros_and_no_child(
             await beside(lambda: none_left(page))
             assert not Path(f"/proc/{child}").exists()
         async with guiding(page) as another:
-            await another.begin("calibrate", way="tape")
+            await another.begin("calibrate", method="tape")
             await another.asks("How far apart")
 
     run(story)
@@ -162,7 +162,7 @@ def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> 
     async def story() -> None:
         async with guiding(page, pings=False) as guided:
             for _ in range(4):  # a busy machine may end it before
-                await guided.begin("calibrate", way="umbmark")
+                await guided.begin("calibrate", method="umbmark")
                 await guided.answer(await guided.asks("How wide"), 300)
                 await guided.starts()
                 end = await guided.ended()
@@ -219,7 +219,7 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
 
     async def story() -> None:
         async with guiding(served, token=token) as guided:
-            await guided.begin("calibrate", way="umbmark")
+            await guided.begin("calibrate", method="umbmark")
             await guided.answer(await guided.asks("How wide"), 300)
             begun = time.monotonic()
             await guided.starts("1. Set the robot")
@@ -252,7 +252,7 @@ def test_a_server_that_is_killed_at_a_question_takes_its_child_with_it(
 
         async def story() -> None:
             async with guiding(page) as guided:
-                await guided.begin("calibrate", way="umbmark")
+                await guided.begin("calibrate", method="umbmark")
                 await guided.asks("How wide")
                 (child,) = commands(page)
                 page.signal(signal.SIGKILL)
@@ -321,18 +321,18 @@ def test_who_is_no_maintainer_begins_nothing(page: Page, standing: Bus) -> None:
 INJECTED: list[dict[str, object]] = [
     {"begin": "run"},
     {"begin": "calibrate", "words": ["--write"]},
-    {"begin": "calibrate", "way": "tape --write"},
-    {"begin": "calibrate", "way": "--log=/etc/passwd"},
-    {"begin": "calibrate", "way": "positions", "positions": "--yes"},
-    {"begin": "calibrate", "way": "positions", "positions": "**"},
-    {"begin": "calibrate", "way": "positions"},
-    {"begin": "calibrate", "way": "tape", "positions": "sim/pose"},
+    {"begin": "calibrate", "method": "tape --write"},
+    {"begin": "calibrate", "method": "--log=/etc/passwd"},
+    {"begin": "calibrate", "method": "positions", "positions": "--yes"},
+    {"begin": "calibrate", "method": "positions", "positions": "**"},
+    {"begin": "calibrate", "method": "positions"},
+    {"begin": "calibrate", "method": "tape", "positions": "sim/pose"},
     {"begin": "calibrate", "port": "sim"},
     {"begin": "check", "port": "/etc/passwd"},
     {"begin": "check", "port": "sim --yes"},
     {"begin": "check", "port": ""},
     {"begin": "check", "port": "--yes"},
-    {"begin": "check", "port": "sim", "way": "tape"},
+    {"begin": "check", "port": "sim", "method": "tape"},
     {"begin": "check", "port": "x" * 300},
 ]
 
@@ -372,7 +372,7 @@ def test_a_port_that_the_daemon_has_is_told_with_how_to_end_it(tmp_path: Path) -
                 assert "systemctl stop acsard" in end["text"]
             told = json.loads(await text(f"{served.here}/api/guide"))
             # A pty counts as an ordinary port: the advice for the simulator does not apply to it.
-            assert (told["way"], told["advice"]) == ("", "")
+            assert (told["method"], told["advice"]) == ("", "")
 
         with Daemon(tmp_path, port=port) as holder, Page(holder, tmp_path) as served:
             with Bus(holder.endpoint) as bus:
@@ -402,8 +402,8 @@ def test_a_browser_that_goes_while_a_motor_turns_leaves_zeros_and_the_port(tmp_p
 def test_what_may_be_begun_is_listed(page: Page) -> None:
     async def story() -> None:
         told = json.loads(await text(f"{page.here}/api/guide"))
-        assert sorted(told["ways"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
-        assert told["way"] == "positions"
+        assert sorted(told["methods"]) == ["gyro", "positions", "tape", "umbmark", "wall"]
+        assert told["method"] == "positions"
         assert "no floor to lay a tape on" in told["advice"]
         assert told["ports"][0]["port"] == "sim"  # the configured port
         if len(told["ports"]) == 1:

@@ -255,7 +255,7 @@ class Robot:
         return time.monotonic() - begun
 
 
-class Door(NamedTuple):
+class Gateway(NamedTuple):
     """A robot with its own TLS gateway, and the certificates for it."""
 
     certificates: Certificates
@@ -268,8 +268,8 @@ class Door(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def door(tmp_path_factory: pytest.TempPathFactory) -> Door:
-    return Door(Certificates(tmp_path_factory.mktemp("certificates")))
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Gateway:
+    return Gateway(Certificates(tmp_path_factory.mktemp("certificates")))
 
 
 Router = Callable[[Path, str], Program]
@@ -339,9 +339,9 @@ def attacks(half_a_minute: Forms, a_moment: Forms) -> list[Any]:
     ),
 )  # fmt: skip
 def test_who_is_let_in_disturbs_neither_the_loop_nor_the_stop_nor_the_others(
-    tmp_path: Path, door: Door, form: str, who: Identity, seconds: float
+    tmp_path: Path, gateway: Gateway, form: str, who: Identity, seconds: float
 ) -> None:
-    figures = Robot(tmp_path, door.network()).attacked(form, who, seconds)
+    figures = Robot(tmp_path, gateway.network()).attacked(form, who, seconds)
     print(f"\n{form} by {who}: {figures}")
     assert len(figures.stops) >= (0 if form in HALT else 1 if seconds < LONG_S else 3)
     undisturbed(figures, long=seconds >= LONG_S)
@@ -378,12 +378,14 @@ def test_who_attacks_zenohd_does_not_disturb_the_robot_behind_it(tmp_path: Path,
     undisturbed(figures)
 
 
-def test_a_bus_that_is_locked_costs_messages_and_no_period(tmp_path: Path, door: Door) -> None:
+def test_a_bus_that_is_locked_costs_messages_and_no_period(
+    tmp_path: Path, gateway: Gateway
+) -> None:
     """On the robot's machine any client may use wildcards.
 
     A client that holds the lock on Zenoh's tables blocks every program that puts.
     """
-    periods, counters = Robot(tmp_path, door.network()).locked(0.5)
+    periods, counters = Robot(tmp_path, gateway.network()).locked(0.5)
     print(f"\n{periods}, {counters}")
     assert periods.missed <= 0.01 * periods.elapsed + 4
     assert counters["bus_dropped"] > 20
@@ -391,18 +393,20 @@ def test_a_bus_that_is_locked_costs_messages_and_no_period(tmp_path: Path, door:
 
 
 @pytest.mark.parametrize("form", ["many", "subscribe"])
-def test_behind_the_door_not_even_wildcards_disturb(tmp_path: Path, door: Door, form: str) -> None:
-    figures = Robot(tmp_path, door.network(wildcards=True)).attacked(form, "viewer", 1.5)
+def test_behind_the_gateway_not_even_wildcards_disturb(
+    tmp_path: Path, gateway: Gateway, form: str
+) -> None:
+    figures = Robot(tmp_path, gateway.network(wildcards=True)).attacked(form, "viewer", 1.5)
     print(f"\n{form} with wildcards: {figures}")
     # The gateway's tables are cleaned at the machine's speed, 1.7 s on a fast one; newcomers wait.
     undisturbed(figures, back_s=3 * BACK_S)
 
 
 def test_who_takes_all_connections_is_in_the_log_and_in_the_state(
-    tmp_path: Path, door: Door
+    tmp_path: Path, gateway: Gateway
 ) -> None:
-    robot = Robot(tmp_path, door.network())
+    robot = Robot(tmp_path, gateway.network())
     robot.attacked("sessions", "unlisted", 5.0)
-    (line,) = robot.daemon.events("door_crowded")
+    (line,) = robot.daemon.events("gateway_full")
     assert line["text"].startswith("all 255 connections are taken, 255 by unlisted")
-    assert robot.counters["door_crowded"] > 0
+    assert robot.counters["gateway_full"] > 0

@@ -214,7 +214,7 @@ import { Convert, RobotState } from "./acsard.js";
 // Neither more nor fewer modes, or it does not compile.
 const moves: Record<RobotState["mode"], boolean> = {
   inactive: false, waiting: false, ready: false, driving: true, stopped: false, fault: false,
-  leaving: true,
+  shutdown: true,
 };
 const readers = Convert as unknown as Record<string, (text: string) => unknown>;
 for await (const line of createInterface({ input: process.stdin })) {

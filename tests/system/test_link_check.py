@@ -10,7 +10,7 @@ import pytest
 
 from acsard.client import Client, NotDrivenError, connect
 from tests.system.bystander import lost
-from tests.system.harness import Bus, Daemon, Program, acsard, until
+from tests.system.harness import Bus, Daemon, until
 
 
 def drives(robot: Client) -> float:
@@ -46,16 +46,7 @@ def test_the_daemon_drives_checked_with_samples_and_leaves_with_a_stop(tmp_path:
         # A line that waited for a core for longer than the next two took answers an old one.
         late = {"line_stale_sequence"} if lost(started) > 0.02 else set()
         if late and daemon.events("link_stale"):
-            late.add("line_unchecked")  # the check was requested again
+            late.add("line_without_crc")  # the check was requested again
         assert {name for name in bus.state()["counters"] if name.startswith("line_")} <= late
         daemon.signal(signal.SIGTERM)
         assert daemon.ended(2.0) == 0
-
-
-def test_firmware_without_the_check_is_not_driven_where_it_is_required(tmp_path: Path) -> None:
-    with Program(acsard("sim", "--fault", "no_check"), tmp_path) as sim:
-        port = sim.says("acsard run --port").split()[-1]
-        config = {"mcu": {"link_check": "require"}}
-        with Daemon(tmp_path, port, config) as daemon, Bus(daemon.endpoint) as bus:
-            until(lambda: "link_check" in bus.state()["reason"], 5.0, "the reason")
-            assert bus.state()["mode"] == "waiting"

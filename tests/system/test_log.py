@@ -25,33 +25,30 @@ def by(daemon: Daemon, name: str) -> list[Any]:
     return [line["by"] for line in daemon.events(name)]
 
 
-def test_who_calls_is_told_by_the_name_he_gives_himself(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with connect(daemon.endpoint) as robot:
-            robot.call("set_pose", x=1.0, y=0.0, yaw=0.0)
-            robot.name = "patrol \x1b[2J(native)"
-            robot.call("stop")
-        call = acsard("call", "clear", "--connect", daemon.endpoint)
-        subprocess.run(call, check=True, capture_output=True)
-        bus.ask("srv/deactivate")
-        until(lambda: daemon.events("deactivate"), 5.0, "the last call is in the log")
-        (pose,), (stop,), (clear,) = (by(daemon, name) for name in ("set_pose", "stop", "clear"))
+def test_who_calls_is_told_by_the_name_he_gives_himself(shared: Daemon, bus: Bus) -> None:
+    with connect(shared.endpoint) as robot:
+        robot.call("set_pose", x=1.0, y=0.0, yaw=0.0)
+        robot.name = "patrol \x1b[2J(native)"
+        robot.call("stop")
+    call = acsard("call", "clear", "--connect", shared.endpoint)
+    subprocess.run(call, check=True, capture_output=True)
+    bus.ask("srv/deactivate")
+    until(lambda: shared.events("deactivate"), 5.0, "the last call is in the log")
+    (pose,), (stop,), (clear,) = (by(shared, name) for name in ("set_pose", "stop", "clear"))
     me = f"@{os.uname().nodename.partition('.')[0]}"
     assert me in own_name()
     assert re.fullmatch(rf"{re.escape(own_name())}/[0-9a-f]{{16}} \(native\)", pose)
     assert re.fullmatch(r"patrol \?\?2J\?native\?/[0-9a-f]{16} \(native\)", stop)
     assert re.search(rf"{me} acsard/[0-9a-f]{{16}} \(native\)$", clear)
-    assert by(daemon, "deactivate") == ["unnamed (native)"]
+    assert by(shared, "deactivate") == ["unnamed (native)"]
 
 
-def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        bus.linked()
-        with connect(daemon.endpoint) as robot:
-            key, stamp = robot.key("stop"), robot.session.new_timestamp()
-            robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann/s3cret"}')
-            (line,) = until(lambda: daemon.events("stop"), 5.0, "the stop is in the log")
+def test_a_put_on_stop_is_told_with_the_session_that_stamped_it(shared: Daemon, bus: Bus) -> None:
+    stops = len(shared.events("stop"))
+    with connect(shared.endpoint) as robot:
+        key, stamp = robot.key("stop"), robot.session.new_timestamp()
+        robot.session.put(key, b"", timestamp=stamp, attachment=b'{"sender": "ann/s3cret"}')
+        (line,) = until(lambda: shared.events("stop")[stops:], 5.0, "the stop is in the log")
     session = public_name(str(stamp.get_id()))
     assert line["by"] == f"{public_name('ann/s3cret')} (native, session {session})"
 
@@ -75,7 +72,7 @@ def test_a_day_is_told_from_its_start_to_its_totals(tmp_path: Path, peer: Peer) 
     assert (started["port"], started["rate"]) == (str(peer.path), 100.0)
     assert modes[:2] == ["waiting -> ready", "ready -> driving"]
     assert modes[-2] in ("driving -> stopped", "ready -> stopped")
-    assert modes[-1] == "stopped -> leaving"
+    assert modes[-1] == "stopped -> shutdown"
     assert commander["text"].startswith("nobody -> app (")
     assert refused["text"].startswith("wrong_shape: cmd/app: needs both")
     assert refused["level"] == "warning"

@@ -21,6 +21,7 @@ import pytest
 
 from tests.system.harness import ROOT, Bus, Daemon, Program, acsard, finish, until
 from tests.system.test_cli import ON_TERMINAL, Terminal
+from tests.system.typed import typed
 
 CHECK_S = 200.0
 """A check takes 13 to 25 s.
@@ -36,33 +37,32 @@ WHEELS = ("fr", "fl", "rl", "rr")
 
 
 def test_a_port_that_the_daemon_holds_ends_with_75_and_how_to_stop_it(
-    shared: Daemon, bus: Bus, tmp_path: Path
+    shared: Daemon, bus: Bus
 ) -> None:
     port = bus.get("info")["port"]
-    ended = finish(acsard("mcu", "check", "--port", port, "--yes"), tmp_path)
+    ended = typed("mcu", "check", "--port", port, "--yes")
     assert ended.code == 75
     assert f"process {shared.pid}" in ended.err
     assert "systemctl stop acsard" in ended.err
     bus.comes_to("ready")
 
 
-def test_a_port_that_is_not_there_ends_with_66(tmp_path: Path) -> None:
-    ended = finish(acsard("mcu", "check", "--port", "/dev/acsar_none", "--yes"), tmp_path)
+def test_a_port_that_is_not_there_ends_with_66() -> None:
+    ended = typed("mcu", "check", "--port", "/dev/acsar_none", "--yes")
     assert ended.code == 66
     assert "acsard ports" in ended.err
 
 
-def test_without_a_terminal_it_refuses_with_2(tmp_path: Path) -> None:
-    ended = finish(acsard("mcu", "check", "--port", "sim"), tmp_path)
+def test_without_a_terminal_it_refuses_with_2() -> None:
+    ended = typed("mcu", "check", "--port", "sim")
     assert (ended.code, ended.out) == (2, "")
     assert "terminal" in ended.err
 
 
-def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s(tmp_path: Path) -> None:
+def test_yes_alone_is_refused_on_a_pty_that_is_not_the_simulator_s() -> None:
     ends = pty.openpty()
     try:
-        words = acsard("mcu", "check", "--yes", "--port", os.ttyname(ends[1]))
-        ended = finish(words, tmp_path)
+        ended = typed("mcu", "check", "--yes", "--port", os.ttyname(ends[1]))
     finally:
         for end in ends:
             os.close(end)
@@ -134,11 +134,11 @@ FAULTS: dict[str, tuple[str, list[str], dict[str, object]]] = {
         {"mcu.trailing_comma": True},
     ),
     "no watchdog": ("no_watchdog", ["watchdog"], {}),
-    "fed watchdog": ("fed_by_anything", ["watchdog"], {}),
+    "fed watchdog": ("watchdog_fed_by_bad_lines", ["watchdog"], {}),
     "late watchdog": ("late_watchdog", ["watchdog"], {}),
     "dead encoder": ("stuck_encoder=c", ["motor c (rear left)"], {}),
-    "baud": ("other_baud=57600", ["baud rate"], {"mcu.baud_rate": 57600}),
-    "10 Hz": ("unprompted", ["reply rate"], {"mcu.reply_period": 0.1}),
+    "baud": ("wrong_baud=57600", ["baud rate"], {"mcu.baud_rate": 57600}),
+    "10 Hz": ("free_running", ["reply rate"], {"mcu.reply_period": 0.1}),
     "spaces": ("spaces", [], {}),
     "unpadded": ("unpadded", [], {}),
 }

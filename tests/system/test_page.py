@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import aiohttp
 import pytest
 
-from acsard.lan.authority import Authority
+from acsard.certificates.authority import Authority
 from acsard.web.limits import CONNECTIONS_HERE
 from acsard.web.viewer import HEARTBEAT_S
 from tests import pictures
@@ -946,15 +946,15 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             page.shows("role", "viewer")
             page.shows("mode", "READY")
             off = "one => [one.disabled || one.getAttribute('aria-disabled') === 'true', one.title]"
-            told = browser.js(f"[...document.querySelectorAll('[data-least]')].map({off})")
+            told = browser.js(f"[...document.querySelectorAll('[data-does]')].map({off})")
             assert len(told) >= 6
-            assert {tuple(one) for one in told} == {(True, "for who is operator; you are viewer")}
-            described = browser.js(f"[...document.querySelectorAll('[data-least]')].map({WORDS})")
-            assert all("for who is operator; you are viewer" in one for one in described)
-            page.shows("barred", "for who is operator; you are viewer")
+            assert {tuple(one) for one in told} == {(True, "for operators; you are viewer")}
+            described = browser.js(f"[...document.querySelectorAll('[data-does]')].map({WORDS})")
+            assert all("for operators; you are viewer" in one for one in described)
+            page.shows("barred", "for operators; you are viewer")
             page.shows("hint", "You may watch and stop, not drive")
             browser.tap("tab-events")
-            page.shows("recordings", "download and report are for who is operator")
+            page.shows("recordings", "download and report are for operators")
             assert (
                 browser.js("document.querySelectorAll('#recordings a, #recordings button').length")
                 == 0

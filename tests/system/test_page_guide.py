@@ -38,7 +38,7 @@ class Person:
         browser.open(server.here)
         until(lambda: browser.text("robot") == "acsar", 5.0, "it is connected")
         self.click("tab-set")
-        until(lambda: browser.js("document.querySelectorAll('#way option').length"), 5.0, "ways")
+        until(lambda: browser.js("document.querySelectorAll('#method option').length"), 5.0, "ways")
 
     def click(self, name: str) -> None:
         self.browser.js(f"document.getElementById({name!r}).click()")
@@ -158,7 +158,7 @@ def drives(person: Person, bus: Bus) -> None:
 
     def moves() -> bool:
         if person.hidden("guide"):
-            person.begin("calibrate", way="")
+            person.begin("calibrate", method="")
             person.asked("1. Set the robot", 30.0)
             person.shows("guide-where", "SIMULATED")
             person.press("start")
@@ -237,7 +237,7 @@ def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
 ) -> None:
     _, _, server = skidding
     person = Person(browser, server)
-    assert browser.js("document.getElementById('way').value") == "positions"
+    assert browser.js("document.getElementById('method').value") == "positions"
     assert not person.hidden("positions-row")
     person.shows("advice", "no floor to lay a tape on")
     # The default works, and a different choice is kept.
@@ -246,11 +246,11 @@ def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
     person.click("guide-leave")
     person.ended("stopped")
     person.click("guide-close")
-    browser.js("document.getElementById('way').value = 'tape'")
+    browser.js("document.getElementById('method').value = 'tape'")
     person.click("tab-drive")
     person.click("tab-set")
     browser.js("new Promise(done => setTimeout(done, 300))")
-    assert browser.js("document.getElementById('way').value") == "tape"
+    assert browser.js("document.getElementById('method').value") == "tape"
     browser.open("about:blank")
 
 

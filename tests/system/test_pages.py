@@ -86,8 +86,8 @@ def desk(shared: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("block", TYPED)
 def test_what_a_page_says_to_type_does_what_it_says(block: Block, desk: Path, bus: Bus) -> None:
-    if "lan init" in block.text and Path("/etc/systemd/system/acsard.service").exists():
-        pytest.skip("lan init would write the drop-in of the service of this machine")
+    if "tls init" in block.text and Path("/etc/systemd/system/acsard.service").exists():
+        pytest.skip("tls init would write the drop-in of the service of this machine")
     for command in block.commands():
         how = COMMANDS.get(command)
         if isinstance(how, Run):
@@ -174,7 +174,7 @@ def test_the_laptop_of_the_fleet_page_does_what_its_role_may(fleet: Fleet) -> No
 @pytest.mark.network
 def test_one_authority_and_one_file_serve_the_ten_robots_of_the_fleet_page(tmp_path: Path) -> None:
     page, place = "deploy/zenoh/README.md", with_acsard(tmp_path)
-    for words in ("lan init", "lan add router", "lan add robot$n", "lan add laptop", "lan router"):
+    for words in ("tls init", "tls add router", "tls add robot$n", "tls add laptop", "tls router"):
         done = shell(place, find(page, words).replace("192.168.1.10", "127.0.0.1"))
         assert done.code == 0, done
     clients, endpoint = place / "fleet/clients", free_tls_endpoint()
@@ -248,7 +248,7 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
         find(page, "python3 -m venv"),
         find(page, "sudo /opt", "pip install -r"),
         find(page, "sudo /opt", "pip install --no-deps"),
-        f"{venv}/bin/acsard lan init --directory {clone.parent}/tls",
+        f"{venv}/bin/acsard tls init --directory {clone.parent}/tls",
     ]
     for command in wanted:
         typed = command.removeprefix("sudo ").replace("/opt/acsard/venv", str(venv))
@@ -256,7 +256,7 @@ def test_the_service_s_venv_has_all_that_lan_and_service_need(clone: Path) -> No
         assert done.code == 0, done
     files = finish([str(venv / "bin/acsard"), "service", "install", "--dry-run"], clone.parent)
     assert "acsard.service" in files.out
-    router = finish([str(venv / "bin/acsard"), "lan", "router", "robot7"], clone.parent)
+    router = finish([str(venv / "bin/acsard"), "tls", "router", "robot7"], clone.parent)
     assert '"acsard/robot7/srv/stop"' in router.out
 
 
@@ -267,7 +267,7 @@ def test_the_authority_of_the_fleet_page_is_made_by_what_its_first_line_installs
     clone: Path,
 ) -> None:
     page = "deploy/zenoh/README.md"
-    typed = [find(page, words) for words in ("pip install", "bin/activate", "lan init")]
+    typed = [find(page, words) for words in ("pip install", "bin/activate", "tls init")]
     done = finish(["bash", "-ec", "\n".join(typed)], clone, INSTALL_S, of_a_stranger())
     assert done.code == 0, done
     assert (clone / "fleet/ca-key.pem").is_file()

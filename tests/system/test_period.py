@@ -37,7 +37,7 @@ def undisturbed(tmp_path: Path, length: float) -> tuple[Periods, float, bool]:
         used, memory = cpu_seconds(daemon.pid) - cpu, resident_kb(daemon.pid)
         waited = waited_for_a_core(daemon.pid) - waited
         up = not broken(states, begun.at)
-        late = bus.get("state")["figures"]["period_lateness"]["since_start"]
+        late = bus.get("state")["latencies"]["period_lateness"]["since_start"]
     periods = Periods.between(first, last)
     print(
         f"{periods.elapsed / 100:.2f} s: {periods.sent} lines sent "

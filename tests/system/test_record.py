@@ -41,7 +41,7 @@ def files(where: Path) -> list[Path]:
 
 def replayed(where: Path, path: Path) -> int:
     """Return the number of lines, and check that all of them replay the same."""
-    ended = finish(acsard("log", "replay", str(path)), where)
+    ended = finish(acsard("recording", "replay", str(path)), where)
     assert ended.code == 0, ended
     found = re.match(r"([\d ]+) of ([\d ]+) lines are the same", ended.out)
     assert found, ended
@@ -84,7 +84,7 @@ def test_a_kill_costs_little_and_the_next_start_makes_the_file_whole(tmp_path: P
     assert whole.name.endswith(".kept.mcap")
     assert new.name > whole.name
     assert replayed(tmp_path, whole) == lines
-    listed = finish(acsard("log", "--directory", str(tmp_path / "record")), tmp_path)
+    listed = finish(acsard("recording", "--directory", str(tmp_path / "record")), tmp_path)
     assert whole.name in listed.out.splitlines()[0]
     assert "[cut: the daemon or the computer ended without notice]" in listed.out.splitlines()[0]
 
@@ -115,11 +115,11 @@ def test_a_fault_of_the_daemons_own_is_told_and_what_came_into_that_step_is_in_t
     (path,) = files(tmp_path)
     assert path.name.endswith(".kept.mcap")
     for words in ((), ("show",)):
-        said = finish(acsard("log", *words, "--directory", str(path.parent)), tmp_path).out
+        said = finish(acsard("recording", *words, "--directory", str(path.parent)), tmp_path).out
         assert "an internal error ended the daemon: in step " in said
         assert "ZeroDivisionError: a fault of our own" in said
     assert replayed(tmp_path, path) > 3
-    again = finish(acsard("log", "replay", str(path)), tmp_path)
+    again = finish(acsard("recording", "replay", str(path)), tmp_path)
     assert "which ended the daemon, does not end the robot of this version" in again.out
 
 
@@ -152,12 +152,12 @@ def test_a_full_disk_is_said_and_costs_only_records(tmp_path: Path) -> None:
     full = ["sh", "-c", 'ulimit -f 40; exec "$@"', "sh"]  # blocks of 512 bytes per file
     with recording(tmp_path, before=full) as (daemon, bus):
         with bus.commanding(0.3):
-            until(lambda: "File too large" in bus.state()["recording"], 30.0, "it is said")
+            until(lambda: "File too large" in bus.state()["recording_error"], 30.0, "it is said")
             assert bus.state()["mode"] == "driving"
             row = next(r for r in bus.get("diagnostics")["status"] if "recording" in r["name"])
             assert row["level"] == 1
         assert any(e["level"] == "warning" for e in daemon.events("recording"))
-        until(lambda: bus.state()["recording"] == "", 30.0, "it is tried again")
+        until(lambda: bus.state()["recording_error"] == "", 30.0, "it is tried again")
     for path in files(tmp_path):
         assert replayed(tmp_path, path) > 0
 
@@ -167,7 +167,7 @@ def test_a_directory_that_cannot_be_made_is_said_and_the_robot_runs(tmp_path: Pa
         Daemon(tmp_path, words=["--record", "/proc/nowhere"]) as daemon,
         Bus(daemon.endpoint) as bus,
     ):
-        until(lambda: "/proc/nowhere" in bus.state()["recording"], 10.0, "it is said")
+        until(lambda: "/proc/nowhere" in bus.state()["recording_error"], 10.0, "it is said")
         bus.linked()
         with bus.commanding(0.3):
             until(lambda: bus.state()["mode"] == "driving", 5.0, "drives")

@@ -109,7 +109,11 @@ def misses_what_the_other_misses(name: str, bus: Bus, beside: Bus) -> None:
 
 def says(bus: Bus, text: str) -> None:
     """Wait until `state` reports this problem of the recording, or none for ""."""
-    until(lambda: (told := bus.state()["recording"]) == text or (text and text in told), 30.0, text)
+    until(
+        lambda: (told := bus.state()["recording_error"]) == text or (text and text in told),
+        30.0,
+        text,
+    )
 
 
 def lived_again(where: Path, record: Path) -> None:
@@ -159,7 +163,7 @@ def records(where: Path, record: Path) -> Iterator[Daemon]:
         bus.linked()
         with bus.commanding(0.3):
             until(lambda: any(size > 9000 for size in sizes()), 30.0, "it")
-        assert bus.state()["recording"] == ""
+        assert bus.state()["recording_error"] == ""
         yield daemon
 
 
@@ -263,7 +267,7 @@ def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
         before = syncs.stat().st_size
         misses_what_the_other_misses("2 s a sync", bus, beside)
         assert syncs.stat().st_size > before
-        assert bus.state()["recording"] == ""
+        assert bus.state()["recording_error"] == ""
         daemon.process.terminate()
         assert daemon.ended(5.0) == 0
         happened = any(daemon.events(name) for name in HAPPENED)

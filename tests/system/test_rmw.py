@@ -523,7 +523,7 @@ def test_a_clock_that_is_an_hour_off_harms_no_commander(bus: Bus, ros: RmwClient
         before = bus.state()
         until(partial(_put, bus, other, off, bus.count("commands") + 3), 3.0, f"zeros {off} s off")
         # A new sender shows its delays first.
-        assert changes(before, bus.state()).keys() <= {"commands", "commands_first_contact"}
+        assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 
 def _put(bus: Bus, other: RmwClient, off: float, enough: int) -> bool:
@@ -561,7 +561,7 @@ def test_what_is_unusual_but_right_is_taken(bus: Bus, ros: RmwClient, name: str)
     kind, payload = PLAIN[name]
     before = bus.state()
     ros.heard(bus, "joint_commands" if kind == JOINTS else "cmd_vel", kind, payload)
-    assert changes(before, bus.state()).keys() <= {"commands", "commands_first_contact"}
+    assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 
 def test_a_big_endian_twist_says_the_same_speed(bus: Bus, ros: RmwClient) -> None:

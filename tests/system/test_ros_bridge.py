@@ -131,7 +131,7 @@ def test_a_twist_has_52_bytes_and_a_stamped_one_more(bus: Bus, ros: BridgeHalf) 
     for more in (b"", bytes(3)):
         ros.heard(bus, "cmd_vel", TWIST, plain + more)
         ros.heard(bus, "cmd_vel", TWIST, lambda more=more: stamped(0.0) + more)  # type: ignore[misc]
-    assert changes(before, bus.state()).keys() <= {"commands", "commands_first_contact"}
+    assert changes(before, bus.state()).keys() <= {"commands", "commands_of_new_senders"}
 
 
 @pytest.mark.usefixtures("restored")

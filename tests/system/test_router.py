@@ -27,7 +27,7 @@ def listens(program: Program, times: int = 1) -> None:
 
 def the_router(program: Program) -> int:
     """Return the child process that may be lost."""
-    return until(lambda: children(program.pid, "--held"), 5.0, "its process")[0]
+    return until(lambda: children(program.pid, "--supervised"), 5.0, "its process")[0]
 
 
 def gone(pid: int) -> bool:
@@ -97,4 +97,4 @@ def test_one_that_lacks_its_certificates_ends_with_a_sentence(where: Path) -> No
     with watched_router(where, free_tls_endpoint()) as router:
         assert router.ended(10.0) == 78
         assert [line for line in router.err if "private key" in line and "in place" in line]
-        assert "door" not in router.stderr
+        assert "gateway" not in router.stderr

@@ -31,6 +31,7 @@ from tests.system.harness import (
     write_config,
 )
 from tests.system.strangers import DRIVE, FIRST_ODOMETRY, words
+from tests.system.typed import typed
 
 
 def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path: Path) -> None:
@@ -43,15 +44,6 @@ def test_first_odometry_reaches_another_process_within_3_s_of_the_start(tmp_path
     seconds = first - daemon.started
     print(f"acsard run -> first odometry in another process: {seconds:.3f} s")
     assert seconds < 3.0 + lost(daemon.started, first)
-
-
-def test_run_is_the_default_verb_and_announces_the_simulator_loudly(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
-    with Program(acsard("--listen", endpoint), tmp_path) as daemon:
-        assert "SIMULATOR" in daemon.says("port ")
-        assert endpoint in daemon.says("bus ")
-        for hint in ("acsard drive", "acsard top", "acsard call stop"):
-            daemon.says(hint)
 
 
 @pytest.mark.slow
@@ -105,11 +97,6 @@ def test_sigterm_while_the_port_is_missing_ends_with_0_however_soon_it_comes(
             daemon.signal(signal.SIGTERM)
             assert daemon.ended(2.0) == 0
             assert time.monotonic() - sent < 1.0 + lost(sent)
-
-
-def test_state_answers_as_soon_as_the_daemon_says_it_is_up(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Bus(daemon.endpoint) as bus:
-        assert bus.state()["mode"] in ("waiting", "ready")
 
 
 # in use: 75
@@ -291,13 +278,12 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("verb", ["run", "check"])
-def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path, verb: str) -> None:
+def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(PLANTED)
     begun = time.monotonic()
-    ended = finish(acsard(verb, "--config", str(path)), tmp_path)
-    print(f"{verb} with a bad configuration: {ended.seconds:.2f} s")
+    ended = finish(acsard("run", "--config", str(path)), tmp_path)
+    print(f"run with a bad configuration: {ended.seconds:.2f} s")
     assert ended.code == 78
     assert ended.out == ""
     *lines, summary = ended.err.splitlines()
@@ -309,19 +295,7 @@ def test_a_bad_configuration_ends_with_78_and_a_line_per_mistake(tmp_path: Path,
 
 
 def test_a_configuration_that_is_not_there_ends_with_78(tmp_path: Path) -> None:
-    ended = finish(acsard("run", "--config", str(tmp_path / "none.toml")), tmp_path)
+    ended = typed("run", "--config", str(tmp_path / "none.toml"))
     assert ended.code == 78
     assert len(ended.err.splitlines()) == 1
     assert "none.toml" in ended.err
-
-
-def test_a_rate_the_wire_cannot_carry_is_refused_with_both_ways_out(tmp_path: Path) -> None:
-    path = write_config(tmp_path / "slow.toml", {"mcu": {"port": "sim", "baud_rate": 9600}})
-    ended = finish(acsard("run", "--config", str(path)), tmp_path)
-    assert ended.code == 78
-    for told in ("34.4 ms", "29 Hz", "23 Hz", "38400"):
-        assert told in ended.err
-
-
-def test_an_unknown_option_ends_with_2(tmp_path: Path) -> None:
-    assert finish(acsard("run", "--prot", "sim"), tmp_path).code == 2

@@ -13,10 +13,10 @@ from threading import Thread
 import pytest
 import zenoh
 
+from acsard.certificates import authority as making
+from acsard.certificates.authority import Authority
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
-from acsard.lan import authority as making
-from acsard.lan.authority import Authority
 from tests.system.harness import free_endpoint
 
 ALL_NAMES = ["localhost", "127.0.0.1"]
@@ -99,7 +99,7 @@ def test_the_directory_is_looked_at_before_the_network(tmp_path: Path) -> None:
     [
         ("robot ended", "the certificate of 127.0.0.1 has expired, by this machine's clock"),
         ("robot later", "is not valid yet, by this machine's clock"),
-        ("robot elsewhere", "lan renew --address 127.0.0.1"),
+        ("robot elsewhere", "tls renew --address 127.0.0.1"),
     ],
 )
 def test_what_is_wrong_with_the_robot_s_certificate(

@@ -60,7 +60,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     robot = Robot(tmp_path_factory.mktemp("whoami"))
     with robot.daemon, Bus(robot.plain) as bus:
         bus.linked()
-        until(lambda: robot.tool("viewer", "get", "info").code == 0, 10.0, "the door")
+        until(lambda: robot.tool("viewer", "get", "info").code == 0, 10.0, "the gateway")
         yield robot
 
 

@@ -7,6 +7,8 @@ a process.
 from __future__ import annotations
 
 import io
+import os
+import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
 
@@ -15,12 +17,18 @@ from tests.system.harness import Finished
 
 
 def typed(*words: str) -> Finished:
-    """Return the result of `acsard` with these words. Relative paths are those of this process."""
+    """Return the result of `acsard` with these words, without a terminal.
+
+    Relative paths are those of this process.
+    """
     out, err, begun = io.StringIO(), io.StringIO(), time.monotonic()
-    with redirect_stdout(out), redirect_stderr(err):
+    before = sys.stdin
+    with open(os.devnull) as sys.stdin, redirect_stdout(out), redirect_stderr(err):
         try:
             code = main(list(words))
         except SystemExit as end:  # argparse
             code = end.code if isinstance(end.code, int) else 1
+        finally:
+            sys.stdin = before
     said, wrong = (stream.getvalue().rstrip("\n") for stream in (out, err))
     return Finished(code, said, wrong, time.monotonic() - begun)

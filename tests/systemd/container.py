@@ -33,7 +33,7 @@ With any other Python the container is the Debian that we run on, with our Pytho
 
 PACKAGES = "systemd,systemd-sysv,dbus,udev,umockdev,iproute2,python3-minimal,libpython3-stdlib"
 
-UNIT, DOOR, PAGE = "acsard.service", "acsard-door.service", "acsard-web.service"
+UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
 
 HOME = "/opt/acsard"
 
@@ -255,17 +255,17 @@ class Container:
         """Install the files of `acsard service install`, without starting the service."""
         deploy = ROOT / "deploy" / "systemd"
         self.write(f"{HOME}/bin/acsard-stop", (deploy / "acsard-stop").read_text(), 0o755)
-        for unit in (UNIT, DOOR, PAGE):
+        for unit in (UNIT, GATEWAY, PAGE):
             self.write(f"{UNITS}/{unit}", (deploy / unit).read_text())
         self.run("systemctl", "daemon-reload")
 
     def reset(self) -> None:
         """Restore the state after the installation."""
-        self.run("systemctl", "stop", PAGE, DOOR, UNIT)
-        for unit in (UNIT, DOOR, PAGE):
+        self.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
+        for unit in (UNIT, GATEWAY, PAGE):
             shutil.rmtree(self.path(f"{UNITS}/{unit}.d"), ignore_errors=True)
         self.run("systemctl", "daemon-reload")
-        self.run("systemctl", "reset-failed", UNIT, DOOR, PAGE)
+        self.run("systemctl", "reset-failed", UNIT, GATEWAY, PAGE)
         self.forget()
         self.write(CONFIG, USUAL)
 

@@ -16,8 +16,8 @@ CLONE, THERE = "/opt/acsard/src", "/tmp/router"
 
 BEFORE = (
     f"cp {CLONE}/deploy/zenoh/router.json5 .",
-    f"{ACSARD} lan init --directory fleet",
-    f"{ACSARD} lan add router.local --directory fleet",
+    f"{ACSARD} tls init --directory fleet",
+    f"{ACSARD} tls add router.local --directory fleet",
     "cp fleet/clients/router.local/*.pem .",
     "useradd --system zenohd",
 )

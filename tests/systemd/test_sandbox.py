@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.system.harness import ROOT, until
-from tests.systemd.container import CONFIG, DOOR, PAGE, PORT, UNIT, USUAL, ZERO, Board, Container
+from tests.systemd.container import CONFIG, GATEWAY, PAGE, PORT, UNIT, USUAL, ZERO, Board, Container
 
 pytestmark = pytest.mark.systemd
 
@@ -25,13 +25,13 @@ ACSARD = "/opt/acsard/venv/bin/acsard"
 TLS = "/etc/acsard/tls"
 
 
-@pytest.mark.parametrize("unit", [UNIT, DOOR, PAGE])
+@pytest.mark.parametrize("unit", [UNIT, GATEWAY, PAGE])
 def test_systemd_finds_nothing_wrong_with_a_unit(container: Container, unit: str) -> None:
     checked = container.run("systemd-analyze", "verify", f"/etc/systemd/system/{unit}")
     assert (checked.code, checked.out, checked.err) == (0, "", "")
 
 
-@pytest.mark.parametrize("unit", [UNIT, DOOR, PAGE])
+@pytest.mark.parametrize("unit", [UNIT, GATEWAY, PAGE])
 def test_its_exposure_is_small(container: Container, unit: str) -> None:
     words = ["security", "--offline=yes", "--no-pager", f"/etc/systemd/system/{unit}"]
     text = container.run("systemd-analyze", *words).out.splitlines()[-1]
@@ -41,21 +41,21 @@ def test_its_exposure_is_small(container: Container, unit: str) -> None:
 
 def opened(container: Container) -> None:
     """The service with a TLS gateway."""
-    made = container.run(ACSARD, "lan", "init", "--force", "--address", "127.0.0.1")
+    made = container.run(ACSARD, "tls", "init", "--force", "--address", "127.0.0.1")
     assert made.code == 0, made.err
     listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
     container.write(
         CONFIG, f'mcu.port = "{PORT}"\nbus.listen = {json.dumps(listen)}\nbus.tls = "{TLS}"\n'
     )
-    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text(), DOOR)
-    for unit in (UNIT, DOOR):
+    container.drop_in("lan.conf", (DEPLOY / "lan.conf").read_text(), GATEWAY)
+    for unit in (UNIT, GATEWAY):
         started = container.start(unit)
         assert started.code == 0, started.err + container.messages(unit)
     is_open(container)
 
 
 def is_open(container: Container) -> None:
-    until(lambda: "open at" in container.show("StatusText", DOOR), 10.0, "the door opens")
+    until(lambda: "open at" in container.show("StatusText", GATEWAY), 10.0, "the gateway opens")
 
 
 @pytest.mark.parametrize("name", ["lan.conf", "bind-to-device.conf"])
@@ -65,7 +65,7 @@ def test_systemd_finds_nothing_wrong_with_a_drop_in(container: Container, name: 
     assert (checked.code, checked.out, checked.err) == (0, "", "")
 
 
-def test_with_lan_conf_the_door_reads_root_s_keys_and_listens_beyond_this_computer(
+def test_with_lan_conf_the_gateway_reads_root_s_keys_and_listens_beyond_this_computer(
     container: Container, board: Board
 ) -> None:
     opened(container)
@@ -74,54 +74,54 @@ def test_with_lan_conf_the_door_reads_root_s_keys_and_listens_beyond_this_comput
     assert shown.code == 0, shown.err
     state = json.loads(shown.out)
     assert state["mode"] == "ready"
-    assert state["certificate"] == "valid for 730 days", (
-        "the daemon may not read it: the door tells"
+    assert state["certificate_expiry"] == "valid for 730 days", (
+        "the daemon may not read it: the gateway tells"
     )
 
 
-def test_a_door_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
+def test_a_gateway_that_is_killed_is_open_again_and_the_daemon_does_not_notice(
     container: Container, board: Board
 ) -> None:
     opened(container)
-    daemon, first = container.main_pid(), container.main_pid(DOOR)
+    daemon, first = container.main_pid(), container.main_pid(GATEWAY)
     os.kill(first, signal.SIGKILL)
-    until(lambda: container.show("NRestarts", DOOR) == "1", 5.0, "it is started again")
+    until(lambda: container.show("NRestarts", GATEWAY) == "1", 5.0, "it is started again")
     is_open(container)
-    assert container.main_pid(DOOR) != first
+    assert container.main_pid(GATEWAY) != first
     assert container.main_pid() == daemon
 
 
-def test_a_door_that_hangs_holds_up_no_stop_nor_restart_of_the_daemon(
+def test_a_gateway_that_hangs_holds_up_no_stop_nor_restart_of_the_daemon(
     container: Container, board: Board
 ) -> None:
     opened(container)
-    first = container.main_pid(DOOR)
+    first = container.main_pid(GATEWAY)
     os.kill(first, signal.SIGSTOP)
     begun, waited = time.monotonic(), container.waited()
     container.run("systemctl", "restart", UNIT)
     took = time.monotonic() - begun
     print(f"restarted in {took:.2f} s")
     assert took < 1.7 + container.waited() - waited
-    until(lambda: container.show("ActiveState", DOOR) == "active", 10.0, "it came along")
+    until(lambda: container.show("ActiveState", GATEWAY) == "active", 10.0, "it came along")
     is_open(container)
-    assert container.main_pid(DOOR) != first
+    assert container.main_pid(GATEWAY) != first
 
 
-def test_what_a_stranger_can_take_of_the_door_is_limited(
+def test_what_a_stranger_can_take_of_the_gateway_is_limited(
     container: Container, board: Board
 ) -> None:
     opened(container)
     for name, value in (("MemoryMax", 256 << 20), ("CPUQuotaPerSecUSec", "800ms")):
-        assert container.show(name, DOOR) == str(value)
-    limits = Path(f"/proc/{container.main_pid(DOOR)}/limits").read_text()
+        assert container.show(name, GATEWAY) == str(value)
+    limits = Path(f"/proc/{container.main_pid(GATEWAY)}/limits").read_text()
     assert re.search(rf"Max data size +{192 << 20} +{192 << 20}", limits)
 
 
-def test_without_lan_conf_there_is_no_door(container: Container, board: Board) -> None:
+def test_without_lan_conf_there_is_no_gateway(container: Container, board: Board) -> None:
     assert container.start().code == 0
-    container.start(DOOR)
-    assert container.show("ConditionResult", DOOR) == "no"
-    assert container.show("ActiveState", DOOR) == "inactive"
+    container.start(GATEWAY)
+    assert container.show("ConditionResult", GATEWAY) == "no"
+    assert container.show("ActiveState", GATEWAY) == "inactive"
 
 
 def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
@@ -135,8 +135,8 @@ def test_without_its_key_lan_conf_fails_the_start_instead_of_going_without(
     assert {heard.line for heard in board.since(0.0)} <= {ZERO, b"-"}
 
 
-@pytest.mark.parametrize("unit", [DOOR, PAGE])
-def test_without_its_key_the_door_or_page_waits_for_a_person_and_doctor_says_which(
+@pytest.mark.parametrize("unit", [GATEWAY, PAGE])
+def test_without_its_key_the_gateway_or_page_waits_for_a_person_and_doctor_says_which(
     container: Container, board: Board, unit: str
 ) -> None:
     opened(container)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from acsard.lan.authority import Authority
+from acsard.certificates.authority import Authority
 from tests.system.harness import ROOT, until
-from tests.systemd.container import DOOR, PAGE, UNIT, Container, UnavailableError, unavailable
+from tests.systemd.container import GATEWAY, PAGE, UNIT, Container, UnavailableError, unavailable
 
 pytestmark = pytest.mark.systemd
 
@@ -37,7 +37,7 @@ def alone(rootfs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 def bare(alone: Container) -> Iterator[Container]:
     """The program alone, as after pip."""
     clean = "rm -rf /etc/systemd/system/acsard* /opt/acsard/bin /etc/acsard"
-    alone.run("systemctl", "stop", PAGE, DOOR, UNIT)
+    alone.run("systemctl", "stop", PAGE, GATEWAY, UNIT)
     alone.run("sh", "-c", clean)
     alone.run("systemctl", "daemon-reload")
     yield alone
@@ -65,13 +65,13 @@ def test_a_dry_run_prints_every_file_and_command_and_touches_nothing(bare: Conta
     assert listing(bare) == before
     assert written(done.out) == [
         f"/etc/systemd/system/{UNIT}",
-        f"/etc/systemd/system/{DOOR}",
+        f"/etc/systemd/system/{GATEWAY}",
         f"/etc/systemd/system/{PAGE}",
         "/opt/acsard/bin/acsard-stop",
         "/etc/udev/rules.d/70-acsar.rules",
         CONFIGURATION,
     ]
-    assert f"run     systemctl enable --now {UNIT} {DOOR} {PAGE}" in done.out
+    assert f"run     systemctl enable --now {UNIT} {GATEWAY} {PAGE}" in done.out
 
 
 def test_installed_it_runs_and_uninstalled_nothing_is_left(bare: Container) -> None:
@@ -263,12 +263,12 @@ def test_only_root_installs(bare: Container) -> None:
 
 def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> None:
     assert bare.run(ACSARD, "service", "install").code == 0
-    made = bare.run(ACSARD, "lan", "init", "--write", CONFIGURATION)
+    made = bare.run(ACSARD, "tls", "init", "--write", CONFIGURATION)
     assert made.code == 0, made.out + made.err
     bare.run("systemctl", "daemon-reload")
     bare.run("systemctl", "restart", UNIT)
     assert bare.show("ActiveState") == "active"
-    until(lambda: "open at" in bare.show("StatusText", DOOR), 10.0, "the door opens with it")
+    until(lambda: "open at" in bare.show("StatusText", GATEWAY), 10.0, "the gateway opens with it")
     assert bare.show("NRestarts") == "0"
     status = bare.run(ACSARD, "call", "stop", "--config", CONFIGURATION)
     assert status.code == 0, status.err
@@ -276,4 +276,4 @@ def test_after_lan_init_the_service_listens_on_the_network(bare: Container) -> N
     assert bare.run(ACSARD, "call", "stop", *viewer).code == 0
     assert bare.run(ACSARD, "call", "clear", *viewer).code == 77
     assert bare.run(ACSARD, "service", "uninstall").code == 0
-    assert not bare.path("/etc/systemd/system/acsard-door.service.d").exists()
+    assert not bare.path("/etc/systemd/system/acsard-gateway.service.d").exists()

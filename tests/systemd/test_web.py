@@ -48,7 +48,7 @@ def of_the_page(language: str, words: str) -> Block:
 OPENING = of_the_page("console", "acsard-web.service.d").commands()
 """The commands that open it. The last of them invites."""
 
-REVOKING, RENEWING = of_the_page("console", "lan renew").commands()
+REVOKING, RENEWING = of_the_page("console", "tls renew").commands()
 
 SETTINGS = 'mcu.port = "sim"\n' + of_the_page("toml", "https://0.0.0.0:8443").text
 

@@ -86,9 +86,9 @@ REFUSED: list[tuple[bytes, str]] = [
     (b"ap12.50,bn08.75,cp15.00,dn10.25\n", "malformed"),
     (b"ap12.50,bn08.75,cp15.00,dn10.25\x00", "malformed"),
     # four good wheels, but one of them is there twice
-    (b"ap12.50,ap12.50,cp15.00,dn10.25", "wheel_twice"),
-    (b"ap12.50,bn08.75,cp15.00,cn10.25", "wheel_twice"),
-    (b"dp00.00,dp00.00,dp00.00,dp00.00", "wheel_twice"),
+    (b"ap12.50,ap12.50,cp15.00,dn10.25", "duplicate_wheel"),
+    (b"ap12.50,bn08.75,cp15.00,cn10.25", "duplicate_wheel"),
+    (b"dp00.00,dp00.00,dp00.00,dp00.00", "duplicate_wheel"),
     # more than two digits and two decimals can say
     (b"ap99.991,bn08.75,cp15.00,dn10.25", "over_range"),
     (b"ap12.50,bn08.75,cp15.00,dn99.999", "over_range"),

@@ -1,7 +1,6 @@
 """`acsard calibrate` without a log: instructions, legs and measurements of a guided drive.
 
-Each method of calibration is a generator (in `tour.py`, `tape.py`, `wall.py` and `umbmark.py`). It
-yields the legs to drive and the numbers to ask for (`legs.py`) and is sent the answers, so that
-its code reads from top to bottom in the order of events. `client/riding.py` drives one leg:
-messages and keys go in, commands come out.
+Each way of calibration is a table of legs (`ways.py`): what to tell the person, what to drive, what
+to ask, and what the numbers measure. `runner.py` goes through such a table. `leg_driver.py` decides
+the commands of one leg from messages and keys, and `robot_on_bus.py` sends them.
 """

@@ -1,4 +1,7 @@
-"""The steps of a guided drive: legs to drive and numbers to ask for, with speeds and distances.
+"""The tables of a guided drive: legs to drive, numbers to ask for, and what they measure.
+
+A way of calibration is a `Way`: the numbers to ask for first, and its legs in order. `ways.py` has
+the table of the ways, and `runner.py` leads a person through one of them.
 
 The robot stays on 3 m x 3 m and within its limits. The true turns are unknown, since they are what
 the calibration measures. The plan allows for an effective track of 1 to 2.5 times the geometric
@@ -9,17 +12,14 @@ after turns that were measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
-from typing import Any, TypeVar
+from collections.abc import Callable
+from typing import Literal
 
 from msgspec import Struct
 
-from acsard.calibration.runs import Run
-from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.values import AcsardError
-
-T = TypeVar("T")
+from acsard.prompts.prompt import Ask
 
 
 class GuideError(AcsardError):
@@ -39,56 +39,73 @@ class Move(Struct, frozen=True):
     """Turn rate, rad/s, positive to the left."""
 
 
+UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
+"""Units of the numbers that a person reads off, in m or rad."""
+
+
+What = Literal["turned", "angle", "distance", "ahead", "aside"]
+"""Kind of a reading. `turned` is an angle that includes whole turns, and `angle` one that does not.
+
+Both are in rad, positive to the left. The other kinds are in m.
+"""
+
+
+class Mean(Struct, frozen=True):
+    """A measurement: the mean of some answers, plus a known part."""
+
+    what: What
+    answers: tuple[str, ...]
+    deviation: float
+    """Standard deviation, m or rad."""
+    plus: float = 0.0
+    """The known part, m or rad: whole turns that nobody measures."""
+    over: tuple[str, ...] = ()
+    """Names of the legs in which the robot moved by this much; without any, the leg itself."""
+
+
+class Slant(Struct, frozen=True):
+    """A measurement: the turn of the robot relative to a line, by two distances from the line.
+
+    `near` and `far` are the answers of the end that comes closer to the line by a turn to the left
+    and of the end that goes away from it. `apart` is the distance between both ends, which was
+    asked for before the first leg.
+    """
+
+    what: What
+    near: str
+    far: str
+    apart: str
+    since: str = ""
+    """Name of the leg after which the robot's angle to the line was measured before.
+
+    Without one, a person set the robot along the line.
+    """
+    plus: float = 0.0
+    """Whole and half turns, rad."""
+    over: tuple[str, ...] = ()
+    """As in `Mean`."""
+
+
+Measure = Mean | Slant
+
+
 class Leg(Struct, frozen=True):
     """A series of moves that a person starts with Enter and stops with any key."""
 
+    name: str
     words: str
     """Instructions to the person, and an announcement of the moves."""
     moves: tuple[Move, ...]
+    asks: tuple[Ask, ...] = ()
+    """Numbers that the person reads off after the moves."""
+    measures: tuple[Measure, ...] = ()
+    """The meaning of the numbers."""
     by_key: bool = False
     """Whether a key press is the normal end of the last move, whose duration is then a timeout."""
 
     @property
     def seconds(self) -> float:
         return sum(move.seconds for move in self.moves)
-
-
-class Ask(Struct, frozen=True):
-    """A number within bounds that the person reads off."""
-
-    words: str
-    unit: str
-    least: float
-    most: float
-    usual: float | None = None
-    """The number that Enter alone stands for, or None."""
-
-
-Step = Leg | Ask
-
-Way = Generator[Step, Any, Calibration]
-"""A method of calibration.
-
-It is sent a `Run` for each `Leg` and a number for each `Ask`. Raises `GuideError`, `LogError` and
-`RefusedError`.
-"""
-
-Part = Generator[Step, Any, T]
-"""A part of a method, with a result of its own."""
-
-
-def ride(leg: Leg) -> Part[Run]:
-    """Yield a leg and return its recording."""
-    run: Run = yield leg
-    return run
-
-
-def ask(
-    words: str, unit: str, least: float, most: float, usual: float | None = None
-) -> Part[float]:
-    """Yield a question and return the number that the person read off."""
-    number: float = yield Ask(words, unit, least, most, usual)
-    return number
 
 
 ROOM = 3.0
@@ -180,6 +197,34 @@ class Setup(Struct, frozen=True):
     @property
     def _believed(self) -> float:
         return self.drive.wheel_separation_multiplier
+
+
+Legs = Callable[[Setup, float], tuple[Leg, ...]]
+"""The legs for a setup and a ratio of effective to geometric track.
+
+The legs up to the first reading of whole turns do not depend on the track, which that reading
+tells.
+"""
+
+TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
+"""Ratios of effective to geometric track for which the driving time is computed.
+
+The time is not monotonic: a smaller track lets more whole turns fit into the time allowed.
+"""
+
+
+class Way(Struct, frozen=True):
+    """A way of calibration by a guided drive."""
+
+    legs: Legs
+    asks: tuple[Ask, ...] = ()
+    """Numbers that the person reads off before the first leg."""
+    tool: str = ""
+    """The tool whose readings are compared with the wheels, in words; "" for a sensor."""
+
+    def longest_s(self, setup: Setup) -> float:
+        """Return the longest driving time, s, whatever the effective track is."""
+        return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
 
 
 def setup(config: Config) -> Setup:

@@ -7,28 +7,27 @@ from collections.abc import Sequence
 import numpy as np
 
 from acsard.calibration import heading
-from acsard.calibration.doubts import RefusedError, remarks
+from acsard.calibration.doubts import remarks
 from acsard.calibration.evidence import RATE, TURN, Base
-from acsard.calibration.fit import (
-    LEFT_RADIUS,
-    RIGHT_RADIUS,
-    Rates,
-    configured,
-    constant,
-    rates,
-)  # fmt: skip
+from acsard.calibration.fit import Rates, configured, constant, rates
 from acsard.calibration.gain import Error, Gain
 from acsard.calibration.gain import constant as with_one_track
 from acsard.calibration.guided.readings import Found, Reading, found, joined, predicted
 from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import blocks, wheels
+from acsard.calibration.prepared import sure_enough
 from acsard.calibration.solve import Calibration, Drives
 from acsard.core.config.settings import DriveConfig
 
 BLOCK_S = 4.0
 
-WORST_TRACK, WORST_RATIO = 0.1, 0.02
+WORST = 0.1, 0.02
 """Largest useful standard deviations, as fractions: of the track, and of the ratio of radii."""
+
+MEND = (
+    "they contradict each other, or the robot skids much. Begin again on even ground, set the "
+    "robot exactly, and read off to the millimetre"
+)
 
 TURNED, STRAIGHT = np.pi, 0.5
 """Turns that classify a reading, rad.
@@ -39,10 +38,7 @@ Above `TURNED` it counts as a reading of turns, and below `STRAIGHT` as one of a
 
 def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Calibration:
     """Return the calibration that the readings give. Raises `RefusedError`."""
-    base = Base(
-        drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
-        drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
-    )  # fmt: skip
+    base = Base.of(drive)
     rides = list({id(ride): ride for reading in readings for ride in reading.rides}.values())
     told = found(readings, base)
     angles = [wheels(ride) for ride in rides]
@@ -50,13 +46,9 @@ def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Cal
     by_wheels = heading.turned(rows, base, told.parameters)
     rate = rates(rows, by_wheels)
     result = constant(told.parameters, told.covariance, rate, 0.0)
-    _sure(told)
-    size = base.radius * float(result.values[[LEFT_RADIUS, RIGHT_RADIUS]].mean())
-    drives = Drives(
-        len(rides), sum(float(ride.t[-1]) for ride in rides),
-        size * float(np.abs(rows.left + rows.right).sum()) / 2,
-        float(np.abs(by_wheels).sum()) / (2 * np.pi), rate.fastest,
-    )  # fmt: skip
+    chance = float(np.sqrt(told.covariance[TURN, TURN])) / abs(told.parameters[TURN])
+    sure_enough(result, chance, WORST, "these readings", MEND)
+    drives = Drives.of(rides, rows, by_wheels, base, result, rate)
     now = told.parameters.copy()
     now[: RATE + 1] = base.start()[: RATE + 1]
     notes = remarks({}, 0.0, by_wheels, result.values, base, sized=True)
@@ -65,23 +57,6 @@ def calibrated(way: str, readings: Sequence[Reading], drive: DriveConfig) -> Cal
         float(np.sqrt(told.covariance[RATE, RATE])), _gain(readings, base, told, now, rate),
         {}, 0.0, tuple(notes),
     )  # fmt: skip
-
-
-def _sure(told: Found) -> None:
-    every = told.covariance
-    track = float(np.sqrt(every[TURN, TURN])) / abs(told.parameters[TURN])
-    apart = np.zeros(len(told.parameters))
-    apart[:2] = -1.0, 1.0
-    ratio = float(np.sqrt(apart @ every @ apart)) / float(told.parameters[:2].mean())
-    for name, deviation, worst in (
-        ("the effective track", track, WORST_TRACK), ("left to right", ratio, WORST_RATIO),
-    ):  # fmt: skip
-        if not deviation <= worst:
-            raise RefusedError(
-                f"{name} comes out of these readings only to {deviation:.1%}, which is of no use: "
-                "they contradict each other, or the robot skids much. Begin again on even ground, "
-                "set the robot exactly, and read off to the millimetre"
-            )
 
 
 def _gain(readings: Sequence[Reading], base: Base, told: Found, now: Floats, rate: Rates) -> Gain:

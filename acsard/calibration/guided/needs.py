@@ -1,6 +1,6 @@
-"""The equipment that each method of a guided drive needs, in words.
+"""The equipment that each way of calibration in `ways.py` needs, in words.
 
-The methods are in `ways.py`.
+It stands apart so that the command line and the page can name the ways without loading numpy.
 """
 
 from __future__ import annotations
@@ -19,4 +19,4 @@ SIMULATED = (
     "where it truly is; and gyro where [odometry] gyro is on, with its distance left empty. tape, "
     "wall and umbmark are for a real robot.",
 )
-"""The method to begin with on the simulator, and why."""
+"""The way to begin with on the simulator, and why."""

@@ -5,34 +5,27 @@ how much turned, or where in x and y. The fit is Gauss-Newton on all readings, a
 (`calibration/places.py` sums the path). A reading is off by the error of tape and eye and by
 skidding on the way. If there are enough readings, their scatter shows how much the robot skidded.
 
-For turns on the spot, a person ends the first turn with a key. The later turns use the track that
-the first one showed.
+A person ends the first turn on the spot with a key. The later turns use the track that the first
+one showed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from msgspec import Struct
 
 from acsard.calibration.doubts import RefusedError, in_range
-from acsard.calibration.evidence import COUNT, LEFT, RATE, RIGHT, TURN, Base
+from acsard.calibration.evidence import COUNT, LEFT, RATE, RIGHT, TURN, Base, condition
 from acsard.calibration.fit import USUAL
-from acsard.calibration.guided.legs import WIDEST, GuideError, Leg, Part, Setup, ask
+from acsard.calibration.guided.legs import WIDEST, GuideError, Mean, Measure, What
 from acsard.calibration.log_table import Floats
 from acsard.calibration.paths import wheels
 from acsard.calibration.places import Grid, grid, path
 from acsard.calibration.runs import Run
 from acsard.core.config.settings import DriveConfig
-
-What = Literal["turned", "angle", "distance", "ahead", "aside"]
-"""Kind of a reading. `turned` is an angle that includes whole turns, and `angle` one that does not.
-
-Both are in rad, positive to the left. The other kinds are in m.
-"""
 
 SKIDDING = 0.015
 """Heading error by skidding, rad for 1 m of rolling.
@@ -52,6 +45,8 @@ PRIOR_FREE = 4.0
 LEAST_FREE = 3.0
 MOST_STEPS = 50
 SMALL = 1e-9
+WORST_CONDITION = 1e8
+"""Largest condition number at which the readings determine the parameters."""
 
 ACTIVE = [LEFT, RIGHT, TURN, RATE]
 
@@ -125,7 +120,7 @@ def found(readings: Sequence[Reading], base: Base) -> Found:
     """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
     steps = [joined(reading.rides) for reading in readings]
     start = _begun(readings, steps, base)
-    parameters, normal, _ = _solved(readings, steps, base, start)
+    parameters, normal = _solved(readings, steps, base, start)
     in_range(np.array([1 / parameters[TURN], parameters[LEFT], parameters[RIGHT]]))
     left, weights = _left(readings, steps, base, parameters)
     # Combine the scatter of these readings with the assumed noise. If there are few readings, widen
@@ -162,8 +157,8 @@ def _begun(readings: Sequence[Reading], steps: Sequence[Grid], base: Base) -> Fl
 
 def _solved(
     readings: Sequence[Reading], steps: Sequence[Grid], base: Base, start: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return the parameters, the normal equations and the right-hand side.
+) -> tuple[Floats, Floats]:
+    """Return the parameters and the normal equations.
 
     Raises `RefusedError` if the readings do not determine the parameters.
     """
@@ -182,7 +177,7 @@ def _solved(
         normal += np.outer(both, both) / UNKNOWN**2
         score += both * float(both @ (begun - parameters)) / UNKNOWN**2
         inner = normal[np.ix_(ACTIVE, ACTIVE)]
-        if np.linalg.cond(_correlated(inner)) > 1e8:
+        if condition(inner) > WORST_CONDITION:
             raise RefusedError(
                 "what was measured does not tell the wheels from the track: the robot hardly moved "
                 "or hardly turned. See that it can, and begin again"
@@ -190,16 +185,11 @@ def _solved(
         step = np.linalg.solve(inner, score[ACTIVE])
         parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
         if float(np.abs(step).max()) < SMALL:
-            return parameters, normal, score
+            return parameters, normal
     raise RefusedError(
         "what was measured does not fit together: is each number in its unit, and of the end that "
         "was asked for? Begin again"
     )
-
-
-def _correlated(normal: Floats) -> Floats:
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.asarray(normal / np.outer(size, size))
 
 
 def _off(reading: Reading, told: float) -> float:
@@ -225,9 +215,7 @@ def _without(
     """Return the residual of one reading by the fit without it, or NaN if that fit fails."""
     kept = [n for n in range(len(readings)) if n != number]
     try:
-        parameters, _, _ = _solved(
-            [readings[n] for n in kept], [steps[n] for n in kept], base, start
-        )
+        parameters, _ = _solved([readings[n] for n in kept], [steps[n] for n in kept], base, start)
     except RefusedError:
         return math.nan
     told = predicted(steps[number], readings[number].what, base, parameters)
@@ -237,33 +225,28 @@ def _without(
 READ_M = 0.002
 """Standard deviation of a distance of a few decimetres, and of placing the robot on a line, m."""
 
-FIRST = 1.2
-"""Rate of the first turn as it would be without skidding, rad/s."""
-
-LATE = 1.1
-"""Timeout of the first turn, as a multiple of the duration with the widest track.
-
-Beyond it, the person has missed the end of the turn.
-"""
-
-MOST_SPIN_S = 24.0
-"""Longest time for several turns on the spot, s."""
-
 BELIEVABLE = 0.85, 3.0
 """Credible ratios of effective to geometric track. Outside them, a reading must be wrong."""
 
-
-def once_round(setup: Setup, words: str) -> Leg:
-    """Return a leg that turns to the left until a key is pressed."""
-    longest = LATE * 2 * math.pi * WIDEST
-    rate = abs(setup.command(FIRST)) * setup.drive.wheel_separation_multiplier
-    return Leg(words, (setup.spin(FIRST, longest / rate),), by_key=True)
+Answers = dict[tuple[str, str], float]
+"""Numbers in m and rad by leg and name; the leg is "" if they were asked for before the first."""
 
 
-def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of whole turns that fit into `MOST_SPIN_S`, from 1 to `most`."""
-    one = setup.turn(2 * math.pi, rate, track).seconds
-    return max(1, min(most, int(MOST_SPIN_S / one)))
+def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
+    """Return what a leg has measured. Raises `RefusedError` if the numbers are impossible."""
+    driven = tuple(rides[name] for name in measure.over or (leg,))
+    if isinstance(measure, Mean):
+        numbers = [answers[leg, name] for name in measure.answers]
+        value = measure.plus + sum(numbers) / len(numbers)
+        return Reading(driven, measure.what, value, measure.deviation)
+    apart = answers["", measure.apart]
+
+    def angle(leg: str) -> float:
+        return slant(answers[leg, measure.near], answers[leg, measure.far], apart)
+
+    turned = angle(leg) - (angle(measure.since) if measure.since else 0.0)
+    # Each of the two angles has two distances.
+    return Reading(driven, measure.what, measure.plus + turned, 2 * READ_M / apart)
 
 
 def effective(reading: Reading, drive: DriveConfig) -> float:
@@ -297,17 +280,3 @@ def slant(near: float, far: float, apart: float) -> float:
             f"{far * 1000:.0f} mm from the line: measure again from the start"
         )
     return math.asin(share)
-
-
-def millimetres(words: str, least: float, most: float) -> Part[float]:
-    """Ask for a length in mm and return it in m."""
-    length = yield from ask(words, "mm", least, most)
-    return length / 1000.0
-
-
-def deviation(apart: float) -> float:
-    """Return the standard deviation of the difference of two slants, rad.
-
-    Each has two distances.
-    """
-    return 2 * READ_M / apart

@@ -1,42 +1,376 @@
-"""The table of methods of calibration by a guided drive."""
+"""The table of the ways of calibration by a guided drive, and the legs of each.
+
+UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
+Robots (1995): the robot drives a square in both directions, and a person measures how far its end
+is from its start. They use two formulas for small errors. Here the same measurements go into the
+general fit, because the effective track of a robot that skids is not a small error.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 
-from msgspec import Struct
+from acsard.calibration.guided.legs import (
+    EDGE,
+    ROOM,
+    WIDEST,
+    Leg,
+    Mean,
+    Measure,
+    Move,
+    Setup,
+    Slant,
+    Way,
+)  # fmt: skip
+from acsard.calibration.tape_distance import LEAST_M
+from acsard.prompts.prompt import Ask
 
-from acsard.calibration.guided import tape, tour, umbmark, wall
-from acsard.calibration.guided.legs import WIDEST, Setup, Way
-from acsard.calibration.guided.needs import NEEDS
+TAPE_M = 0.005
+"""Standard deviation of the long distance, including the position of its ends, m."""
 
-TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
-"""Ratios of effective to geometric track for which the driving time is computed.
+BY_EYE = 0.07
+"""Standard deviation of a heading that a person judges by eye, rad."""
 
-The time is not monotonic: a smaller track lets more whole turns fit into the time allowed.
+END_M = 0.003
+"""Standard deviation of the end of a square relative to the marks, m.
+
+It includes the error of placing the robot on them.
 """
 
+FIRST = 1.2
+"""Rate of the first turn as it would be without skidding, rad/s."""
 
-class Kind(Struct, frozen=True):
-    """A method of calibration."""
+LATE = 1.1
+"""Timeout of the first turn, as a multiple of the duration with the widest track.
 
-    needs: str
-    begin: Callable[[Setup], Way]
-    longest_s: Callable[[Setup, float], float]
-    """Driving time in s by the setup and the ratio of effective to geometric track."""
-    person: bool
-    """Whether a person has to read off numbers."""
+Beyond it, the person has missed the end of the turn.
+"""
 
-    def told(self, setup: Setup) -> str:
-        """Return the longest driving time as a sentence."""
-        most = max(self.longest_s(setup, track) for track in TRACKS)
-        return f"It drives for at most {most:.0f} s in all."
+MOST_SPIN_S = 24.0
+"""Longest time for several turns on the spot, s."""
+
+STOP, SETTLE = Move(0.6), Move(1.0)
+"""Pauses before and after a move."""
+
+ROUND = "once round"
+"""Name of the leg that a person ends with a key."""
+
+FROM_MARK = Ask(
+    "How far is that wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
+    name="metres",
+)  # fmt: skip
+DISTANCE = Mean("distance", ("metres",), TAPE_M)
 
 
-KINDS: dict[str, Kind] = {
-    "gyro": Kind(NEEDS["gyro"], tour.gyro, tour.spinning_s, False),
-    "positions": Kind(NEEDS["positions"], tour.positions, tour.petals_s, False),
-    "tape": Kind(NEEDS["tape"], tape.way, tape.longest_s, True),
-    "wall": Kind(NEEDS["wall"], wall.way, wall.longest_s, True),
-    "umbmark": Kind(NEEDS["umbmark"], umbmark.way, umbmark.longest_s, True),
+def _at_the_edge(setup: Setup) -> str:
+    return (
+        f"Set the robot {setup.from_edge:.2f} m (its middle) from the near edge of a free floor of "
+        f"{ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, looking to the far edge."
+    )
+
+
+def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
+    """Return a leg that turns to the left until a key is pressed."""
+    longest = LATE * 2 * math.pi * WIDEST
+    rate = abs(setup.command(FIRST)) * setup.drive.wheel_separation_multiplier
+    words = f"It turns to the left, on the spot. Press SPACE {until}"
+    return Leg(ROUND, words, (setup.spin(FIRST, longest / rate),), asks, measures, by_key=True)
+
+
+def turns(setup: Setup, rate: float, track: float, most: int) -> int:
+    """Return the number of whole turns that fit into `MOST_SPIN_S`, from 1 to `most`."""
+    one = setup.turn(2 * math.pi, rate, track).seconds
+    return max(1, min(most, int(MOST_SPIN_S / one)))
+
+
+# A tape measure beside a straight line.
+
+TO_LINE = (
+    Ask("Front left wheel to the line, at a right angle to it?", "mm", 0, 1500, name="front"),
+    Ask("Rear left wheel to the line?", "mm", 0, 1500, name="rear"),
+)
+LINE = "front", "rear", "wheelbase"
+
+
+def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
+    def spun(how: str, side: int, rate: float, since: str) -> Leg:
+        # `rate` is a true rate, rad/s. Two rates show how the track depends on the rate.
+        count = turns(setup, rate, track, 3)
+        around = setup.turn(side * 2 * math.pi * count, rate, track)
+        to = "left" if side > 0 else "right"
+        words = f"It turns {count} times round to the {to}, {how}."
+        measure = Slant("angle", *LINE, since=since)
+        return Leg(how, words, (SETTLE, around, SETTLE), TO_LINE, (measure,))
+
+    around = once_round(
+        setup,
+        "when it has turned once round and looks along the line as before; 20 deg too far or too "
+        "short do not matter.",
+        TO_LINE,
+        Slant("turned", *LINE, since="ahead", plus=2 * math.pi, over=("back", ROUND)),
+    )
+    return (
+        Leg(
+            "ahead",
+            f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
+            "middle (a joint of tiles, a board, chalk). Set the robot to the right of the line, "
+            f"about 300 mm off, its middle {setup.from_edge:.2f} m from the near edge, looking "
+            "along the line, so that its front left and rear left wheel are equally far from it, "
+            "to the millimetre. Mark where one wheel stands. Do not move it by hand until all is "
+            f"done. It drives {setup.length:.2f} m straight ahead.",
+            (SETTLE, setup.ahead(setup.length), SETTLE),
+            (FROM_MARK, *TO_LINE),
+            (DISTANCE, Slant("angle", *LINE)),
+        ),
+        Leg("back", "It drives back to the middle.", (setup.ahead(-setup.to_middle), SETTLE)),
+        around,
+        spun("slowly", -1, 0.6, ROUND),
+        spun("fast", 1, 1.2, "slowly"),
+    )
+
+
+# A tape measure and a wall that the robot is set square against.
+
+GAP_M = 0.2
+"""Distance from the wall to which the robot returns, m."""
+
+OUT_M = 0.9
+"""Distance that the robot drives before the turns on the spot, m."""
+
+HALF_RATE, ROUND_RATE = 0.8, 1.2
+"""True rates of the half turns and of the whole turns, rad/s."""
+
+SQUARE = (
+    "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
+)
+
+
+def _corners(end: str) -> tuple[Ask, Ask]:
+    return (
+        Ask(f"From the wall to the robot's {end} left corner?", "mm", 0, 2500, name="left"),
+        Ask(f"And to its {end} right corner?", "mm", 0, 2500, name="right"),
+    )
+
+
+# A turn to the left brings the left corner closer to the wall if the robot's back faces the wall,
+# and the right corner if its front does.
+REAR, FRONT = ("left", "right", "rear width"), ("right", "left", "front width")
+
+
+def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
+    out, count = setup.ahead(setup.length), turns(setup, ROUND_RATE, track, 2)
+    around = setup.turn(-2 * math.pi * count, ROUND_RATE, track)
+
+    def there_and_back(to: str, side: int) -> Leg:
+        half = setup.turn(side * math.pi, HALF_RATE, track)
+        home = setup.ahead(setup.length - 2 * GAP_M)
+        return Leg(
+            f"half round to the {to}",
+            f"{SQUARE}. It drives away from the wall, turns half round to the {to}, and drives "
+            "back.",
+            (STOP, out, STOP, half, STOP, home, STOP),
+            _corners("front"),
+            (Slant("angle", *FRONT, plus=side * math.pi),),
+        )
+
+    return (
+        Leg(
+            "out",
+            f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the middle "
+            f"of that. It drives {setup.length:.2f} m away from the wall.",
+            (STOP, out, STOP),
+            (
+                Ask(
+                    "How far is the robot's back from the wall now?", "m", LEAST_M, 2 * ROOM,
+                    name="metres",
+                ),
+            ),
+            (DISTANCE,),
+        ),
+        once_round(
+            setup,
+            "when it has turned once round and looks straight away from the wall as before; 10 deg "
+            "too far or too short do not matter.",
+        ),
+        Leg(
+            "home",
+            "It drives back towards the wall.",
+            (setup.ahead(GAP_M - setup.length), STOP),
+            _corners("rear"),
+            (Slant("turned", *REAR, plus=2 * math.pi, over=("out", ROUND, "home")),),
+        ),
+        there_and_back("left", 1),
+        there_and_back("right", -1),
+        Leg(
+            "round at the wall",
+            f"{SQUARE}. It drives away from the wall, turns {count} times round to the right, and "
+            "drives back.",
+            (STOP, setup.ahead(OUT_M), STOP, around, STOP, setup.ahead(GAP_M - OUT_M), STOP),
+            _corners("rear"),
+            (Slant("angle", *REAR),),
+        ),
+    )  # fmt: skip
+
+
+# UMBmark: squares in both directions.
+
+SIDE_M = 1.2
+
+CORNER_RATE = 0.9
+"""True turn rate at the corners, rad/s."""
+
+
+def side_of_square(setup: Setup) -> float:
+    """Return the length of the square's side, m."""
+    return min(SIDE_M, ROOM - 2 * (setup.from_edge + 2 * EDGE))
+
+
+def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
+    edge = side_of_square(setup)
+    marks = "How far ahead of its mark is the middle of its {} side (behind it: less than 0)?"
+    ends = (
+        Ask(marks.format("left"), "mm", -1500, 1500, name="left"),
+        Ask(marks.format("right"), "mm", -1500, 1500, name="right"),
+        Ask(
+            "How far to the left of its marks is the robot (to the right: less than 0)?",
+            "mm", -1500, 1500, name="aside",
+        ),
+    )  # fmt: skip
+
+    def square(to: str, other: str, side: int) -> Leg:
+        corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
+        return Leg(
+            f"square to the {to}",
+            f"Set the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far from "
+            f"the {other} one, looking to the far edge. Mark on the floor exactly beside the "
+            f"middle of its left and of its right side. It drives a square of {edge:.2f} m, round "
+            f"to the {to}, and ends about where it began.",
+            (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
+            ends,
+            (
+                Mean("ahead", ("left", "right"), END_M),
+                Mean("aside", ("aside",), END_M),
+                Slant("angle", "left", "right", "width"),
+            ),
+        )
+
+    return (
+        Leg(
+            "ahead",
+            f"{_at_the_edge(setup)} Mark where one wheel stands. It drives {setup.length:.2f} m "
+            "straight ahead.",
+            (STOP, setup.ahead(setup.length), STOP),
+            (FROM_MARK,),
+            (DISTANCE,),
+        ),
+        once_round(
+            setup,
+            "just when it has turned once round and looks as before; what it rolls on behind that "
+            "is asked for.",
+            (
+                Ask(
+                    "How many degrees past once round does it look (short of it: less than 0)?",
+                    "deg", -90, 90, name="past",
+                ),
+            ),
+            Mean("turned", ("past",), BY_EYE, plus=2 * math.pi),
+        ),
+        square("left", "right", 1),
+        square("right", "left", -1),
+    )  # fmt: skip
+
+
+# Sensors: a gyro or positions. The legs go there and back, whatever the track is.
+
+FAST, SLOW, CURVE = 1.5, 0.75, 0.8
+"""Rates of turns and curves as they would be without skidding, rad/s."""
+
+SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
+"""Duration of a turn for a gyro, length of a curve, and angle of a turn for positions."""
+
+PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
+"""Rates of each turn on the spot and of the curve after it, rad/s, without skidding."""
+
+STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
+"""Pauses: at first, in between, and where the robot only has to stop.
+
+The gyro bias is measured in the longer ones.
+"""
+
+STRAIGHT = "straight"
+"""Name of the leg that the tape measures."""
+
+
+def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
+    return Leg(
+        STRAIGHT,
+        f"{_at_the_edge(setup)} Mark on the floor where one of its wheels stands. Do not move it "
+        f"by hand until all is done. It stands for {STANDING.seconds:g} s, then drives "
+        f"{setup.length:.2f} m straight ahead.",
+        (STANDING, setup.ahead(setup.length), PAUSE),
+        asks,
+    )
+
+
+def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
+    moves = [PAUSE, setup.ahead(-setup.to_middle), PAUSE]
+    for rate in (FAST, -FAST, SLOW, -SLOW):
+        moves += [setup.spin(rate, SPIN_S), PAUSE]
+    for rate in (CURVE, -CURVE, 0.0):
+        moves += _there_and_back(setup, rate)
+    far = Ask(
+        "How far is that wheel from its mark now, in a straight line? Enter alone: not measured",
+        "m", 0.0, 2 * setup.length, 0.0, "metres",
+    )  # fmt: skip
+    return (
+        _straight(setup, (far,)),
+        Leg(
+            "turns",
+            "It drives back to the middle, turns on the spot to both sides, fast and slowly, and "
+            "drives three curves there and back.",
+            (*moves, PAUSE),
+        ),
+    )
+
+
+def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
+    # Positions show a turn on the spot only by the curve that follows it.
+    moves = [SHORT, setup.ahead(-setup.to_middle), SHORT]
+    for rate, bend in PETALS:
+        moves += [setup.spin(rate, TURN_RAD / abs(rate)), SHORT]
+        moves += _there_and_back(setup, bend)
+    return (
+        _straight(setup),
+        Leg(
+            "turns",
+            "It drives back to the middle; then, again and again, it turns a part on the spot and "
+            "drives a curve there and back.",
+            tuple(moves),
+        ),
+    )
+
+
+def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
+    """Return a curve from the middle that stays on the floor in any direction, and its way back."""
+    metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
+    return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
+
+
+WHEELBASE = Ask(
+    "How far apart are the front left and the rear left wheel, axle to axle?", "mm", 50, 2000,
+    name="wheelbase",
+)  # fmt: skip
+REAR_WIDTH = Ask(
+    "How far apart are the robot's rear corners, where they touch the wall?", "mm", 50, 2000,
+    name="rear width",
+)  # fmt: skip
+FRONT_WIDTH = Ask("And its front corners?", "mm", 50, 2000, name="front width")
+WIDTH = Ask("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
+
+WAYS: dict[str, Way] = {
+    "gyro": Way(_gyro),
+    "positions": Way(_positions),
+    "tape": Way(_tape, (WHEELBASE,), "a tape"),
+    "wall": Way(_wall, (REAR_WIDTH, FRONT_WIDTH), "a wall"),
+    "umbmark": Way(_umbmark, (WIDTH,), "UMBmark"),
 }

@@ -226,14 +226,14 @@ def _endpoint_problems(config: Config, key: str) -> list[str]:
         elif endpoint.startswith("tls/"):
             if not bus.tls:
                 found.append(
-                    f"{where}: needs certificates; `acsard lan init` makes them and prints the "
+                    f"{where}: needs certificates; `acsard tls init` makes them and prints the "
                     "bus.tls to write"
                 )
         elif not _is_loopback(host) and not bus.insecure:
             found.append(
                 f"{where}: leaves this machine, but it has no encryption and no access control; "
                 "use 127.0.0.1 (a laptop connects through an SSH tunnel), use "
-                'certificates (`acsard lan init`, then "tls/…"), or accept that anyone there '
+                'certificates (`acsard tls init`, then "tls/…"), or accept that anyone there '
                 "can drive the robot: bus.insecure = true"
             )
     return found

@@ -56,7 +56,7 @@ LIVE: dict[str, Live] = {
     "limits.linear_jerk": Live("always", "how fast the acceleration may grow"),
     "limits.angular_jerk": Live("always", "how fast the acceleration of a turn may grow"),
     "limits.wheel_speed": Live("rest", "highest speed of any wheel"),
-    "commands.pause": Live(
+    "commands.neutral_pause": Live(
         "rest", "time without a speed that must follow a zero of a shared sender identity"
     ),
     "commands.sources.*.timeout": Live("rest", "silence after which the source is stale"),

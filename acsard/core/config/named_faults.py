@@ -19,8 +19,8 @@ from acsard.core.config.validation import show
 FAULTS = (
     "mute", "noise", "partial_line", "slow_reply", "sparse_replies", "spaces", "unpadded",
     "trailing_comma", "comma_latched", "no_check", "plain_only", "no_sample", "no_watchdog",
-    "late_watchdog", "fed_by_anything", "lost_replies", "lost_commands", "bit_errors", "unprompted",
-    "ftdi",
+    "late_watchdog", "watchdog_fed_by_bad_lines", "lost_replies", "lost_commands", "bit_errors",
+    "free_running", "ftdi",
 )  # fmt: skip
 """Faults without arguments."""
 
@@ -28,7 +28,7 @@ ARGUMENTS = {
     "stuck_encoder": "m", "frozen_encoder": "m", "dead_motor": "m", "reversed_motor": "m",
     "reversed_encoder": "m",
     "reversed_wheel": "m", "swapped_motors": "mm", "swapped_encoders": "mm",
-    "swapped_wheels": "mm", "bias": "mn", "other_baud": "n",
+    "swapped_wheels": "mm", "bias": "mn", "wrong_baud": "n",
     "pushed": "n", "stalls": "nn",
 }  # fmt: skip
 """Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
@@ -80,7 +80,7 @@ def named(text: str) -> NamedFault:
             "give the seconds from one stall to the next, then fewer seconds for each stall; "
             f"both at least {SHORTEST_S}"
         )
-    if name == "other_baud" and fault.values[0] not in get_args(Baud):
+    if name == "wrong_baud" and fault.values[0] not in get_args(Baud):
         raise ValueError(f"rates are {', '.join(map(str, get_args(Baud)))}")
     return fault
 

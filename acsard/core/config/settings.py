@@ -200,7 +200,7 @@ class Source(Struct, frozen=True):
 
 class CommandsConfig(Struct, frozen=True):
     neutral_first: bool = True
-    pause: Annotated[float, Meta(ge=0.5, le=60.0, extra={"unit": "s"})] = 1.0
+    neutral_pause: Annotated[float, Meta(ge=0.5, le=60.0, extra={"unit": "s"})] = 1.0
     sources: tuple[Source, ...] = (
         Source("teleop", 100),
         Source("app", 50),

@@ -15,7 +15,7 @@ from msgspec import Struct
 from acsard.core.incoming.commands import Arrival
 from acsard.core.incoming.queries import Query, Reply
 from acsard.core.messages.encodings import DecodeError, Decoder
-from acsard.core.messages.schema import DoorState, Message
+from acsard.core.messages.schema import GatewayState, Message
 from acsard.core.values import Event, RoutersStatus
 
 
@@ -72,16 +72,16 @@ class Bus(Protocol):
         """End the query of this ticket: it gets no more replies."""
 
 
-DOOR_KEY = "door"
+GATEWAY_KEY = "gateway"
 
-_decoder = Decoder(DoorState)
+_decoder = Decoder(GatewayState)
 
 
-class DoorTold:
+class GatewayTold:
     """Follower of the TLS gateway's reports, also across restarts of the gateway."""
 
     def __init__(self) -> None:
-        self._last = DoorState(0, 0, 0)
+        self._last = GatewayState(0, 0, 0)
 
     def hear(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
         """Count the news in a report.
@@ -94,10 +94,10 @@ class DoorTold:
             return None  # only local programs may write on this key, so a bad report is ignored
         last = self._last
         if told.opened != last.opened:
-            counters["door_opened"] += 1
-            last = DoorState(told.opened, 0, 0)
-        if told.crowded > last.crowded:
-            counters["door_crowded"] += told.crowded - last.crowded
+            counters["gateway_opened"] += 1
+            last = GatewayState(told.opened, 0, 0)
+        if told.full > last.full:
+            counters["gateway_full"] += told.full - last.full
         self._last = told
         return told.certificate_ends or None
 
@@ -129,7 +129,7 @@ class RoutersTold:
             events.append(Event("router_found", _words("connected to", come)))
         peers = [one for one in status.peers if one not in before.peers]
         if peers:
-            events.append(Event("no_router", f"{', '.join(peers)} {PEER}", "warning"))
+            events.append(Event("not_a_router", f"{', '.join(peers)} {PEER}", "warning"))
 
 
 def _words(what: str, endpoints: list[str]) -> str:

@@ -108,7 +108,7 @@ def reading(arrival: Arrival) -> GyroSample:
         raise DecodeError("wrong_shape", f"a variance of {variances[8]:g}")
     if max(map(abs, said[:3])) > MAX_RATE or variances[8] > MAX_RATE**2:
         raise DecodeError(
-            "absurd", f"over {MAX_RATE:g} rad/s, or a variance above the square of that"
+            "out_of_range", f"over {MAX_RATE:g} rad/s, or a variance above the square of that"
         )
     stamp_ns = got.header.stamp.to_ns()
     return GyroSample(arrival.arrived_ns, stamp_ns if stamp_ns > 0 else None, rate.z, variances[8])

@@ -63,10 +63,10 @@ def unseal(line: bytes) -> Checked:
     match = _REPLY.fullmatch(line)
     if match is None:
         has_suffix = b"#" in line or b"*" in line
-        raise FrameError("wrong_check" if has_suffix else "unchecked", line)
+        raise FrameError("crc_error" if has_suffix else "without_crc", line)
     plain, sequence, sample, crc = match.groups()
     if binascii.crc_hqx(line[:-5], 0) != int(crc, 16):
-        raise FrameError("wrong_check", line)
+        raise FrameError("crc_error", line)
     return Checked(plain, int(sequence, 16), None if sample is None else _reading(sample))
 
 

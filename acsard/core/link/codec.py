@@ -24,7 +24,7 @@ MAX_SPEED = 99.99
 """rad/s, the largest number with two integer digits and two decimals."""
 
 Reason = Literal[
-    "malformed", "wheel_twice", "over_range", "unchecked", "wrong_check", "stale_sequence"
+    "malformed", "duplicate_wheel", "over_range", "without_crc", "crc_error", "stale_sequence"
 ]
 
 _TOKEN = rb"([abcd][pn])([0-9]{1,2}\.[0-9]{1,3})"
@@ -107,7 +107,7 @@ class Codec:
             wheel[index] = speed * sign
         front_right, front_left, rear_left, rear_right = wheel
         if front_right is None or front_left is None or rear_left is None or rear_right is None:
-            raise FrameError("wheel_twice", line)
+            raise FrameError("duplicate_wheel", line)
         return WheelSpeeds(front_right, front_left, rear_left, rear_right)
 
 

@@ -29,9 +29,6 @@ LATEST_MS = 1000.0
 """Delay of a line in ms above which the delay is not tracked. The session starts over after such a
 gap anyway."""
 
-DRIFT = 0.01
-"""Relative drift between the two clocks that is allowed. A ceramic resonator has half of it."""
-
 Unknown = Literal["unknown", "leap", "restarted"]
 """The reason why a difference is unusable. "unknown": there is no earlier reading, or it is too
 old. "leap": no motor can have turned so far. "restarted": the board has been powered on again."""
@@ -63,7 +60,7 @@ class Encoders:
         self._fastest = wheel_speed / math.tau * counts / 1000
         self._early_ms = quiet_ns * 1000 / NS_PER_S
         self._last: tuple[Reading, int] | None = None
-        self._promptest = MinimumDelay(DRIFT, LATEST_MS)
+        self._promptest = MinimumDelay(most=LATEST_MS)
         """The least delay of a reading, in ms."""
 
     def forget(self) -> None:

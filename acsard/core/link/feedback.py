@@ -3,8 +3,8 @@
 The time between two samples comes from the best clock that is available:
 
 - the board's own clock, if the board sends it with its counts;
-- the lines that left, if the board answers each one (`clock_of_answers.py`);
-- the period of a free-running board (`clock_of_reports.py`), where `habit.py` detects which of the
+- the lines that left, if the board answers each one (`sample_time.py`);
+- the period of a free-running board (`sample_time.py`), where `ReplyStyle` detects which of the
   two kinds the board is;
 - otherwise the times of the reads, spread evenly over the lines of a read.
 
@@ -12,8 +12,6 @@ The time between two samples comes from the best clock that is available:
 """
 
 from __future__ import annotations
-
-from typing import Literal
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -23,9 +21,7 @@ from acsard.core.config.wire_time import PLAIN_BYTES, wire_ns
 from acsard.core.link.check import Reading
 from acsard.core.link.codec import Codec, Motors
 from acsard.core.link.encoders import Encoders, Turned
-from acsard.core.link.free_running_times import BRIDGED_S, Slots
-from acsard.core.link.prompted_times import Prompts
-from acsard.core.link.reply_style import ReplyStyle
+from acsard.core.link.sample_time import BRIDGED_S, FreeRunningTimes, Placed, PromptedTimes
 from acsard.core.values import NS_PER_S, Instant, WheelSpeeds
 
 APART_NS = 1000
@@ -37,6 +33,25 @@ LATER = 0.05
 
 FULL_READ = 1024
 """Bytes of a full read of the port. After a full read more data may wait."""
+
+DIFFERS = 1.5
+"""Difference between periods and lines sent since the last read that scheduling does not cause."""
+
+TELLING = 2.5
+"""Difference between the two sums that is needed for a decision."""
+
+LATEST = 100.0
+"""Periods since the last read. After more, the read is ignored."""
+
+CLEAR = 0.5
+"""Share of the sums' difference by which one sum must be nearer to the received lines."""
+
+AFTER = 3
+"""Number of reads after a differing one that belong to it."""
+
+NEAR = 0.35
+"""Largest distance of the nearer sum from the received lines, as a share of these: lines are lost
+too."""
 
 
 class Feedback(Struct, frozen=True, gc=False):
@@ -64,26 +79,59 @@ class Feedback(Struct, frozen=True, gc=False):
     """Monotonic time at which the line was complete here."""
     counted: Motors | None = None
     """Angle that each wheel turned in `dt` without `bridged`, rad in `WHEELS` order. None unless
-    the speeds show whole counts (`snapping.py`)."""
+    the speeds show whole counts (`quantization.py`)."""
     steps: Motors = (0.0, 0.0, 0.0, 0.0)
     """Step of each wheel's reported speed that its encoder causes, rad/s, `math.inf` if unknown."""
 
 
-class Placed(Struct, frozen=True, gc=False):
-    """The place of a line on one of the clocks; `due_ns` is when it was due to be complete here."""
+class ReplyStyle:
+    """Detects whether the board reports by its own clock or answers the daemon's lines.
 
-    clock: Literal["slots", "prompts", "reads"]
-    due_ns: int
-    dt: float | None = None
-    """Seconds since the last line by the same clock, None for the first line."""
-    bridged: float = 0.0
-    """Seconds of `dt` that no line reported."""
-    place: float = 0.0
-    """Slot of the line on the clock with the number `found`."""
-    found: int = 0
-    early: bool = False
-    """Whether the line came before it was due. Then `due_ns` is its arrival, and the time to the
-    next line is the difference of their `due_ns`."""
+    While the daemon sends one line per period, both look alike. Sometimes it sends more or fewer
+    lines: the host stood still, or a command's line went at once. Then the number of lines received
+    follows either the periods that passed or the lines that left. The decision compares both sums
+    with the lines received, over the reads in which they differ and over the next few, which bring
+    the lines that an adapter still held.
+    """
+
+    def __init__(self, speaks: bool) -> None:
+        """Start. With `speaks` the configuration says that the board reports by its own clock."""
+        self.speaks: bool | None = speaks or None
+        """True if the board reports by its own clock, False if it answers, None while unknown."""
+        self._known = speaks
+        self._left = self._after = 0
+        self._came = self._periods = self._asked = 0.0
+
+    def left(self) -> None:
+        """Note that a command line left."""
+        self._left += 1
+
+    def read(self, lines: int, periods: float) -> None:
+        """Take a read of `lines` lines, `periods` reply periods after the last read."""
+        left, self._left = self._left, 0
+        if self._known or periods > LATEST:
+            return
+        if abs(periods - left) >= DIFFERS:
+            self._after = AFTER
+        elif self._after:
+            self._after -= 1
+        else:
+            return
+        self._came += lines
+        self._periods += periods
+        self._asked += left
+        came, own, asked = (
+            self._came,
+            abs(self._came - self._periods),
+            abs(self._came - self._asked),
+        )
+        apart = abs(self._periods - self._asked)
+        if apart < TELLING or abs(own - asked) < CLEAR * apart:
+            return
+        if min(own, asked) <= max(1.5, NEAR * came):
+            self.speaks = own < asked
+        self._came = self._periods = self._asked = 0.0
+        self._after = 0
 
 
 class Timeline:
@@ -108,14 +156,14 @@ class Timeline:
         self._encoders = Encoders(mcu.encoder_counts, wheel_speed, quiet_ns)
         self._counts = mcu.encoder_counts
         known = (mcu.reply_period,) if mcu.reply_period else ()
-        self._slots = Slots((*known, 1 / rate_hz))
+        self._slots = FreeRunningTimes((*known, 1 / rate_hz))
         self._period_ns = NS_PER_S * (mcu.reply_period or 1 / rate_hz)
-        self._prompts = Prompts(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
-        self._habit = ReplyStyle(mcu.reply_period > 0)
+        self._prompts = PromptedTimes(wire_ns(2 * PLAIN_BYTES, mcu.baud_rate))
+        self._style = ReplyStyle(mcu.reply_period > 0)
         self._last: Instant | None = None
         self._heard_ns = self._end_ns = 0
         self._forgotten = True
-        self._told = Placed("reads", 0)
+        self._last_placed = Placed("reads", 0)
         """The place of the last good line."""
         self._later = 0.0
         """How much later a reply is due by its line than by the slots, mean in ns."""
@@ -134,7 +182,7 @@ class Timeline:
     def left(self, made_ns: int) -> None:
         """Note that a command line left that was made at `made_ns`."""
         self._prompts.left(made_ns)
-        self._habit.left()
+        self._style.left()
 
     def read(self, at: Instant, size: int, lines: int, following: int) -> None:
         """Take a read of `size` bytes that completes `lines` lines.
@@ -147,11 +195,11 @@ class Timeline:
         end_ns = self._end_ns = max(before, end_ns)
         self._at, self._rest = at, lines
         self._share_ns = (end_ns - before) / lines
-        habit, slots = self._habit, self._slots
-        if habit.speaks is not False:
+        style, slots = self._style, self._slots
+        if style.speaks is not False:
             slots.read(end_ns, lines, size < FULL_READ)
-        habit.read(lines, (end_ns - before) / self._usual_ns)
-        if habit.speaks is False:
+        style.read(lines, (end_ns - before) / self._usual_ns)
+        if style.speaks is False:
             slots.forget()
         self._prompts.read(end_ns, lines)
 
@@ -161,7 +209,7 @@ class Timeline:
         A prompted board still made it as a reply.
         """
         self._rest -= 1
-        if not self._habit.speaks:
+        if not self._style.speaks:
             self._prompts.skip()
 
     def place(
@@ -190,13 +238,13 @@ class Timeline:
             came_ns -= wire_ns(following, self._baud_rate)
         came_ns = max(came_ns, self._heard_ns)
         since, self._heard_ns = (came_ns - self._heard_ns) / NS_PER_S, came_ns
-        told = self._told_by(asked_ns, came_ns)
-        dt, bridged = self._since_last(told)
+        placed = self._placed(asked_ns, came_ns)
+        dt, bridged = self._since_last(placed)
         first = self._last is None
         turned, wheels = self._turned(reading, came_ns), None
         # A prompted board makes no line unless it is asked, so a silence of the host leaves no line
         # missing.
-        clocked = told.clock != "reads" or self._prompts.lossy
+        clocked = placed.clock != "reads" or self._prompts.lossy
         known = clocked or not silent or dt * NS_PER_S <= self._quiet_ns
         if turned is not None:
             dt, bridged, since, known = turned.dt, 0.0, turned.dt, not silent
@@ -205,68 +253,60 @@ class Timeline:
         if self._forgotten or self.restarted or not known or dt >= BRIDGED_S:
             gap = 0.0 if first else max(since, dt)
             self._share_ns = min(self._share_ns, wire_ns(length, self._baud_rate))
-            self._told = self._told_by_reads() if told.clock == "reads" else told
+            self._last_placed = self._placed_by_reads() if placed.clock == "reads" else placed
             dt = bridged = since = 0.0
         self._forgotten = False
-        at = self._sampled(came_ns, self._told, length)
+        at = self._sampled(came_ns, self._last_placed, length)
         since = 0.0 if silent else since
         return Feedback(at, speeds, dt, gap, wheels, bridged, asked_ns, since, came_ns)
 
-    def _told_by(self, asked_ns: int | None, came_ns: int) -> Placed:
+    def _placed(self, asked_ns: int | None, came_ns: int) -> Placed:
         """Return the place of the next line on the best available clock."""
-        speaks, slots = self._habit.speaks, self._slots
+        speaks, answered = self._style.speaks, None
         if asked_ns is not None or not speaks:
-            answered = self._prompts.answer(asked_ns)
-            prompts = self._prompts
-            ours = asked_ns is not None or speaks is False or prompts.thinks
+            answered = self._prompts.place(asked_ns)
+            ours = asked_ns is not None or speaks is False or self._prompts.thinks
             if ours and answered is not None:
                 if answered.due_ns - came_ns > self._usual_ns / 2:
                     # The usual delay comes from a first reply that was read late, during a stall
                     # that the line before has already counted. This line's time is therefore its
                     # arrival.
                     return Placed("prompts", came_ns, early=True)
-                return Placed("prompts", answered.due_ns, answered.dt, answered.bridged)
-        else:
-            answered = None
-        if slots.period is None:
-            return self._told_by_reads()
-        place, slot_ns, last = slots.place(self._rest), slots.time_ns(self._rest), self._told
-        due_ns = min(slot_ns, came_ns)
+                return answered
+        slot = self._slots.place(self._rest)
+        if slot is None:
+            return self._placed_by_reads()
         if answered is not None:
-            self._compare(answered.due_ns - slot_ns)
-        if last.clock != "slots" or last.found != slots.found:
-            return Placed("slots", due_ns, place=place, found=slots.found)
-        passed = place - last.place if place > last.place else 0.0
-        missing = passed - 1.0 if passed > 1.0 else 0.0
-        dt, bridged = passed * slots.period, missing * slots.period
-        return Placed("slots", due_ns, dt, bridged, place, slots.found)
+            self._compare(answered, slot)
+        return slot if slot.due_ns <= came_ns else replace(slot, due_ns=came_ns)
 
-    def _told_by_reads(self) -> Placed:
+    def _placed_by_reads(self) -> Placed:
         return Placed("reads", int(self._end_ns - self._share_ns * self._rest))
 
-    def _since_last(self, told: Placed) -> tuple[float, float]:
+    def _since_last(self, placed: Placed) -> tuple[float, float]:
         """Return the time since the last good line, and the part of it that no line reported, s.
 
         If different clocks placed the two lines, the host times of both decide, so changes of the
         clock do not add up.
         """
-        last = self._told
-        back = told.due_ns < last.due_ns
-        self._told = replace(told, due_ns=last.due_ns) if back else told
-        by_clock = told.dt if told.clock == last.clock else None
+        last = self._last_placed
+        back = placed.due_ns < last.due_ns
+        self._last_placed = replace(placed, due_ns=last.due_ns) if back else placed
+        by_clock = placed.dt if placed.clock == last.clock else None
         if by_clock is not None and not last.early:
-            return by_clock, told.bridged
-        late_ns = self._late_ns(told.clock) - self._late_ns(last.clock)
-        dt = max(0.0, (told.due_ns - last.due_ns - late_ns) / NS_PER_S)
+            return by_clock, placed.bridged
+        late_ns = self._late_ns(placed.clock) - self._late_ns(last.clock)
+        dt = max(0.0, (placed.due_ns - last.due_ns - late_ns) / NS_PER_S)
         if by_clock is not None:
-            return dt, told.bridged
+            return dt, placed.bridged
         period = self._usual_ns / NS_PER_S
-        missing = dt > 1.5 * period and self._habit.speaks is not False
+        missing = dt > 1.5 * period and self._style.speaks is not False
         return dt, dt - period if missing else 0.0
 
-    def _compare(self, later_ns: int) -> None:
+    def _compare(self, answered: Placed, slot: Placed) -> None:
         """Update the mean by which replies are due later by their lines than by the slots."""
-        if self._told.found != self._slots.found:
+        later_ns = answered.due_ns - slot.due_ns
+        if slot.dt is None or self._last_placed.clock != "slots":
             self._later = float(later_ns)
         self._later += LATER * (later_ns - self._later)
 
@@ -280,9 +320,9 @@ class Timeline:
     def _usual_ns(self) -> float:
         return self._slots.usual or self._period_ns
 
-    def _sampled(self, came_ns: int, told: Placed, length: int) -> Instant:
+    def _sampled(self, came_ns: int, placed: Placed, length: int) -> Instant:
         """Return when the sample of a line was taken: before its own bytes were on the wire."""
-        mono_ns = min(came_ns, told.due_ns) - wire_ns(length, self._baud_rate)
+        mono_ns = min(came_ns, placed.due_ns) - wire_ns(length, self._baud_rate)
         last, read = self._last, self._at
         wall_ns = read.wall_ns - read.mono_ns + mono_ns
         if last is not None and mono_ns < last.mono_ns + APART_NS:

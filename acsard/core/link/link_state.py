@@ -42,12 +42,14 @@ WORDS: dict[State, str] = {
     "stale": "the microcontroller has fallen silent",
 }
 
+WATCHDOG_S = 0.3
+"""Seconds after the last valid line at which the board stops the motors by itself."""
+
 GOOD_LINES = 3
 """Good lines before the link is trusted. A board that just reset may print anything for a while."""
 
 BAD_LINES = 5
 """Bad lines in a row after which a checked link asks for the check again."""
-
 
 SPARSE = 2
 """Silences in a row, each ended by one good line, that make the lines sparse. A single one is a

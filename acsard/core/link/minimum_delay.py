@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import math
 
+DRIFT = 0.01
+"""Relative drift between two clocks that is allowed. A ceramic resonator has half of it."""
+
 
 class MinimumDelay:
     """The lateness of the last event, in the caller's unit of time."""
 
-    def __init__(self, drift: float, most: float = math.inf) -> None:
+    def __init__(self, drift: float = DRIFT, most: float = math.inf) -> None:
         """Start.
 
         `drift` is the relative drift of the clocks, and a lateness above `most` counts as `most`.

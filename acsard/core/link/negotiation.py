@@ -9,8 +9,12 @@
 - checked: a correct reply to a line has come. From now on only correct replies count.
 - sampled: checked, and the replies bring the encoder counts that the lines ask for.
 
-This module knows sequences and questions, but not speeds. A board that has once answered with the
-check is not believed without it until the port is reopened, because noise must not end the check.
+A board that has once answered with the check is not believed without it until the port is reopened,
+because noise must not end the check.
+
+The module also recognizes lines that only come back, because TX and RX are joined or the far end
+echoes. A question that comes back shows it at once, because no reply carries the letters of a
+question. For plain lines `EchoDetector` shows it.
 """
 
 from __future__ import annotations
@@ -22,9 +26,8 @@ from acsard.core.config.settings import McuConfig
 from acsard.core.config.wire_time import line_bytes, wire_ns
 from acsard.core.link.check import ASK_NOTHING, ASK_SAMPLE, SEQUENCES, Checked, seal
 from acsard.core.link.codec import FrameError
-from acsard.core.link.contract import WATCHDOG_S
-from acsard.core.link.throttle import Throttle
-from acsard.core.values import NS_PER_S
+from acsard.core.link.link_state import WATCHDOG_S
+from acsard.core.values import NS_PER_S, WheelSpeeds
 
 State = Literal["off", "waking", "asking", "plain", "checked", "sampled"]
 Sign = Literal["gap", "heard", "answer", "sample", "refusal", "samples_end"]
@@ -104,6 +107,92 @@ THINKING_NS = 30_000_000
 FEW_SAMPLES = 5
 """Correct replies in a row without the requested sample, after which samples no longer come."""
 
+REPORTS = 20
+"""Equal reports in a row: 0.2 s at 100 Hz."""
+
+CHANGE = 2.0
+"""rad/s; sum of the changes among them, of the wheel that changes most. A small one alone may be a
+coincidence of coarse encoders."""
+
+LINES = 8
+"""Lines that a report is compared with: an echo that comes back within 70 ms at 100 Hz is found."""
+
+_Run = tuple[int, float, WheelSpeeds]
+"""The equal reports in a row, the sum of their changes, and the speeds of the last one."""
+
+
+class Throttle:
+    """A limiter that passes one event and the next only after a given time."""
+
+    def __init__(self) -> None:
+        self.last_ns: int | None = None
+        """Monotonic time of the last event that passed, None before the first."""
+        self._before_ns: int | None = None
+
+    def lets(self, now_ns: int, wait_ns: int) -> bool:
+        """Return whether an event may pass now, `wait_ns` after the last.
+
+        If so it becomes the last.
+        """
+        if self.last_ns is not None and now_ns - self.last_ns < wait_ns:
+            return False
+        self._before_ns, self.last_ns = self.last_ns, now_ns
+        return True
+
+    def undo(self) -> None:
+        """Forget the last event, because its line did not leave. The next line need not wait."""
+        self.last_ns = self._before_ns
+
+
+class EchoDetector:
+    """Recognizes a run of plain reports that only repeat sent lines.
+
+    A plain reply has the same form as a command, so an echo looks like a board that reports exactly
+    the speeds it was sent. An echo is a run of `REPORTS` reports, each equal byte for byte to one
+    of the last `LINES` lines, always the same number of lines before. The changes of speed in the
+    run add up to `CHANGE`. At rest every board looks like an echo, and nothing is decided.
+
+    A board that measures is not taken for an echo, because its wheels lag behind the lines in
+    another way than by a whole number of lines. In simulated drives with accelerations of 0.1 to
+    100 m/s2 and encoders of up to 1,000,000 counts a turn, equal reports in a row covered at most
+    0.04 rad/s of changes if the motors lag by 2 ms or more. A board that reports its set points,
+    or a simulator whose wheels have no lag at all, looks exactly like an echo. The daemon then
+    drives nothing until the port is opened again, and says why.
+    """
+
+    def __init__(self) -> None:
+        self.forget()
+
+    def forget(self) -> None:
+        """Start over: the port has been opened."""
+        self._sent: deque[tuple[int, bytes]] = deque(maxlen=LINES)
+        """The last lines, each with its number."""
+        self._lines = self._reports = 0
+        self._runs: dict[int, _Run] = {}
+        """By the number of a report minus that of its line, which no delay of an echo changes."""
+
+    def left(self, line: bytes) -> None:
+        """Note that this line left, with its end."""
+        self._lines += 1
+        self._sent.append((self._lines, line.removesuffix(b"\r\n")))
+
+    def report(self, line: bytes, speeds: WheelSpeeds) -> bool:
+        """Take a report without its end, and the speeds in it; return whether it is an echo."""
+        self._reports += 1
+        runs: dict[int, _Run] = {}
+        first, found = (0, 0.0, speeds), False
+        for number, sent in self._sent:
+            if line == sent:
+                offset = self._reports - number
+                equal, change, before = self._runs.get(offset, first)
+                if before != speeds:
+                    pairs = zip(before.as_tuple(), speeds.as_tuple(), strict=True)
+                    change += max([abs(now - then) for then, now in pairs])
+                runs[offset] = equal + 1, change, speeds
+                found = found or (equal + 1 >= REPORTS and change >= CHANGE)
+        self._runs = runs
+        return found
+
 
 class Negotiation:
     """The negotiation of the check. It asks, seals lines, and matches replies with lines."""
@@ -129,6 +218,7 @@ class Negotiation:
         """Sequences and times of the lines that left and are not answered."""
         self._knows = False
         self._without = 0
+        self._echo = EchoDetector()
         self._begin(fresh=True)
 
     @property
@@ -155,6 +245,7 @@ class Negotiation:
         self._begin(fresh)
         if fresh:
             self.trouble, self._knows, self._question = "", False, b""
+            self._echo.forget()
 
     def _begin(self, fresh: bool) -> None:
         self._pending.clear()
@@ -190,6 +281,10 @@ class Negotiation:
         self._question = line.removesuffix(b"\r\n") if letters else b""
         return line
 
+    def left(self, line: bytes) -> None:
+        """Note that this line left, with its end."""
+        self._echo.left(line)
+
     def settle(self, went: bool) -> None:
         """Note whether the last line left. No answer can come to a line that did not."""
         if self._made is not None and went:
@@ -221,9 +316,11 @@ class Negotiation:
         """Whether every received line counts as an echo, until the port is reopened."""
         return self.trouble == "echo"
 
-    def found_echo(self) -> None:
-        """Note that plain lines were found to be an echo."""
-        self.trouble = "echo"
+    def repeated(self, line: bytes, speeds: WheelSpeeds) -> bool:
+        """Take a plain report; return whether it and the reports before it are an echo."""
+        if self._echo.report(line, speeds):
+            self.trouble = "echo"
+        return self.echoes
 
     def heard_plain(self) -> None:
         """Note a whole plain line while asking.

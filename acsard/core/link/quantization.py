@@ -1,10 +1,10 @@
 """Detects the quantization of the reported speeds and recovers whole encoder counts from them.
 
-If a wheel's speeds lie on a lattice (`lattice.py`), each speed is a whole number of counts. With
-the firmware's period it is then an exact angle, so a line tells exactly how far the wheel turned.
-The period by which a firmware divides is a round number near the mean period of its lines. It is
-proven if it makes the counts per turn whole. Each wheel has an encoder of its own
-(`wheel_counter.py`).
+If a wheel's speeds are multiples of a quantization step (`quantization_step.py`), each speed is a
+whole number of counts. With the firmware's period it is then an exact angle, so a line tells
+exactly how far the wheel turned. The period by which a firmware divides is a round number near the
+mean period of its lines. It is proven if it makes the counts per turn whole. Each wheel has an
+encoder of its own.
 
 The counts are trusted while they agree with the times of the lines. If the firmware starts to
 report in another way, or the port is reopened, learning starts over.
@@ -12,11 +12,41 @@ report in another way, or the port is reopened, learning starts over.
 
 from __future__ import annotations
 
+import math
+
 from msgspec.structs import replace
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.wheel_counter import WheelCounter
+from acsard.core.link.quantization_step import FINEST, ROUNDING, Quantization, Search, on
+
+FLICKER = 0.0105
+"""rad/s. A smaller step is only rounding."""
+
+BLOCK = 64
+"""Steps that are examined together: enough for three counts even if a filter smooths few counts."""
+
+FIRST = 24
+"""Steps of the first block after which `size` has a first value, which may still grow."""
+
+RECUR = 3
+"""Number of steps of a block that must reach a size. One damaged line makes two."""
+
+LEARNED_FROM = 100
+"""Changes of a wheel's speed before a lattice is searched."""
+
+MOST_SEEN = 256
+"""Different speeds remembered, which bounds a search."""
+
+MOST_TOLD = 512
+"""Different speeds whose rounding is corrected later: as many as 10 000 counts a turn make."""
+
+OWED_FOR = 3000
+"""Lines after which the owed correction is dropped, because it belongs to another place."""
+
+LONGEST_WAIT = 128 * LEARNED_FROM
+"""Largest number of changes between two searches of speeds without a lattice: minutes of
+driving."""
 
 LOOK = 50
 """Lines from one check of the findings to the next."""
@@ -48,7 +78,149 @@ look like steps too, and only proven counts may be coarser than this."""
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 
 
-class Snapping:
+class Steps:
+    """The step of one wheel's reported speed from line to line that its encoder causes.
+
+    One count more or less in a period is a step of 2 pi / (counts T): 31 rad/s at 20 counts a turn
+    and 100 Hz. It is not an acceleration. The size is learned from the reports, so it holds for any
+    firmware, whether it divides counts by its nominal period or by the measured time, or filters
+    them. Steps that come from counts recur. A damaged line makes only two, one there and one back.
+
+    `size` is in rad/s, `math.inf` until enough steps were seen.
+    """
+
+    def __init__(self) -> None:
+        self.size = math.inf
+        self._before = math.inf
+        self._last = 0.0
+        self._largest = [0.0] * RECUR
+        self._count = 0
+
+    def add(self, speed: float) -> None:
+        """Take the next reported speed, rad/s."""
+        step = abs(speed - self._last)
+        if step < FLICKER:
+            return
+        self._last = speed
+        largest = self._largest
+        if step > largest[0]:
+            largest[0] = step
+            largest.sort()
+            if largest[0] > self.size:
+                self.size = largest[0]
+        self._count += 1
+        if self._count == FIRST and self.size == math.inf:
+            self.size = largest[0]
+        if self._count == BLOCK:
+            # At its start a block has seen too little, so the size of the block before still
+            # counts.
+            self._before, self._count = largest[0], 0
+            self.size, self._largest = self._before, [0.0] * RECUR
+
+
+class WheelCounter:
+    """The encoder of one wheel; `counts` per turn, 0 until they are known.
+
+    It learns from changes of the speed, because a steady speed repeats one value. When the counts
+    are known, each speed is an angle of whole counts, without a rounding error. The error until
+    then is corrected afterwards, from the number of times that each speed was reported.
+    """
+
+    def __init__(self) -> None:
+        self.counts = self.off = 0
+        self.quantum = self.angle = 0.0
+        """One count in a period, as a speed in rad/s and as an angle in rad."""
+        self.steps = Steps()
+        self.lattice: Quantization | None = None
+        self._search: Search | None = None
+        self._told: dict[float, int] | None = {}
+        """How often each speed was reported before the counts were known, forward minus backward.
+        None if there were too many different speeds."""
+        self._owing = 0
+        """Number of lines in `_told`."""
+        self._last = 0.0
+        self._seen: dict[float, int] = {}
+        self._missing = self._patience = LEARNED_FROM
+        """Changes until the next search, and changes to the one after it."""
+
+    def learn(self, speed: float) -> None:
+        """Take the next report of a wheel whose counts are unknown."""
+        self._owing += 1
+        if self._owing > OWED_FOR:
+            self.forgive()
+        if speed and self._told is not None:
+            size, way = abs(speed), 1 if speed > 0 else -1
+            self._told[size] = self._told.get(size, 0) + way
+            if len(self._told) > MOST_TOLD:
+                self._told = None
+        if self._search is None and abs(speed - self._last) >= FLICKER:
+            self._last, size = speed, abs(speed)
+            self._missing -= 1
+            fresh = self._missing < LEARNED_FROM or self.lattice is not None
+            room = size in self._seen or len(self._seen) < MOST_SEEN
+            if fresh and room and size >= FINEST:
+                self._seen[size] = self._seen.get(size, 0) + 1
+            if self._missing <= 0 and self._seen:
+                self._search = Search(self._seen)
+
+    def go_on(self) -> bool:
+        """Continue the search, if one runs; return whether it has just found a lattice."""
+        if self._search is None:
+            return False
+        if not self._search.go_on():
+            return False
+        self.lattice, self._search = self._search.found, None
+        if self.lattice is None:
+            self._seen = {}
+        self._missing = self._patience
+        self._patience = min(2 * self._patience, LONGEST_WAIT)
+        return self.lattice is not None
+
+    def turned(self, speed: float, own: float, missing: float) -> float:
+        """Return the angle that the wheel turned in the `own` s of this line, rad.
+
+        The result includes `missing` s of lines that were lost before it.
+        """
+        if not self.counts:
+            self.steps.add(speed)
+            self.learn(speed)
+            return speed * own
+        whole = round(speed / self.quantum)
+        if abs(speed - whole * self.quantum) > ROUNDING:
+            self.off += 1
+            return speed * own
+        return whole * self.angle + speed * missing
+
+    def owed(self, period: float) -> float:
+        """Return the rounding error until the counts were known, rad. Call it once."""
+        told, self._told = self._told or {}, None
+        return math.fsum(
+            times * (round(speed / self.quantum) * self.angle - speed * period)
+            for speed, times in told.items()
+            if on(speed, self.quantum)
+        )
+
+    def forgive(self) -> None:
+        """Drop the correction for everything until now."""
+        self._owing = 0
+        if self._told is not None:
+            self._told = None if self.counts else {}
+
+    def show(self, period: float) -> bool:
+        """Return whether `period` s, as the firmware's divisor, makes the counts per turn whole.
+
+        If it does, adopt these counts.
+        """
+        counts = self.lattice.counts(period) if self.lattice and not self.counts else 0
+        if counts:
+            self.counts, self.angle = counts, math.tau / counts
+            self.quantum = self.angle / period
+            self.lattice = Quantization(self.quantum, 0.0)
+            self._search, self.off = None, 0
+        return self.counts > 0
+
+
+class CountRecovery:
     """The quantization of all wheels, learned from every good line of one port."""
 
     def __init__(self) -> None:

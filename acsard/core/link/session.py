@@ -13,20 +13,16 @@ from collections import Counter
 
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import FeedbackConfig, McuConfig
-from acsard.core.link import link_text
+from acsard.core.link import link_diagnosis
 from acsard.core.link.check import Reading, unseal
 from acsard.core.link.codec import Codec, FrameError
-from acsard.core.link.contract import WATCHDOG_S
-from acsard.core.link.echo import EchoDetector
 from acsard.core.link.feedback import Feedback, Timeline
-from acsard.core.link.host_stalls import Lateness
 from acsard.core.link.lines import LineReader
-from acsard.core.link.link_state import Link
+from acsard.core.link.link_diagnosis import Lateness, SilenceDiagnosis
+from acsard.core.link.link_state import WATCHDOG_S, Link
 from acsard.core.link.link_state import State as LinkState
-from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation
-from acsard.core.link.quantization import Snapping
-from acsard.core.link.silence_diagnosis import SilenceDiagnosis
-from acsard.core.link.throttle import Throttle
+from acsard.core.link.negotiation import BLIND_PERIOD_NS, MENDS, Negotiation, Throttle
+from acsard.core.link.quantization import CountRecovery
 from acsard.core.values import NS_PER_S, STILL, Event, EventName, Instant, Received, WheelSpeeds
 
 NAMES: dict[LinkState, EventName] = {
@@ -73,8 +69,7 @@ class McuSession:
         self._link = Link(self.quiet_ns)
         self.lateness = Lateness(mcu.simulated, self.quiet_ns)
         self._timeline = Timeline(mcu, self.codec, wheel_speed, self.quiet_ns, rate_hz)
-        self._echo = EchoDetector()
-        self.snapping = Snapping()
+        self.count_recovery = CountRecovery()
         self._hearing = SilenceDiagnosis()
         self._wants_samples, self._longest_reply = mcu.wants_samples, longest_reply
         self.rejects: Counter[str] = Counter()
@@ -180,9 +175,10 @@ class McuSession:
         if self.link == "down" and port_trouble:
             return port_trouble
         if self.blocked:
-            return link_text.BLOCKED
-        heard, late = self._hearing, self.lateness
-        return link_text.words(self._link, self.negotiation, heard, late, self._longest_reply)
+            return link_diagnosis.BLOCKED
+        return link_diagnosis.words(
+            self._link, self.negotiation, self._hearing, self.lateness, self._longest_reply
+        )
 
     @property
     def note(self) -> str:
@@ -202,7 +198,7 @@ class McuSession:
         self._held_up = not went
         if went:
             line, made_ns = made
-            self._echo.left(line)
+            self.negotiation.left(line)
             self._timeline.left(made_ns)
             self.restarted = self.blocked and made_ns - self._left_ns >= LONG_GAP_NS
             self._left_ns = made_ns
@@ -218,8 +214,7 @@ class McuSession:
             self._blind = Throttle()
         self._lines.clear()
         self._timeline.forget()
-        self._echo.forget()
-        self.snapping.forget()
+        self.count_recovery.forget()
         self._hearing.forget()
         self.negotiation.begin(fresh=True)
 
@@ -230,7 +225,7 @@ class McuSession:
         self._link.sign("restarted")
         self.restarted = self._starting_over = True
         self._timeline.forget()
-        self.snapping.forget()
+        self.count_recovery.forget()
         self.negotiation.begin()
 
     def _judge(self, now_ns: int) -> None:
@@ -281,12 +276,12 @@ class McuSession:
         if self._announced == before:
             return
         if link != before[0] or self.blocked > before[3]:
-            plain = not (self.blocked or link_text.damaged(self._link, check))
+            plain = not (self.blocked or link_diagnosis.damaged(self._link, check))
             text = self.lateness.words(link) if plain else self.words()
             good = link in ("up", "booting") and not self.blocked
             self.events.append(Event(NAMES[link], text, "info" if good else "warning"))
         if check.in_force != before[1] and not check.asking:
-            self.events.append(link_text.check_event(check, self._wants_samples))
+            self.events.append(link_diagnosis.check_event(check, self._wants_samples))
         if check.trouble and not before[2]:
             self.events.append(Event("link_check", MENDS[check.trouble], "error"))
 
@@ -328,8 +323,7 @@ class McuSession:
                 asked_ns = check.answered(reply, read_at.mono_ns)
             else:
                 speeds = self.codec.decode(line)
-                if not asking and self._echo.report(line, speeds):
-                    check.found_echo()
+                if not asking and check.repeated(line, speeds):
                     self._link.sign("echo")
                     self._reject("echo")
                     return None
@@ -363,4 +357,4 @@ class McuSession:
             self._reject("count_leap", more=more)
         if self._timeline.restarted:
             self._restart("has restarted: its clock went back")
-        return self.snapping.look(feedback)
+        return self.count_recovery.look(feedback)

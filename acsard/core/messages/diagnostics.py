@@ -139,7 +139,8 @@ def _wheels(doubt: WheelsStatus, counters: dict[str, int]) -> Row:
         "front_more_right": f"{right:.3f}",
     }
     level, message = WARN if doubt.text else OK, doubt.text or "front and rear agree"
-    return Row("wheels", level, message, values | _counted(counters, "wheels"))
+    values |= _counted(counters, "wheel_fault") | _counted(counters, "uncommanded_motion")
+    return Row("wheels", level, message, values)
 
 
 def _gyro(config: Config, gyro: GyroStatus) -> list[Row]:

@@ -15,7 +15,7 @@ import msgspec
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import (
     MESSAGES,
-    DoorState,
+    GatewayState,
     Imu,
     JointState,
     Release,
@@ -27,7 +27,7 @@ from acsard.core.messages.schema import (
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = (Twist, SetPose, Release, Settings, DoorState)
+ONLY_IN = (Twist, SetPose, Release, Settings, GatewayState)
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 ENOUGH: dict[type, list[str]] = {

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 
 from msgspec import Struct
 
-from acsard.core.messages.schema import Events, Happening, Time
+from acsard.core.messages.schema import Events, LogEvent, Time
 from acsard.core.motion.event_throttle import together
 from acsard.core.values import NS_PER_S, Event, Instant
 
@@ -64,6 +64,6 @@ def _time(row: _Row) -> Time:
     return Time.from_ns(row.at.wall_ns)
 
 
-def _happening(row: _Row) -> Happening:
+def _happening(row: _Row) -> LogEvent:
     one = row.event
-    return Happening(_time(row), one.name, one.level, one.text, one.by, one.count)
+    return LogEvent(_time(row), one.name, one.level, one.text, one.by, one.count)

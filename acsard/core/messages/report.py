@@ -17,9 +17,9 @@ from acsard.core.messages.expiry import expiry
 from acsard.core.messages.recent_events import RecentEvents
 from acsard.core.messages.schema import (
     DiagnosticArray,
-    Figure,
     Header,
     JointState,
+    Latency,
     Message,
     Odometry,
     Pose,
@@ -230,20 +230,20 @@ class Report:
                 for s in snapshot.sources
             ],
             refused=snapshot.refused,
-            certificate=self._certificate(outputs.now)[1],
+            certificate_expiry=self._certificate(outputs.now)[1],
             counters=snapshot.counters,
-            figures={
-                name: Figure(_spread(one.since_start), _spread(one.last_minute))
+            latencies={
+                name: Latency(_spread(one.since_start), _spread(one.last_minute))
                 for name, one in snapshot.figures.items()
             },
             gyro=snapshot.gyro.does,
-            track=tracks(snapshot.gyro, self._config.drive.wheel_separation_multiplier),
-            encoders=list(snapshot.encoders),
-            doubt=snapshot.doubt.text,
+            effective_track=tracks(snapshot.gyro, self._config.drive.wheel_separation_multiplier),
+            encoder_counts=list(snapshot.encoders),
+            wheel_fault=snapshot.doubt.text,
             sender=snapshot.sender,
-            recording=snapshot.recording.trouble,
+            recording_error=snapshot.recording.trouble,
             latch=0 if outputs.latches.in_force is None else outputs.latches.in_force.number,
-            latch_file=snapshot.latch_file or "",
+            latch_file_error=snapshot.latch_file or "",
             feedback_age=snapshot.feedback_age_s,
         )
 

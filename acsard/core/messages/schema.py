@@ -203,8 +203,8 @@ class Spread(Message, frozen=True):
     max: float
 
 
-class Figure(Message, frozen=True):
-    """A duration that the daemon measures of itself."""
+class Latency(Message, frozen=True):
+    """A duration that the daemon measures of itself, such as from a command to its line."""
 
     since_start: Spread
     last_minute: Spread
@@ -232,34 +232,34 @@ class RobotState(Message, frozen=True):
     refused: str
     """The last refused command and the reason; empty if no command was refused."""
     counters: dict[str, int]
-    certificate: str = ""
+    certificate_expiry: str = ""
     """Remaining validity of the bus's TLS certificate, in words; empty without TLS."""
-    figures: dict[str, Figure] = {}
+    latencies: dict[str, Latency] = {}
     """Durations of the control loop by the names in `daemon/latencies.py`, up to a second old."""
     gyro: Annotated[str, one_of(get_args(GyroDoes))] = "off"
     """Use of the gyro in odometry, a value of `values.GyroDoes`."""
-    encoders: list[int] = []
+    encoder_counts: list[int] = []
     """Counts per wheel turn, inferred from the speeds, in the order of `wheels`; 0 if unknown."""
-    doubt: str = ""
+    wheel_fault: str = ""
     """The wheel that is left out of the pose, or the side that slips, in words; else empty."""
     sender: str = ""
     """Public name of the followed sender of `source`."""
-    track: str = ""
+    effective_track: str = ""
     """Effective track divided by the wheel separation, as learned from the gyro and as
     configured, and which of them is in use, in words; empty until one is learned.
     """
-    recording: str = ""
+    recording_error: str = ""
     """Why nothing is recorded at present although recording is on, in words; else empty."""
     latch: LatchNumber = 0
     """Number of the fault, else of the stop, else of "inactive"; 0 while none is latched."""
-    latch_file: str = ""
+    latch_file_error: str = ""
     """Why a stop would not survive a restart, in words; empty if it would, and in the simulator."""
     feedback_age: float | None = None
     """Seconds since the last good line of the microcontroller; null before the first one."""
 
 
-class DoorState(Message, frozen=True):
-    """Status that the TLS gateway (the process `door`) reports to the daemon."""
+class GatewayState(Message, frozen=True):
+    """Status that the TLS gateway (`acsard gateway`) reports to the daemon."""
 
     opened: Annotated[int, Meta(ge=0, lt=1 << 62)]
     """Start time of the gateway in ns of the machine's monotonic clock. Another value means that
@@ -267,7 +267,7 @@ class DoorState(Message, frozen=True):
     """
     connections: Annotated[int, Meta(ge=0, lt=1 << 16)]
     """Number of connections from the network at present."""
-    crowded: Annotated[int, Meta(ge=0, lt=1 << 31)]
+    full: Annotated[int, Meta(ge=0, lt=1 << 31)]
     """Number of checks, four a second, at which all connections were in use."""
     certificate_ends: Annotated[int, Meta(ge=0, lt=1 << 62)] = 0
     """End of the certificate by the wall clock, ns; 0 if the library to read it is missing."""
@@ -297,7 +297,7 @@ class DiagnosticArray(Message, frozen=True):
     status: list[DiagnosticStatus]
 
 
-class Happening(Message, frozen=True):
+class LogEvent(Message, frozen=True):
     """An event as in the log."""
 
     stamp: Time
@@ -325,7 +325,7 @@ class Events(Message, frozen=True):
     the end. Of the last N rows, where N is the growth of `total`, those that a reader does not
     have yet are new.
     """
-    events: list[Happening]
+    events: list[LogEvent]
 
 
 class ServiceReply(Message, frozen=True):
@@ -422,7 +422,7 @@ MESSAGES: dict[str, type[Message]] = {
         Twist,
         TwistStamped,
         RobotState,
-        DoorState,
+        GatewayState,
         DiagnosticArray,
         Events,
         ServiceReply,

@@ -1,7 +1,9 @@
-"""The table of all keys below `acsard/<id>/`, with direction, type, rate and meaning.
+"""The table of all keys below `acsard/<id>/`: direction, type, rate, meaning, and the least roles.
 
 The bus declares its keys from this table, the command line and the README list it, and the query
-`topics` answers with it. A key that is not in the table does not exist.
+`topics` answers with it. `permissions.py` derives from it which role may use which key, for the
+access rules, the router of a fleet, the page and the tables of the pages. A key that is not in the
+table does not exist.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from msgspec import Struct
 
 from acsard.core.config.nearest import hint
 from acsard.core.config.settings import Config
-from acsard.core.values import ROOT, Verb
+from acsard.core.values import ROOT, Role, Verb
 
 _PLACE = re.compile("<[A-Za-z]+>")
 
@@ -36,6 +38,14 @@ class Topic(Struct, frozen=True):
     type: str
     rate: str
     note: str
+    publish: Role | None = None
+    """Least role that may put on the key. None means that no client may."""
+    subscribe: Role | None = None
+    """Least role that may follow the key. None means that no client may."""
+    query: Role | Literal["<role>"] | None = None
+    """Least role that may query the key. `<role>` means the role that the key ends with."""
+    local: bool = False
+    """True for a key that is only for programs on the robot's own machine, whatever their role."""
     latched: bool = False
     simulated: bool = False
     """True for a key that exists only with the built-in simulator."""
@@ -50,15 +60,22 @@ class Topic(Struct, frozen=True):
 
 SERVICES: tuple[Verb, ...] = get_args(Verb)
 
-_SERVICE_NOTES: dict[Verb, str] = {
-    "stop": "stop, and stay stopped until clear",
-    "clear": "clear the fault if there is one, else the stop; the payload {latch} names it",
-    "activate": "switch on, so that commands count; the payload {latch} names the latch",
-    "deactivate": "switch off: ramp to zero and ignore commands",
-    "reset_odometry": "set the pose to x 0, y 0, yaw 0",
-    "set_pose": "set the pose to the payload {x, y, yaw}",
-    "set": "change settings; the payload is {settings: {key: value}}",
+_SERVICES: dict[Verb, tuple[Role, str]] = {
+    "stop": ("viewer", "stop, and stay stopped until clear"),
+    "clear": (
+        "operator",
+        "clear the fault if there is one, else the stop; the payload {latch} names it",
+    ),
+    "activate": (
+        "operator",
+        "switch on, so that commands count; the payload {latch} names the latch",
+    ),
+    "deactivate": ("operator", "switch off: ramp to zero and ignore commands"),
+    "reset_odometry": ("operator", "set the pose to x 0, y 0, yaw 0"),
+    "set_pose": ("maintainer", "set the pose to the payload {x, y, yaw}"),
+    "set": ("maintainer", "change settings; the payload is {settings: {key: value}}"),
 }
+"""The least role that may call each service, and its effect. Every client may stop the robot."""
 
 
 IMU = "imu"
@@ -92,47 +109,76 @@ def json_key(key: str) -> str:
 VERBS: dict[str, Verb] = {service_key(verb): verb for verb in SERVICES}
 """The verb of each service, by its key."""
 
-TOPICS: tuple[Topic, ...] = (
-    Topic("odom", "out", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
-    Topic("tf", "out", "TFMessage", "with odom", "transform odom -> base"),
-    Topic("tf_static", "out", "TFMessage", "latched", "transform base -> lidar", latched=True),
-    Topic("wheel_states", "out", "JointState", "every feedback", "wheel angles and speeds"),
-    Topic("cmd_vel_out", "out", "TwistStamped", "every period", "the twist applied after limits"),
-    Topic("state", "out", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
-    Topic("diagnostics", "out", "DiagnosticArray", "1 Hz, on change", "health of every part"),
-    Topic("events", "out", "Events", "on change", "the last 20 events with time, text and caller"),
-    Topic(
-        "sim/pose", "out", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True
-    ),
-    Topic(
-        json_key("<key>"), "out", "JSON", "as the key", "each key above as JSON, for subscribers"
-    ),
-    Topic("cmd/<source>", "in", "Twist or TwistStamped", "any", "velocity command of a source"),
-    Topic("wheel_cmd/<source>", "in", "JointState", "any", "four wheel speeds of a source"),
-    Topic(
-        "cmd/<source>/<certificate>", "in", "Twist or TwistStamped", "any", "cmd/<source> over TLS"
-    ),
-    Topic(
-        "wheel_cmd/<source>/<certificate>", "in", "JointState", "any", "wheel_cmd/<source> over TLS"
-    ),
-    Topic(IMU, "in", "Imu", "any", "turn rate from a gyro, with [odometry] gyro", gyro=True),
-    Topic("stop", "in", "anything", "any", "any PUT stops the robot like srv/stop"),
-    Topic("door", "in", "DoorState", "4 Hz", "status of the TLS gateway, on this machine only"),
-    *(Topic(key, "service", "ServiceReply", "", _SERVICE_NOTES[v]) for key, v in VERBS.items()),
-    Topic("info", "query", "Info", "", "name, version and settings of the daemon"),
-    Topic("config", "query", "Config", "", "the effective configuration"),
-    Topic("interfaces", "query", "Interfaces", "", "command and state interfaces"),
-    Topic("topics", "query", "Topics", "", "this table"),
-    Topic(WHOAMI, "query", "WhoAmI", "", "role of the client that asks, one key per role"),
-    Topic("schema/<Type>", "query", "JSON Schema", "", "the fields of a message type"),
-    Topic("alive", "out", "liveliness token", "", "present while the daemon runs"),
-)
 
-PUBLISHED: tuple[Topic, ...] = tuple(
-    topic
-    for topic in TOPICS
-    if topic.direction == "out" and topic.key not in ("alive", json_key("<key>"))
+def _out(
+    key: str, kind: str, rate: str, note: str, *, latched: bool = False, simulated: bool = False
+) -> Topic:
+    """Return the row of a published key, which every client may follow and query."""
+    return Topic(
+        key, "out", kind, rate, note,
+        subscribe="viewer", query="viewer", latched=latched, simulated=simulated,
+    )  # fmt: skip
+
+
+def _command(key: str, kind: str, note: str, *, local: bool = False) -> Topic:
+    return Topic(key, "in", kind, "any", note, publish="operator", local=local)
+
+
+def _query(key: str, kind: str, note: str, least: Role | Literal["<role>"] = "viewer") -> Topic:
+    return Topic(key, "query", kind, "", note, query=least)
+
+
+def _service(verb: Verb) -> Topic:
+    least, note = _SERVICES[verb]
+    return Topic(service_key(verb), "service", "ServiceReply", "", note, query=least)
+
+
+TOPICS: tuple[Topic, ...] = (
+    _out("odom", "Odometry", "every feedback", "pose, twist, covariance of base in odom"),
+    _out("tf", "TFMessage", "with odom", "transform odom -> base"),
+    _out("tf_static", "TFMessage", "latched", "transform base -> lidar", latched=True),
+    _out("wheel_states", "JointState", "every feedback", "wheel angles and speeds"),
+    _out("cmd_vel_out", "TwistStamped", "every period", "the twist applied after limits"),
+    _out("state", "RobotState", "10 Hz, on change", "mode, reason, pose, link, counters"),
+    _out("diagnostics", "DiagnosticArray", "1 Hz, on change", "health of every part"),
+    _out("events", "Events", "on change", "the last 20 events with time, text and caller"),
+    _out("sim/pose", "PoseStamped", "100 Hz", "the true pose, simulated only", simulated=True),
+    _out(json_key("<key>"), "JSON", "as the key", "each key above as JSON, for subscribers"),
+    _command("cmd/<source>", "Twist or TwistStamped", "velocity command of a source", local=True),
+    _command("wheel_cmd/<source>", "JointState", "four wheel speeds of a source", local=True),
+    _command("cmd/<source>/<certificate>", "Twist or TwistStamped", "cmd/<source> over TLS"),
+    _command("wheel_cmd/<source>/<certificate>", "JointState", "wheel_cmd/<source> over TLS"),
+    # A gyro changes the pose, as set_pose does, so it needs the same role. Clients follow and query
+    # the gyro of the simulator.
+    Topic(
+        IMU, "in", "Imu", "any", "turn rate from a gyro, with [odometry] gyro",
+        publish="maintainer", subscribe="viewer", query="viewer", gyro=True,
+    ),
+    Topic(
+        "stop", "in", "anything", "any", "any PUT stops the robot like srv/stop", publish="viewer",
+    ),
+    Topic(
+        "gateway", "in", "GatewayState", "4 Hz", "status of the TLS gateway, on this machine only",
+        publish="maintainer", local=True,
+    ),
+    *(_service(verb) for verb in SERVICES),
+    _query("info", "Info", "name, version and settings of the daemon"),
+    _query("config", "Config", "the effective configuration", "maintainer"),
+    _query("interfaces", "Interfaces", "command and state interfaces"),
+    _query("topics", "Topics", "this table"),
+    _query(WHOAMI, "WhoAmI", "role of the client that asks, one key per role", "<role>"),
+    _query("schema/<Type>", "JSON Schema", "the fields of a message type"),
+    Topic(
+        "alive", "out", "liveliness token", "", "present while the daemon runs", subscribe="viewer"
+    ),
+)  # fmt: skip
+
+FOLLOWED: tuple[Topic, ...] = tuple(
+    topic for topic in TOPICS if topic.subscribe and topic.query and "<" not in topic.key
 )
+"""The topics whose messages clients follow: the published ones and the gyro of the simulator."""
+
+PUBLISHED: tuple[Topic, ...] = tuple(topic for topic in FOLLOWED if topic.direction == "out")
 """The topics with a payload. Each also answers queries with its last value."""
 
 

@@ -7,8 +7,8 @@
 - A source that sends zeros holds the robot still for any length of time, because an operator who
   wants that and a controller that has failed look the same. `state` and the log report it.
 
-Each refusal has a name under which it is counted, and `words.py` has the sentences for people.
-`values.Command` explains source, sender and clock.
+Each refusal has a name under which it is counted, and `arbiter_text.py` has the sentences for
+people. `values.Command` explains source, sender and clock.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from acsard.core.values import NS_PER_S, REST, Command, SourceStatus, Twist, Wai
 MAX_SENDERS = 16
 """Senders remembered per source. A sender that is live and armed is never replaced."""
 
-Objection = Literal["", "unknown_source", "not_finite", "crowded", "unproven", "stale"]
+Objection = Literal["", "unknown_source", "not_finite", "too_many_senders", "unproven", "stale"]
 """The reason to refuse a command, or "" if the command counts."""
 
 LASTING_S = (3.0, 10.0, 60.0, 600.0, 3600.0)
@@ -134,7 +134,8 @@ class Arbiter:
 
     def __init__(self, commands: CommandsConfig) -> None:
         self._sources = {
-            s.name: _Source(s, commands.neutral_first, commands.pause) for s in commands.sources
+            s.name: _Source(s, commands.neutral_first, commands.neutral_pause)
+            for s in commands.sources
         }
         self._ranking = sorted(self._sources.values(), key=lambda source: -source.priority)
         self._holder: _Source | None = None
@@ -148,7 +149,7 @@ class Arbiter:
         priorities of the sources must be those that the arbiter was constructed with.
         """
         for settings in commands.sources:
-            self._sources[settings.name].use(settings, commands.pause)
+            self._sources[settings.name].use(settings, commands.neutral_pause)
 
     def require_neutral(self, since_ns: int = 0) -> None:
         """Forget all commands and ask each sender for a zero before it drives again.
@@ -177,7 +178,7 @@ class Arbiter:
             return "stale"
         sender = known or source.add(command.sender, command.arrived_ns)
         if sender is None:
-            return "crowded"
+            return "too_many_senders"
         if verdict in ("set", "first"):
             # A sender has one clock on all its sources, so the doubt concerns all its zeros.
             for other in self._ranking:

@@ -1,10 +1,13 @@
-"""Computes how far the wheels rolled since the last believed line.
+"""Fills gaps: how far the wheels rolled since the last believed line, and how uncertain that is.
 
 Each second and each count is used exactly once. The angles come from the encoders' own counts, else
 from whole counts that the speeds show, else from speed times time. A time that no line reported is
 filled half with the speed before it and half with the speed after it. But if the silence was so
 long that the daemon commanded rest, the earlier speed counts only until then. The motion of
 impossible lines is left to the next possible one.
+
+`Rolling` computes the angles. `Gaps` estimates how far the motion in a gap deviates from a straight
+line between the two known speeds.
 """
 
 from __future__ import annotations
@@ -15,15 +18,28 @@ from msgspec import Struct
 
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization_step import on
-from acsard.core.motion.gyro import Turn
-from acsard.core.values import Pose, WheelSpeeds
+from acsard.core.values import REST, Twist, WheelSpeeds
 
 MAX_LOST_S, MAX_LOST = 0.05, 1
 """Impossible lines over which the robot is assumed to have kept its motion: this many seconds of
 them, or this many lines at any distance."""
 
 NOWHERE = (0.0, 0.0, 0.0, 0.0)
+
+GUESS = Twist(0.125, 0.5)
+"""Assumed s_a over `SPAN` before any measurement, m/s2 and rad/s2: an eighth of the default limits,
+which random driving at these limits hardly reaches."""
+
+SPAN = 0.2
+"""Time over which the deviation is measured, s."""
+
+FIRST, MOST = 4.0, 300.0
+"""Number of spans for which the assumption counts, and number that is remembered: a minute of
+driving."""
+
+GROWTH = 5
+"""Power of the time with which the variance grows: 4 from s_a2 t4 / 4, and 1 from the growth of
+s_a2."""
 
 
 class Rolled(Struct, frozen=True, gc=False):
@@ -114,29 +130,62 @@ def times(a: Motors, factor: float) -> Motors:
     return a[0] * factor, a[1] * factor, a[2] * factor, a[3] * factor
 
 
-class Step(Struct, frozen=True, gc=False):
-    """The part of the way that one line added."""
+class Gaps:
+    """The measured s_a, and the variances of the way in gaps.
 
-    pose: Pose
-    """The pose before the line."""
-    pieces: tuple[Motors, ...]
-    """How far the wheels turned in it, rad."""
-    gyro: Turn | None
-    """The turn by a gyro, None without one."""
-    speeds: WheelSpeeds
-    """The speeds in the line."""
-    turn: float
-    """Change of the heading, rad."""
-    on_trial: bool
-    """Whether a gyro on trial will correct the turn when the gyro is proven."""
-    share: float = 1.0
-    """The track by which the wheels turned the robot, as a share of the configured one."""
+    After t s without lines the deviation is s_a t2 / 2, along and turning, where s_a is the
+    standard deviation of the acceleration. The limits bound s_a, but few drives stay at them.
+    Therefore s_a is measured while lines come: it compares the way in every fifth of a second with
+    the way that the first and the last speed would have made. The robot may change its acceleration
+    at any time, so s_a2 itself grows with t. The deviation never exceeds the way at the faster
+    speed: a robot that stood before and after the gap has not moved.
+    """
 
+    def __init__(self) -> None:
+        self._along = (GUESS.linear * SPAN**2 / 2) ** 2
+        self._turning = (GUESS.angular * SPAN**2 / 2) ** 2
+        self._spans = FIRST
+        self.interrupt(REST)
 
-def count_of(line: Feedback) -> float:
-    """Return the angle of the coarsest encoder's count that a line shows, rad, 0 if unknown."""
-    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
-    return max([
-        step * turned / speed for turned, speed, step in rows
-        if speed and 0.0 < step < math.inf and on(speed, step)
-    ], default=0.0)  # fmt: skip
+    def interrupt(self, twist: Twist) -> None:
+        """Start a new span with `twist`, independent of the span before."""
+        self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
+        self._bridged, self._given = 0.0, (0.0, 0.0)
+
+    def follow(self, twist: Twist, dt: float) -> None:
+        """Take a line that reports `twist` for the last `dt` s."""
+        linear, angular = twist.linear, twist.angular
+        self._bridged, self._given = 0.0, (0.0, 0.0)
+        self._seconds += dt
+        self._distance += linear * dt
+        self._turn += angular * dt
+        span = self._seconds - dt  # the time between the two lines whose speeds are taken as known
+        if span < SPAN:
+            return
+        first = self._first
+        if self._distance or self._turn or linear or angular:
+            off = self._distance - linear * dt - span * (first.linear + linear) / 2
+            turned = self._turn - angular * dt - span * (first.angular + angular) / 2
+            scale = (SPAN / span) ** GROWTH
+            self._spans = min(self._spans + 1.0, MOST)
+            self._along += (off * off * scale - self._along) / self._spans
+            self._turning += (turned * turned * scale - self._turning) / self._spans
+        self._first, self._seconds, self._distance, self._turn = twist, 0.0, 0.0, 0.0
+
+    def bridge(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
+        """Return the variances, m2 along and rad2, that `seconds` more of a filled gap add.
+
+        A gap may come in several consecutive pieces. They count as one gap.
+        """
+        bridged, given = self._bridged + seconds, self._given
+        along, yaw = self.unseen(bridged, before, after)
+        self.interrupt(after)
+        self._bridged, self._given = bridged, (max(along, given[0]), max(yaw, given[1]))
+        return max(0.0, along - given[0]), max(0.0, yaw - given[1])
+
+    def unseen(self, seconds: float, before: Twist, after: Twist) -> tuple[float, float]:
+        """Return the variances of `seconds` between two known twists, m2 along and rad2."""
+        scale = (seconds / SPAN) ** GROWTH
+        fastest = max(abs(before.linear), abs(after.linear)) * seconds
+        turning = max(abs(before.angular), abs(after.angular)) * seconds
+        return min(self._along * scale, fastest**2), min(self._turning * scale, turning**2)

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Protocol
 
 from msgspec import Struct
 
@@ -36,9 +35,6 @@ SILENT_NS = NS_PER_S // 5
 
 LATEST_NS = NS_PER_S // 4
 """Delay of a stamp above which the sender's clock was set, ns."""
-
-DRIFT = 0.01
-"""Relative drift between the gyro's clock and ours that is allowed."""
 
 DELAYS_NS = (-NS_PER_S // 10, 3 * NS_PER_S // 10)
 """Least and greatest delay of the gyro against the wheels, ns."""
@@ -92,16 +88,6 @@ class Turn(Struct, frozen=True, gc=False):
     """Whether the wheels slip: lately they reported another turn than the gyro."""
 
 
-class Heading(Protocol):
-    """A source of the robot's turn besides its wheels: a `Gyro`."""
-
-    owes: bool
-
-    def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn | None: ...
-
-    def taken_back(self, turn: float) -> float: ...
-
-
 class Gyro:
     """One gyro. The caller passes its samples to `hear` and calls `turn` for each line."""
 
@@ -122,7 +108,7 @@ class Gyro:
         self._bias, self._match, self._trial = Bias(), Match(), Trial()
         self._heard: deque[tuple[int, GyroSample]] = deque(maxlen=256)
         """Samples later than the last line."""
-        self._promptest = MinimumDelay(DRIFT)
+        self._promptest = MinimumDelay()
         self._last: GyroSample | None = None
         self._delay_ns = 0
         self._told_ns: int | None = None
@@ -228,7 +214,7 @@ class Gyro:
             return sample.at_ns
         late = self._promptest.add(sample.at_ns - last.at_ns, sample.stamp_ns - last.stamp_ns)
         if late > LATEST_NS:
-            self._promptest = MinimumDelay(DRIFT)
+            self._promptest = MinimumDelay()
             return sample.at_ns
         return sample.at_ns - max(0, int(late))
 

@@ -70,7 +70,7 @@ class LearnedTrack:
         if learned is not None and self.use != before:
             told = f"the wheels' effective track: {beside(learned, self._multiplier, self.use)}"
             level: Level = "warning" if self.use == "too far off" else "info"
-            self.event = Event("track", told, level, kind=self.use)
+            self.event = Event("learned_track", told, level, kind=self.use)
 
 
 def _use(learned: Track | None, before: TrackUse) -> TrackUse:

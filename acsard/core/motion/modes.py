@@ -1,6 +1,6 @@
 """The robot's mode, derived from latches and facts by one ordered list.
 
-    leaving   the daemon is going down
+    shutdown  the daemon is going down
     fault     a fault is latched until `clear`
     stopped   a stop is latched until `clear`
     inactive  the robot is switched off until `activate`
@@ -23,7 +23,7 @@ class Mode(StrEnum):
     # Enum's own hash is ten times slower, and every step looks the mode up.
     __hash__ = str.__hash__
 
-    LEAVING = "leaving"
+    SHUTDOWN = "shutdown"
     FAULT = "fault"
     STOPPED = "stopped"
     INACTIVE = "inactive"
@@ -41,7 +41,7 @@ def mode_of(
 ) -> Mode:
     """Return the first mode of the module's list whose condition holds."""
     if leaving:
-        return Mode.LEAVING
+        return Mode.SHUTDOWN
     if fault:
         return Mode.FAULT
     if stopped:
@@ -56,9 +56,9 @@ def mode_of(
 LEAVING = "the daemon is going down"
 
 REFUSALS: dict[tuple[Mode, Verb], str] = {
-    (Mode.LEAVING, "clear"): LEAVING,
-    (Mode.LEAVING, "activate"): LEAVING,
-    (Mode.LEAVING, "deactivate"): LEAVING,
+    (Mode.SHUTDOWN, "clear"): LEAVING,
+    (Mode.SHUTDOWN, "activate"): LEAVING,
+    (Mode.SHUTDOWN, "deactivate"): LEAVING,
     (Mode.FAULT, "activate"): "the robot is in fault: call srv/clear first",
     (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: call srv/clear first",
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",

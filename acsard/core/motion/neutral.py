@@ -4,8 +4,8 @@ A sender is armed by a zero, never by a pause, and it stays armed until arming i
 
 - A zero of a sender with an identity of its own arms it at once, also right behind its speeds.
 - Several programs may share an identity (a bridge, a plain key). Then a zero arms it when no speed
-  has followed for `commands.pause`. Further zeros and silence change nothing. Otherwise the zero
-  of one program would release another one that never stopped.
+  has followed for `commands.neutral_pause`. Further zeros and silence change nothing. Otherwise the
+  zero of one program would release another one that never stopped.
 
 This module holds one sender's last command and its arming. `arbiter.py` decides which sender is
 followed and asks for arming again. `freshness.py` decides whether a command counts.
@@ -46,7 +46,7 @@ class Sender:
         """Why the last command that did not count was refused by its stamp."""
 
     def use(self, timeout_ns: int, pause_ns: int) -> None:
-        """Apply this command timeout and this `commands.pause` from now on."""
+        """Apply this command timeout and this `commands.neutral_pause` from now on."""
         self._timeout_ns, self._pause_ns = timeout_ns, pause_ns
 
     def live(self, now_ns: int) -> bool:
@@ -91,6 +91,7 @@ class Sender:
         now_ns, zero = command.arrived_ns, is_zero(command)
         self._settle(now_ns)
         self.noticed_ns, self.shared = now_ns, command.shared
+        unarmed = not self._armed
         if not zero:
             self._zero_ns = self._proven_zero_ns = None
         elif now_ns >= since_ns and not command.shared:
@@ -98,6 +99,8 @@ class Sender:
         elif now_ns >= since_ns and self._zero_ns is None:
             self._zero_ns = now_ns
         if verdict in ("first", "unproven"):
+            if zero and unarmed:
+                self.arrived_ns = None  # a speed before the zero that arms must not count by it
             self._doubt(command, verdict)
             return
         self._proven_armed, self._proven_zero_ns = self._armed, self._zero_ns

@@ -8,7 +8,7 @@ One step of dt, with left and right the mean wheel speeds of a side (kinematics,
     (10) yaw += dyaw, wrapped            (11) v = d / dt, w = dyaw / dt
 
 Equations (8) and (9) step along a straight line; `path.py` integrates the exact arc instead. They
-agree as dyaw -> 0. `uncertainty.py` and `twist_uncertainty.py` compute the errors of the pose and
+agree as dyaw -> 0. `uncertainty.py` computes the errors of the pose, and `error_model.py` those
 of the twist.
 """
 
@@ -18,36 +18,51 @@ import math
 from collections import deque
 from itertools import takewhile
 
+from msgspec import Struct
+
 from acsard.core.config.settings import FeedbackConfig, OdometryConfig
 from acsard.core.link.codec import Motors
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.gap_filling import NOWHERE, Rolled, Rolling, Step, count_of, plus
-from acsard.core.motion.gap_variance import Gaps
-from acsard.core.motion.gyro import Heading, Turn
+from acsard.core.link.quantization_step import on
+from acsard.core.motion.consistency import ConsistencyChecks
+from acsard.core.motion.error_model import ErrorModel, TwistUncertainty
+from acsard.core.motion.gap_filling import NOWHERE, Gaps, Rolled, Rolling, plus
+from acsard.core.motion.gyro import REST_S, Turn
 from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.learned_track import Track
-from acsard.core.motion.noise import columns, in_use
+from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.path import Path
-from acsard.core.motion.twist_uncertainty import TwistUncertainty
 from acsard.core.motion.uncertainty import COARSE_COUNTS, PoseUncertainty
-from acsard.core.motion.wheel_faults.verdict import Witness
 from acsard.core.values import (
     REST,
     STILL,
     Estimate,
-    Event,
     Pose,
     Twist,
     TwistVariances,
     WheelSpeeds,
-    WheelsStatus,
 )
-
-REST_S = 0.2
-"""Seconds with four wheels at 0.00 after which the robot is at rest."""
 
 TAKEN_BACK = 128
 """Largest number of lines that are recomputed when a wheel proves faulty."""
+
+
+class Step(Struct, frozen=True, gc=False):
+    """The part of the way that one line added."""
+
+    pose: Pose
+    """The pose before the line."""
+    pieces: tuple[Motors, ...]
+    """How far the wheels turned in it, rad."""
+    gyro: Turn | None
+    """The turn by a gyro, None without one."""
+    speeds: WheelSpeeds
+    """The speeds in the line."""
+    turn: float
+    """Change of the heading, rad."""
+    on_trial: bool
+    """Whether a gyro on trial will correct the turn when the gyro is proven."""
+    share: float = 1.0
+    """The track by which the wheels turned the robot, as a share of the configured one."""
 
 
 class Odometry:
@@ -70,9 +85,7 @@ class Odometry:
             response_time: Response time of a slow wheel, s.
             quiet: Duration of silence after which the daemon commands rest, s.
         """
-        self._kinematics, self._declared = kinematics, odometry
-        self._track, self._share = in_use(odometry), 1.0
-        """The track in use, None if none is learned; and its share of the configured one."""
+        self._kinematics, self._track = kinematics, CONFIGURED
         self._positions = NOWHERE
         self._rolling = Rolling(quiet)
         self._held = NOWHERE
@@ -82,10 +95,11 @@ class Odometry:
         self._steps_of, self._coarsest = NOWHERE, 0.0
         """Quantization steps of the last line, and the largest known one of them, rad/s."""
         self._path = Path()
-        self._uncertainty = PoseUncertainty(odometry, kinematics, encoder_counts)
-        self._twist_uncertainty = TwistUncertainty(odometry, kinematics, encoder_counts)
+        self._errors = ErrorModel(odometry, kinematics)
+        self._uncertainty = PoseUncertainty(self._errors, encoder_counts)
+        self._twist_uncertainty = TwistUncertainty(self._errors, encoder_counts)
         self._gaps = Gaps()
-        self._witness = Witness(kinematics, encoder_counts, response_time)
+        self.checks = ConsistencyChecks(odometry, kinematics, encoder_counts, response_time)
         self._steps: deque[Step] = deque(maxlen=TAKEN_BACK)
         """The last lines, for recomputation."""
         self._unsettled = 2 * math.tau / (encoder_counts or COARSE_COUNTS)
@@ -103,18 +117,16 @@ class Odometry:
         """Distance since the start, forwards and backwards, m."""
 
     def use(self, odometry: OdometryConfig) -> None:
-        """Use these variances from now on."""
-        self._uncertainty.use(odometry)
-        self._twist_uncertainty.use(odometry)
+        """Use these variances from now on, and those of the start at the next `set_pose`."""
+        self._errors.use(odometry)
 
     def turn_by(self, track: Track) -> None:
         """Use this effective track from now on for the turns that the wheels provide."""
         if track != self._track:
-            self._track, self._share = track, track.share
-            parameters = columns(self._declared, self._kinematics, track)
-            apart = self._kinematics.track * track.share
-            self._uncertainty.bent_by(parameters, apart)
-            self._twist_uncertainty.bent_by(parameters, apart)
+            self._track = track
+            self._errors.turn_by(track)
+            self._uncertainty.bend()
+            self._twist_uncertainty.bend()
 
     def set_pose(self, pose: Pose) -> None:
         """Set the pose of base_link in odom, as certain as at the start.
@@ -124,6 +136,7 @@ class Odometry:
         self._path.set(pose)
         self._steps.clear()
         self._uncertainty.set(pose.yaw)
+        self.checks.forgive()
 
     @property
     def pose(self) -> Pose:
@@ -132,18 +145,8 @@ class Odometry:
 
     def missed(self) -> dict[str, int]:
         """Return counters of the time that no line reported, without those that are 0."""
-        ms = {"gap_ms": round(1e3 * self.unseen), "bridged_ms": round(1e3 * self.bridged)}
+        ms = {"gap_ms": round(1e3 * self.unseen), "gaps_filled_ms": round(1e3 * self.bridged)}
         return {name: count for name, count in ({"gaps": self.gaps} | ms).items() if count}
-
-    @property
-    def doubt(self) -> WheelsStatus:
-        """The wheels that the pose ignores, and those that slip."""
-        return self._witness.status
-
-    @property
-    def events(self) -> list[Event]:
-        """Events of the last line about wheel faults."""
-        return self._witness.events
 
     def skip(self, feedback: Feedback) -> None:
         """Pass over an impossible line and leave its motion to the next one.
@@ -153,49 +156,39 @@ class Odometry:
         """
         self._rolling.skip(feedback)
 
-    def fold(
-        self, feedback: Feedback, gyro: Heading | None = None, told: WheelSpeeds | None = None
-    ) -> Estimate:
+    def fold(self, feedback: Feedback, commanded: WheelSpeeds | None = None) -> Estimate:
         """Advance by one feedback line: by its counts, else by its speeds times dt.
 
         After a gap without counts only the uncertainty advances. At rest nothing does: a count back
-        and forth waits until its direction is clear. If `gyro` provides the turn since the line
-        before, the wheels provide only the distance. `told` is the commanded wheel speeds, by which
-        a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines are
-        recomputed.
+        and forth waits until its direction is clear. If a gyro provides the turn since the line
+        before, the wheels provide only the distance. `commanded` is the commanded wheel speeds, by
+        which a faulty wheel is found. Then the other wheel of its side stands in, and earlier lines
+        are recomputed.
         """
-        speeds, dt, before = feedback.speeds, feedback.dt, self.twist
-        said, witness = speeds.as_tuple(), self._witness
+        speeds, dt, before, checks = feedback.speeds, feedback.dt, self.twist, self.checks
         rolled = self._rolling.take(feedback, self.speeds)
         steps = feedback.steps
         if steps is not self._steps_of or (feedback.counted and steps is not self._steps_seen):
             self._see(feedback)
-        turn, by_wheels = None, 0.0
-        if gyro is not None:
-            by_wheels = self._wheels_turn(rolled)
-            still = witness.believed(said) == NOWHERE
-            turn = gyro.turn(feedback.at.mono_ns, rolled.known, by_wheels, still)
-        by_gyro = None if turn is None else turn.wheels
-        if witness.hear(rolled.seen, speeds, rolled.seconds, told, by_gyro):
-            self._take_back(gyro)
-        slips = witness.slips or (turn is not None and turn.slips)
-        believed = witness.believed(said)
+        if checks.look(feedback, rolled, commanded):
+            self._take_back()
+        turn, slips = checks.turn, checks.slips
+        believed = checks.wheels.believed(speeds.as_tuple())
         linear, angular = self._kinematics.moved(believed)
-        twist = Twist(linear, angular / self._share)
+        twist = Twist(linear, angular / self._track.share)
         self._still = self._still + dt if believed == NOWHERE else 0.0
         at_rest = self._still > REST_S
         if rolled.unknown > 0.0:
             self._stand(rolled.unknown, before, twist)
-        pieces = self._settled(rolled, at_rest)
-        on_trial = gyro is not None and gyro.owes
-        turned = self._move(pieces, turn, speeds, on_trial, slips)
-        if gyro is not None and on_trial and turned != by_wheels:
-            gyro.taken_back(turned - by_wheels)
+        turned = self._move(self._settled(rolled, at_rest), turn, speeds, slips)
         self._go_on(rolled.bridged, feedback, before, twist)
         variances = self._twist_variances(twist, feedback, at_rest, turn, slips)
         if turn is not None and dt > 0.0:
             twist = Twist(linear, turn.rate)
         self.twist, self.speeds = twist, speeds
+        track = checks.learn(turned)
+        if track is not None:
+            self.turn_by(track)
         return Estimate(
             feedback.at,
             self._path.pose,
@@ -220,14 +213,7 @@ class Odometry:
             return
         if all(line.speeds.as_tuple()):
             self._steps_seen = line.steps
-        self._uncertainty.show_count(count_of(line))
-
-    def _wheels_turn(self, rolled: Rolled) -> float:
-        """Return the turn since the last believed line by the wheels, rad."""
-        turned = rolled.turned
-        for piece in rolled.pieces:
-            turned = plus(turned, piece)
-        return self._kinematics.moved(self._witness.believed(turned))[1]
+        self._uncertainty.show_count(_count_of(line))
 
     def _settled(self, rolled: Rolled, at_rest: bool) -> tuple[Motors, ...]:
         """Return the wheel angles to advance by.
@@ -246,25 +232,26 @@ class Odometry:
         self._held = NOWHERE
         return (turned, *rolled.pieces)
 
-    def _take_back(self, gyro: Heading | None) -> None:
+    def _take_back(self) -> None:
         """Recompute the last lines in which a wheel, now found faulty, was wrong.
 
         The pose jumps by the error, except for the part that a gyro has corrected or will correct.
         """
-        lies = list(takewhile(lambda step: self._witness.lied(step.speeds), reversed(self._steps)))
-        if not lies:
+        was_faulty = self.checks.wheels.was_faulty
+        wrong = list(takewhile(lambda step: was_faulty(step.speeds), reversed(self._steps)))
+        if not wrong:
             return
-        self._path.set(lies[-1].pose)
+        self._path.set(wrong[-1].pose)
         on_trial = 0.0
-        for step in reversed(lies):
+        for step in reversed(wrong):
             arcs = self._arcs(step.pieces, step.gyro, step.share)
             for distance, angle in arcs:
                 self._path.advance(distance, angle)
             if step.on_trial:
                 on_trial += math.fsum([angle for _, angle in arcs]) - step.turn
         self._steps.clear()
-        if gyro is not None and on_trial:
-            self._path.turn(-gyro.taken_back(on_trial))
+        if on_trial:
+            self._path.turn(-self.checks.taken_back(on_trial))
 
     def _arcs(
         self, pieces: tuple[Motors, ...], gyro: Turn | None, share: float
@@ -274,7 +261,7 @@ class Odometry:
         A gyro provides one turn for all of them. Otherwise the track is `share` of the configured
         one.
         """
-        believed, kinematics = self._witness.believed, self._kinematics
+        believed, kinematics = self.checks.wheels.believed, self._kinematics
         moved = [kinematics.moved(believed(one)) for one in pieces]
         if gyro is not None:
             return [(math.fsum([distance for distance, _ in moved]), gyro.angle)]
@@ -285,7 +272,6 @@ class Odometry:
         pieces: tuple[Motors, ...],
         turn: Turn | None,
         speeds: WheelSpeeds,
-        on_trial: bool,
         slips: bool,
     ) -> float:
         """Advance by wheel angles in rad, one arc for each piece; return the turn, rad."""
@@ -293,12 +279,13 @@ class Odometry:
         pose, variance = path.pose, None if turn is None else turn.variance
         for piece in pieces:
             self._positions = plus(self._positions, piece)
-        for distance, angle in self._arcs(pieces, turn, self._share):
+        for distance, angle in self._arcs(pieces, turn, self._track.share):
             turned += angle
             self.travelled += abs(distance)
             dx, dy, heading = path.advance(distance, angle)
             self._uncertainty.advance(distance, angle, dx, dy, heading, variance, slips)
-        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._share))
+        on_trial = self.checks.on_trial
+        self._steps.append(Step(pose, pieces, turn, speeds, turned, on_trial, self._track.share))
         return turned
 
     def _go_on(self, bridged: float, feedback: Feedback, before: Twist, twist: Twist) -> None:
@@ -335,3 +322,12 @@ class Odometry:
             seconds * (before.angular + after.angular) / 2,
             *self._gaps.unseen(seconds, before, after),
         )
+
+
+def _count_of(line: Feedback) -> float:
+    """Return the angle of the coarsest encoder's count that a line shows, rad, 0 if unknown."""
+    rows = zip(line.counted or NOWHERE, line.speeds.as_tuple(), line.steps, strict=True)
+    return max([
+        step * turned / speed for turned, speed, step in rows
+        if speed and 0.0 < step < math.inf and on(speed, step)
+    ], default=0.0)  # fmt: skip

@@ -1,8 +1,10 @@
 """Checks whether feedback is possible and whether the wheels obey their commands.
 
 Each feedback line is checked twice. `impossible` rejects a line that shows a wheel turning or
-changing faster than any wheel can; the line is not used, and several in a row are a fault. `watch`
-compares the feedback with the commands over half a second and reports a fault of a named wheel.
+changing faster than any wheel can; the line is not used, and several in a row are a fault. More
+than one in a hundred cause a warning: either the wire is bad or the bound is, and true lines are
+lost. `watch` compares the feedback with the commands over half a second and reports a fault of a
+named wheel.
 
 The model of a healthy wheel is a first-order lag behind its command. The bounds around it leave
 room for load, slip and coarse encoders. Only behaviour that no healthy wheel shows is evidence, and
@@ -19,10 +21,16 @@ import math
 
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.values import WHEELS, WheelSpeeds
+from acsard.core.values import WHEELS, Event, WheelSpeeds
 
 REPEATED = 3
 """Impossible lines in a row that make a fault: 30 ms at 100 Hz."""
+
+WINDOW = 1000
+"""Lines in which the impossible ones are counted: 10 s at 100 Hz."""
+
+SHARE = 0.01
+"""Share of a window's lines that causes a warning if they are impossible, once per window."""
 
 SLACK = 2.0
 """rad/s. Below this, coarse encoders and a robot at rest look like any fault."""
@@ -107,6 +115,10 @@ class Sanity:
         self._last: WheelSpeeds | None = None
         self._since = 0.0
         self._impossible = 0
+        self._lines = self._dropped = 0
+        """Lines of the present window, and the impossible ones among them."""
+        self.warning: Event | None = None
+        """The warning of the last line about too many impossible ones, if it was due."""
         self._wheels = tuple(_Wheel() for _ in WHEELS)
         self._rolled = 0.0
         self._untold = TOLD_AGAIN_S
@@ -134,11 +146,31 @@ class Sanity:
         if feedback.gap:
             self._last = None
         why = self._objection(feedback)
+        self._count(why)
         if why:
             self._impossible += 1
             return why
         self._last, self._since, self._impossible = feedback.speeds, 0.0, 0
         return ""
+
+    def _count(self, why: str) -> None:
+        """Count a line in the window, with the reason if it is impossible; make a due warning."""
+        self._lines += 1
+        self.warning = None
+        if why:
+            self._dropped += 1
+            if self._dropped == int(SHARE * WINDOW) + 1:
+                self.warning = Event("lines_implausible", self._words(why), "warning")
+        if self._lines == WINDOW:
+            self._lines = self._dropped = 0
+
+    def _words(self, why: str) -> str:
+        return (
+            f"{self._dropped} of {self._lines} lines were dropped, because no wheel can do "
+            f"what they report; the last: {why}. If a wheel really does that, raise the setting. "
+            "Otherwise lines arrive damaged: check cable and ground; firmware that supports "
+            'mcu.link_check = "auto" protects each line with a checksum'
+        )
 
     def _objection(self, line: Feedback) -> str:
         speeds, fastest = line.speeds, self._settings.wheel_speed

@@ -1,8 +1,8 @@
 """Adds what the linear covariance leaves out: errors of the heading that bend the position error.
 
 A heading that errs and returns makes a straight shorter, never longer. This is an effect of second
-order, and on a straight it is the whole error along the way. After 60 m at k = 1e-5 (`noise.py`)
-the error is 17 mm to first order, and in truth 0.12 m.
+order, and on a straight it is the whole error along the way. After 60 m at k = 1e-5
+(`error_model.py`) the error is 17 mm to first order, and in truth 0.12 m.
 
 Each stretch of the way composes the error e so far with an error w of its own. By Baker, Campbell
 and Hausdorff

@@ -1,8 +1,8 @@
 """Computes the covariance of the pose's error, step by step.
 
 The error is log(estimate^-1 truth) in SE(2) (`se2.py`). A step transforms it to the robot's new
-place and adds noise (`noise.py`): P <- F P F' + G Q G'. The errors of the parameters stay the same
-all the way, so the effect of each on the pose is summed as a column, J <- F J + G_p, and
+place and adds noise (`error_model.py`): P <- F P F' + G Q G'. The errors of the parameters stay the
+same all the way, so the effect of each on the pose is summed as a column, J <- F J + G_p, and
 
     P_total = P + J J' + terms of second order (`second_order.py`)
 
@@ -20,9 +20,7 @@ from __future__ import annotations
 
 import math
 
-from acsard.core.config.settings import OdometryConfig
-from acsard.core.motion.kinematics import Kinematics
-from acsard.core.motion.noise import SLIPPING, Column, Noise, columns, in_use
+from acsard.core.motion.error_model import SLIPPING, Column, ErrorModel
 from acsard.core.motion.se2 import (
     ORIGIN,
     Vector,
@@ -62,12 +60,10 @@ STRETCH = 0.2
 class PoseUncertainty:
     """The covariance of the pose, in plain floats because it is updated at 100 Hz."""
 
-    def __init__(self, odometry: OdometryConfig, kinematics: Kinematics, counts: int) -> None:
+    def __init__(self, model: ErrorModel, counts: int) -> None:
         """Start; `counts` are the encoders' counts per wheel turn, 0 if unknown."""
-        self._radius, self._track = kinematics.radius, kinematics.track
-        self._half = self._track / 2
-        self.use(odometry)
-        self._parameters = self._effects = columns(odometry, kinematics, in_use(odometry))
+        self._model = model
+        self._parameters = self._effects = model.columns
         self._configured = self._counted = counts > 0
         self._count = 0.0
         self._stand_within(math.tau / (counts or COARSE_COUNTS))
@@ -76,25 +72,14 @@ class PoseUncertainty:
         m."""
         self.set(0.0)
 
-    def use(self, odometry: OdometryConfig) -> None:
-        """Use this noise, and this initial covariance for the next `set`, from now on.
-
-        The parameters and their uncertainty stay.
-        """
-        self._start = odometry.pose_covariance_diagonal
-        self._odometry = odometry
-        self._noise = Noise(odometry, self._track)
-
-    def bent_by(self, parameters: tuple[Column, ...], track: float) -> None:
-        """Use these columns, as many as before, and the track of `track` m from now on.
+    def bend(self) -> None:
+        """Use the model's columns, as many as before, and its track from now on.
 
         Their effects until now stay.
         """
         beside = self._effects[len(self._parameters) :]
-        self._effects = (*parameters, *beside)
-        self._parameters = parameters
-        self._track, self._half = track, track / 2
-        self._noise = Noise(self._odometry, track)
+        self._parameters = self._model.columns
+        self._effects = (*self._parameters, *beside)
         self._stand_within(self._count)
 
     def _stand_within(self, angle: float) -> None:
@@ -102,13 +87,13 @@ class PoseUncertainty:
 
         Each side is the mean of two wheels, which may stand anywhere in it.
         """
-        self._count, count = angle, self._radius * angle
-        self._play = count / self._track
-        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / self._track**2, 0.0)
+        self._count, count, track = angle, self._model.radius * angle, self._model.track
+        self._play = count / track
+        self._phase = (count**2 / 24 / 2, count**2 / 24 * 2 / track**2, 0.0)
 
     def set(self, yaw: float) -> None:
         """Reset the covariance to that of the start, with the heading `yaw`."""
-        xx, yy, _, _, _, yawyaw = self._start
+        xx, yy, _, _, _, yawyaw = self._model.settings.pose_covariance_diagonal
         self._p = PoseCovariance(xx, 0.0, 0.0, yy, 0.0, yawyaw)
         self._cos, self._sin = math.cos(yaw), math.sin(yaw)
         if self._counted:
@@ -158,7 +143,7 @@ class PoseUncertainty:
             self._forget_where(distance, turn)
             return
         c, s = self._cos, self._sin = math.cos(heading), math.sin(heading)
-        along, yaw, both = self._noise.of(distance, turn, self._beyond_play(turn))
+        along, yaw, both = self._model.noise.of(distance, turn, self._beyond_play(turn))
         if slips:
             along, yaw, both = SLIPPING * along, SLIPPING * yaw, SLIPPING * both
         if variance is not None:
@@ -170,7 +155,7 @@ class PoseUncertainty:
             self._bend(distance, turn, dx, dy, None if variance is None else scale)
         self._dx += dx
         self._dy += dy
-        self._rolled += abs(distance) + self._half * abs(turn)
+        self._rolled += abs(distance) + self._model.track / 2 * abs(turn)
         if self._rolled > STRETCH:
             self._end_stretch()
         self._publish()
@@ -199,7 +184,7 @@ class PoseUncertainty:
         self._columns[self._of_gaps] = gone_on
         # An unknown arc may lead to either side.
         aside = (distance**2 + along) * min(1.0, (turn**2 + yaw) / 4)
-        way_along, way_yaw, both = self._noise.of(distance, turn, abs(turn))
+        way_along, way_yaw, both = self._model.noise.of(distance, turn, abs(turn))
         p = added(self._p, along + way_along, yaw + way_yaw, both, c, s)
         self._p = added(p, aside, 0.0, 0.0, -s, c)
         self._publish()

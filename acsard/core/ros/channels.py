@@ -67,8 +67,8 @@ acsard/msg/RobotState: \
     float64 x, float64 y, float64 yaw, float64 linear, float64 angular, float64[] wheels, \
     float64 feedback_age, string link, string source, string sender, \
     acsard/msg/SourceState[] sources, \
-    string refused, string gyro, string track, string doubt, string recording, \
-    string certificate, acsard/msg/Counter[] counters
+    string refused, string gyro, string effective_track, string wheel_fault, \
+    string recording_error, string certificate_expiry, acsard/msg/Counter[] counters
 """
 """Message definitions. Each type has one line: its name, a colon, and its fields as `type name`,
 separated by commas. `[]` marks a sequence and `[n]` an array. Types without a ROS message are in

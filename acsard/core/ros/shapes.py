@@ -13,8 +13,8 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.schema import (
     Byte,
-    Happening,
     Header,
+    LogEvent,
     RobotState,
     Time,
     Twist,
@@ -47,7 +47,7 @@ LEVELS: dict[str, int] = {"info": 20, "warning": 30, "error": 40}
 """The numbers of the log levels in ROS."""
 
 
-def log(event: Event | Happening, stamp: Time) -> Log:
+def log(event: Event | LogEvent, stamp: Time) -> Log:
     """Return an event of a step or of `events` as one log line."""
     by = f" (by {event.by})" if event.by else ""
     text = f"{event.text}{by}{how_often(event.text, event.count)}"
@@ -107,10 +107,10 @@ class State(Struct, frozen=True):
     sources: list[Source]
     refused: str
     gyro: str
-    track: str
-    doubt: str
-    recording: str
-    certificate: str
+    effective_track: str
+    wheel_fault: str
+    recording_error: str
+    certificate_expiry: str
     counters: list[Counter]
 
 
@@ -133,10 +133,10 @@ def state(message: RobotState) -> State:
         sources=[Source(s.name, s.priority, _known(s.age), s.waits_for) for s in message.sources],
         refused=message.refused,
         gyro=message.gyro,
-        track=message.track,
-        doubt=message.doubt,
-        recording=message.recording,
-        certificate=message.certificate,
+        effective_track=message.effective_track,
+        wheel_fault=message.wheel_fault,
+        recording_error=message.recording_error,
+        certificate_expiry=message.certificate_expiry,
         counters=[Counter(name, count) for name, count in message.counters.items()],
     )
 

@@ -288,7 +288,7 @@ class FakeMcu(Faults):
     # The fault that needs a clock of its own.
 
     @contextmanager
-    def unprompted(self, period_s: float = 0.1) -> Iterator[None]:
+    def free_running(self, period_s: float = 0.1) -> Iterator[None]:
         """Report by its own clock instead of answering: unpadded, with a trailing comma."""
         period_ns = int(period_s * NS_PER_S)
         # A new name, so that events of an older clock are ignored.

@@ -166,7 +166,7 @@ class Faults:
         """Answer only one line in `period_s`."""
         return self._with(reply_gap_ns=int(period_s * NS_PER_S))
 
-    def other_baud(self, baud_rate: int) -> Fault:
+    def wrong_baud(self, baud_rate: int) -> Fault:
         """Send and receive at another baud rate than the configured one."""
         return self._with(baud_rate=baud_rate)
 
@@ -209,7 +209,7 @@ class Faults:
         """Stop the motors only after `time_s` of silence."""
         return self._with(watchdog_ns=int(time_s * NS_PER_S))
 
-    def fed_by_anything(self) -> Fault:
+    def watchdog_fed_by_bad_lines(self) -> Fault:
         """Keep the motors running for broken lines, which are not obeyed."""
         return self._with(any_feeds=True)
 

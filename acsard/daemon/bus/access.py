@@ -1,4 +1,4 @@
-"""Makes Zenoh's access rules, default deny, from the topic table, the ROS names and the roles.
+"""Makes Zenoh's access rules, default deny, from the table of keys and roles and the ROS names.
 
 - Zenoh checks the rules at the end of a link: at the daemon's session or, over TLS, at the session
   of the TLS gateway. It sees only the neighbour on that link, so a client behind a router has the
@@ -19,39 +19,18 @@ from collections.abc import Sequence
 from typing import Literal, TypedDict
 
 from acsard.core.config.settings import Config
-from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.permissions import COMMAND_ROLE, Use, has, keys_for, least_role
 from acsard.core.messages.topics import (
     IMU,
-    VERBS,
     Direction,
     full_key,
     json_key,
     offered,
     published,
-    service_key,
     source_keys,
-    whoami_key,
 )
-from acsard.core.ros.transports import Endpoint, claims, endpoints, left_out
-from acsard.core.values import ROLES, ROOT, Role, Verb
-
-SERVICE_ROLES: dict[Verb, Role] = {
-    "stop": "viewer",
-    "clear": "operator",
-    "activate": "operator",
-    "deactivate": "operator",
-    "reset_odometry": "operator",
-    "set_pose": "maintainer",
-    "set": "maintainer",
-}
-"""The least role that may call each service. Every client that sees the robot may stop it."""
-
-MAY: dict[Role, str] = {
-    "viewer": "it may follow and stop, not drive",
-    "operator": "it may drive by the listed sources, stop and clear",
-    "maintainer": "it has every permission",
-}
-"""What each role may do, for the message of a tool that was refused."""
+from acsard.core.ros.transports import PARAMETERS, Endpoint, claims, endpoints, left_out
+from acsard.core.values import ROLES, ROOT, Role
 
 LOCAL_LINKS = ("tcp",)
 """Links without a certificate. They do not leave the machine unless `bus.insecure` lets them."""
@@ -71,26 +50,24 @@ SPOKEN = (
 
 EVERYTHING = (*SPOKEN, "put", "delete", "query")
 
-GRANTS: dict[Role, tuple[str, ...]] = {
-    "viewer": ("speak", "tell", "watch", "ask", "halt"),
-    "operator": ("speak", "tell", "watch", "ask", "halt", "drive", "operate"),
-    "maintainer": (
-        "speak",
-        "tell",
-        "watch",
-        "appear",
-        "ask",
-        "halt",
-        "drive",
-        "operate",
-        "maintain",
-        "sense",
-    ),
-}
-"""The rules of each role. A router is a maintainer: it forwards the tokens of other daemons."""
-
-DRIVERS: tuple[Role, ...] = ("operator", "maintainer")
+DRIVERS: tuple[Role, ...] = tuple(role for role in ROLES if has(role, COMMAND_ROLE))
 """The roles whose certificates command."""
+
+
+def _grants(role: Role) -> tuple[str, ...]:
+    """Return the rules of a role: those of its own keys and those of the roles below it.
+
+    A router is a maintainer: it forwards the tokens of other daemons.
+    """
+    own = [f"{least} {use}" for least in ROLES if has(role, least) for use in USES]
+    return ("speak", "tell", *own, *(("appear",) if role == "maintainer" else ()))
+
+
+USES = ("subscribes", "queries", "publishes")
+"""The ends of the names of a role's rules."""
+
+GRANTS: dict[Role, tuple[str, ...]] = {role: _grants(role) for role in ROLES}
+"""The rules of each role."""
 
 WIDE: dict[Role, tuple[str, ...]] = {
     "viewer": ("roam", "recall"),
@@ -136,13 +113,16 @@ class _Keys:
 
     def __init__(self, config: Config) -> None:
         robot = config.robot.id
-        self._robot, self._ros = robot, endpoints(config.ros, "*", left_out(config) & {IMU})
-        ros, topics, told = self._ros, offered(config), published(config)
+        self._robot, self._sources = robot, [source.name for source in config.commands.sources]
+        self._ros = ros = endpoints(config.ros, "*", left_out(config) & {IMU})
+        topics, told = offered(config), published(config)
+        self._taken = [topic for topic in topics if topic not in told]
+        """The rows that clients put on. The simulator publishes its gyro itself."""
+        self._given = [*told, *(t for t in self._taken if t.direction != "in")]
+        """The rows that clients follow and query."""
         self.all = full_key(robot, "**")
         self.alive = full_key(robot, "alive")
         self.claims = claims(config.ros)
-        self.config = full_key(robot, "config")
-        self.stop = full_key(robot, "stop")
         self.imu = full_key(robot, IMU)
         self.published = [full_key(robot, topic.key) for topic in told]
         self.published += [full_key(robot, json_key(topic.key)) for topic in told]
@@ -154,46 +134,50 @@ class _Keys:
         self.heard = [full_key(robot, t.pattern) for t in topics if t.direction == "in"]
         self.heard += _of(ros, "in")
         """Keys that the daemon subscribes to, for each sender."""
-        sources = [source.name for source in config.commands.sources]
-        self.commands = [full_key(robot, key) for key in source_keys(sources)]
+        self.commands = [full_key(robot, key) for key in source_keys(self._sources)]
         """Command keys of the listed sources for clients without a certificate."""
-        self.ros_commands = [
-            e.key for e in ros if e.direction == "in" and e.native.rpartition("/")[2] in sources
+        self.questions = [
+            full_key(robot, t.pattern)
+            for t in topics
+            if t.direction == "query" and t.query == "viewer"
         ]
-        """Command keys of the listed sources in ROS, which have no place for a certificate."""
-        self._sources = sources
-        self.gyro = [full_key(robot, t.key) for t in topics if t.key == IMU and t not in told]
-        self.gyro += [e.key for e in ros if e.native == IMU]
-        """Keys on which a gyro sends; none with the simulator, which has a gyro of its own."""
-        asked = [full_key(robot, t.pattern) for t in topics if t.direction == "query"]
-        self.whoami = {role: full_key(robot, whoami_key(role)) for role in ROLES}
-        """Each role may query its own key and those of lower roles, so the highest key that answers
-        is the role of the client."""
-        self.any_role = full_key(robot, whoami_key("*"))
-        own = (self.config, self.any_role)
-        self.questions = [key for key in asked if key not in own]
-        self.exact_questions = [key for key in self.questions if "*" not in key]
-        self.exact_questions += [full_key(robot, f"schema/{name}") for name in SCHEMAS]
-        self.parameters = _of(ros, "query")
+        """Expressions of the queries that every client may send."""
+        asked = [full_key(robot, t.pattern) for t in topics if t.direction in ("query", "service")]
+        self.answered = [*self.published, *self.kept, *asked]
+        self.answered += [e.key for e in ros if e.direction in ("query", "service")]
+        """Keys that the daemon publishes on or answers."""
+
+    def of(self, role: Role, use: Use) -> list[str]:
+        """Return the exact keys for which `role` is the least role, native and ROS.
+
+        Command keys that end with a certificate are left out; see `commands_by`.
+        """
+        rows = self._taken if use == "publish" else self._given
+        keys = [full_key(self._robot, key) for key in keys_for(role, use, rows)]
+        return keys + [e.key for e in self._ros if use in _uses(e) and self._least(e) == role]
 
     def commands_by(self, certificate: str) -> list[str]:
         """Return the command keys of the listed sources for this certificate, "*" for any."""
         return [full_key(self._robot, key) for key in source_keys(self._sources, certificate)]
 
-    def of(self, verb: Verb) -> list[str]:
-        """Return the keys of a service, native and ROS."""
-        native = service_key(verb)
-        return [full_key(self._robot, native)] + [e.key for e in self._ros if e.native == native]
+    def _least(self, endpoint: Endpoint) -> Role | None:
+        """Return the least role for a ROS name: that of the native key that it stands for.
+
+        Commands of a source that is not listed are for nobody. ROS keys have no place for a
+        certificate, so they are granted to each role that may command.
+        """
+        native = endpoint.native
+        if native.startswith(PARAMETERS):
+            return least_role("config")
+        if endpoint.direction == "in" and native != IMU:
+            return COMMAND_ROLE if native.rpartition("/")[2] in self._sources else None
+        return least_role(native)
 
 
-def least_role(key: str) -> Role:
-    """Return the least role that may use a key below the robot's id."""
-    verb = VERBS.get(key)
-    if verb is not None:
-        return SERVICE_ROLES[verb]
-    if key.startswith(("cmd/", "wheel_cmd/")):
-        return "operator"
-    return "maintainer" if key in ("config", IMU) else "viewer"
+def _uses(endpoint: Endpoint) -> tuple[Use, ...]:
+    if endpoint.direction == "in":
+        return ("publish",)
+    return ("subscribe", "query") if endpoint.direction == "out" else ("query",)
 
 
 def access_control(config: Config) -> dict[str, object]:
@@ -205,7 +189,7 @@ def access_control(config: Config) -> dict[str, object]:
     return _access(config, LOCAL, gateway=False)
 
 
-def door_access(config: Config) -> dict[str, object]:
+def gateway_access(config: Config) -> dict[str, object]:
     """Return the value of `access_control` for the TLS gateway's session.
 
     Its only link without a certificate is that to the daemon. Each certificate that may command has
@@ -261,38 +245,28 @@ def _access(config: Config, local: tuple[str, ...], *, gateway: bool) -> dict[st
 
 
 def _rules(keys: _Keys) -> dict[str, Rule]:
-    def services(role: Role) -> list[str]:
-        return [k for verb, least in SERVICE_ROLES.items() if least == role for k in keys.of(verb)]
-
     tokens = [keys.alive, *keys.claims, *keys.kept, *TOKENS]
-    answered = [*keys.published, *keys.kept, *keys.questions, keys.config, *keys.parameters]
-    answered.append(keys.any_role)
-    answered += [key for verb in SERVICE_ROLES for key in keys.of(verb)]
     # A gyro beside the simulator's is let through, because the code refuses it with a reason.
-    forged = [key for key in answered if key != keys.imu]
-    watching = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
-    asked = [*keys.published, *keys.exact_questions, *services("viewer"), keys.whoami["viewer"]]
-    operated = [*services("operator"), keys.whoami["operator"]]
-    maintained = [*services("maintainer"), keys.whoami["maintainer"], keys.config]
-    maintained += keys.parameters
-    rules = (
-        _rule("speak", "egress", SPOKEN, [*answered, *keys.heard, *tokens]),
+    forged = [key for key in keys.answered if key != keys.imu]
+    following = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
+    rules = [
+        _rule("speak", "egress", SPOKEN, [*keys.answered, *keys.heard, *tokens]),
         _rule("tell", "egress", ["put"], [*keys.published, *keys.kept]),
         _rule("overhear", "egress", ["put"], keys.heard),
-        # exact keys
-        _rule("watch", "ingress", watching, [*keys.published, keys.alive]),
+    ]
+    # exact keys
+    for role in ROLES:
+        rules += [
+            _rule(f"{role} subscribes", "ingress", following, keys.of(role, "subscribe")),
+            _rule(f"{role} queries", "ingress", ["query"], keys.of(role, "query")),
+            _rule(f"{role} publishes", "ingress", ["put"], keys.of(role, "publish")),
+        ]
+    rules += [
         _rule("appear", "ingress", ["liveliness_token"], [keys.alive, *keys.claims]),
-        _rule("ask", "ingress", ["query"], asked),
-        _rule("halt", "ingress", ["put"], [keys.stop]),
         _rule("command", "ingress", ["put"], keys.commands),
         _rule("hand_on", "ingress", ["put"], keys.commands_by("*")),
-        _rule("drive", "ingress", ["put"], keys.ros_commands),
-        _rule("operate", "ingress", ["query"], operated),
-        _rule("maintain", "ingress", ["query"], maintained),
-        # A gyro changes the pose, as set_pose does, so it needs the same role.
-        _rule("sense", "ingress", ["put"], keys.gyro),
         # with wildcards: all robots at once, the discovery of ROS, samples for late subscribers
-        _rule("roam", "ingress", watching, [f"{ROOT}/**", *tokens]),
+        _rule("roam", "ingress", following, [f"{ROOT}/**", *tokens]),
         _rule("recall", "ingress", ["query"], [*keys.kept, *keys.questions]),
         _rule("browse", "ingress", ["query"], [keys.all]),
         _rule("attend", "ingress", ["liveliness_token"], keys.kept),
@@ -302,7 +276,7 @@ def _rules(keys: _Keys) -> dict[str, Rule]:
         _rule("forge", "ingress", ["put", "delete"], [*forged, *tokens], "deny"),
         # between the TLS gateway and the daemon; ** includes no key with an @
         _rule("pass", "both", EVERYTHING, ["**", *tokens]),
-    )
+    ]
     return {rule["id"]: rule for rule in rules}
 
 

@@ -14,9 +14,9 @@ from typing import Literal
 import zenoh
 from msgspec import Struct
 
+from acsard.core.messages.permissions import MAY, has, least_role
 from acsard.core.messages.topics import full_key, whoami_key
 from acsard.core.values import NS_PER_S, ROLES, Role
-from acsard.daemon.bus.access import MAY, least_role
 from acsard.daemon.bus.tls import common_name
 from acsard.host import clock
 
@@ -49,7 +49,7 @@ class Identity(Struct, frozen=True):
         least = least_role(key)
         if not self.role:
             return self.silence
-        if ROLES.index(self.role) >= ROLES.index(least):
+        if has(self.role, least):
             return ""
         return f"{self.words()}; {key} is for a certificate that is {least}"
 

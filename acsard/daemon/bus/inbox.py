@@ -14,7 +14,6 @@ import queue
 import threading
 from collections import deque
 from itertools import count
-from typing import TypeVar
 
 import zenoh
 
@@ -24,6 +23,7 @@ from acsard.core.incoming.queries import BUSY, Query, Reply, most_bytes, refused
 from acsard.core.messages.topics import IMU, JSON_TREE, VERBS, full_key, service_key, source_keys
 from acsard.core.ros.transports import Endpoint
 from acsard.host import clock
+from acsard.host.mailbox import Mailbox
 
 TICKETS = 1024
 """Queries held at once. Further queries are dropped without an answer."""
@@ -126,8 +126,6 @@ one is cut, so it decodes to no sender."""
 STOP, SET = service_key("stop"), service_key("set")
 STOP_ALL = full_key("*", "stop")
 
-T = TypeVar("T")
-
 
 class Inbox:
     """Samples and queries of one robot, buffered until `take`."""
@@ -142,12 +140,14 @@ class Inbox:
         """The ids with which routers stamp samples. Such an id tells when a sample passed a router,
         but does not identify its sender."""
         self._prefix, self._replies = prefix, replies
-        self._arrivals: dict[str, deque[Arrival]] = {
-            key: deque(maxlen=ARRIVALS)
+        self._arrivals: dict[str, Mailbox[Arrival]] = {
+            key: Mailbox(ARRIVALS, self._commanded)
             for key in (*source_keys(sources), *source_keys(sources, ALL), OTHERS)
         }
-        self._arrivals[IMU] = deque(maxlen=SAMPLES)
-        self._stops: deque[Arrival] = deque(maxlen=STOPS)
+        # A gyro sample wakes nobody: it waits for the next feedback of the wheels.
+        self._arrivals[IMU] = Mailbox(SAMPLES, self._note)
+        self._stops = Mailbox[Arrival](STOPS, self._stopped)
+        # Queries are no mailbox: a query that finds no room is refused, and displaces no other.
         self._services: deque[Query] = deque()
         self._questions: deque[Query] = deque()
         self._slow: deque[Query] = deque()
@@ -168,13 +168,11 @@ class Inbox:
         if not self._any:
             return NOTHING
         self._any = False
-        arrivals = [
-            one for held in self._arrivals.values() for one in taken_of(held, most_of(held))
-        ]
+        arrivals = [one for box in self._arrivals.values() if box.waiting for one in box.take()]
         arrivals.sort(key=lambda one: one.arrived_ns)
-        arrivals = taken_of(self._stops, STOPS) + arrivals
-        asked = taken_of(self._services, queries) + taken_of(self._slow, 1)
-        asked += taken_of(self._questions, queries - len(asked))
+        arrivals = self._stops.take() + arrivals
+        asked = _taken_of(self._services, queries) + _taken_of(self._slow, 1)
+        asked += _taken_of(self._questions, queries - len(asked))
         if self._services or self._slow or self._questions:
             self._any = True  # the rest waits for the next step
         overrun, self._overrun = self._overrun, 0
@@ -221,17 +219,14 @@ class Inbox:
             received_ns,
         )
         if key == "stop" and put:
-            self._stop(arrival)
-            return
-        held = self._line(key)
-        if len(held) == held.maxlen:
-            self._overrun += 1
-        held.append(arrival)
-        self._any = True
-        if key != IMU:  # a gyro sample waits for the next feedback of the wheels
-            self._waker.command()
+            self._stops.put(arrival)
+        else:
+            line = self._line(key)
+            # The count comes before the wake-up, because the reader takes both at once.
+            self._overrun += not line.store(arrival)
+            line.wake()
 
-    def _line(self, key: str) -> deque[Arrival]:
+    def _line(self, key: str) -> Mailbox[Arrival]:
         """Return the buffer of a key.
 
         The certificates of one source share it, as they share a rate limit.
@@ -241,8 +236,14 @@ class Inbox:
             held = self._arrivals.get(f"{key.rpartition('/')[0]}/{ALL}", self._arrivals[OTHERS])
         return held
 
-    def _stop(self, arrival: Arrival) -> None:
-        self._stops.append(arrival)
+    def _note(self) -> None:
+        self._any = True
+
+    def _commanded(self) -> None:
+        self._any = True
+        self._waker.command()
+
+    def _stopped(self) -> None:
         self._any = True
         self._waker.stop()
 
@@ -271,7 +272,7 @@ class Inbox:
         if topic == STOP:
             # The stop itself never waits behind other queries and is never refused as busy.
             by = _bytes(query.attachment, ATTACHMENT_BYTES)
-            self._stop(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
+            self._stops.put(Arrival("stop", True, b"", "", arrived.mono_ns, None, "", via, by))
         ticket = self._replies.issue(query, key)
         if ticket is None:
             return
@@ -303,14 +304,5 @@ def _bytes(payload: zenoh.ZBytes | None, most: int) -> bytes:
     return b"" if payload is None else payload.to_bytes()[: most + 1]
 
 
-def most_of(held: deque[T]) -> int:
-    """Return the buffer's capacity, so that a flood during `take` cannot make it take for ever."""
-    return held.maxlen or len(held)
-
-
-def taken_of(held: deque[T], most: int) -> list[T]:
-    """Remove and return up to `most` items. Another thread may be appending meanwhile."""
-    taken: list[T] = []
-    while held and len(taken) < most:
-        taken.append(held.popleft())
-    return taken
+def _taken_of(queries: deque[Query], most: int) -> list[Query]:
+    return [queries.popleft() for _ in range(min(most, len(queries)))]

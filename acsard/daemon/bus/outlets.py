@@ -9,7 +9,6 @@ own encodes and sends them, so a bus that blocks costs messages and never a cont
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from threading import Lock, Thread
 from typing import Any
@@ -22,6 +21,7 @@ from acsard.core.messages.schema import Message
 from acsard.core.ros.attachments import Attachment
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.mailbox import Bell, Mailbox
 
 OPTIONS: dict[str, Any] = {
     "congestion_control": zenoh.CongestionControl.DROP,
@@ -72,11 +72,9 @@ class Outlets:
         self._counting = Lock()
         self.wanted: frozenset[str] = frozenset()
         """The topics that have a listener."""
-        self._slots: dict[str, deque[Message]] = {}
-        self._bell = Lock()
-        """A lock that is held while no message waits. Releasing it wakes the thread, which is the
-        cheapest way to do so."""
-        self._bell.acquire()
+        self._slots: dict[str, Mailbox[Message]] = {}
+        self._bell = Bell()
+        """Wakes the thread. One bell serves all slots, because a step fills several of them."""
         self._waiting = self._leaving = self._stuck = False
         self._dropped = 0
         self._began_ns: int | None = None
@@ -99,10 +97,8 @@ class Outlets:
 
     def publish(self, topic: str, message: Message) -> None:
         """Queue a message for its listeners. `flush` sends it."""
-        slot = self._slots[topic]
-        if len(slot) == HELD:
+        if not self._slots[topic].store(message):
             self._dropped += 1
-        slot.append(message)
         self._waiting = True
 
     def flush(self) -> None:
@@ -114,7 +110,7 @@ class Outlets:
             raise self._error
         if self._waiting:
             self._waiting = False
-            self._ring()
+            self._bell.ring()
 
     @property
     def behind(self) -> bool:
@@ -137,24 +133,19 @@ class Outlets:
     def stop(self, timeout: float) -> None:
         """Send the queued messages and stop. Give up after `timeout` s."""
         self._leaving = True
-        self._ring()
+        self._bell.ring()
         self._thread.join(timeout)
-
-    def _ring(self) -> None:
-        # If the lock is free, the thread has not started the round that it was woken for.
-        if self._bell.locked():
-            self._bell.release()
 
     def _run(self) -> None:
         try:
             leaving = False
             while not leaving:
-                self._bell.acquire()
+                self._bell.wait()
                 leaving = self._leaving
                 self._began_ns = clock.mono_ns()
                 for topic, slot in self._slots.items():
-                    while slot:
-                        self._send(topic, slot.popleft())
+                    while slot.waiting:
+                        self._send(topic, slot.waiting.popleft())
                 self._began_ns = None
         except BaseException as error:  # noqa: BLE001 - raised again by flush(), so it ends the process
             self._error = error
@@ -196,7 +187,7 @@ class Outlets:
             )
         else:
             publisher = session.declare_publisher(key, encoding=encoding, **OPTIONS)
-        self._slots.setdefault(topic, deque(maxlen=HELD))
+        self._slots.setdefault(topic, Mailbox(HELD))
         outlet = _Outlet(publisher, form, gid, signed)
         self._outlets.setdefault(topic, []).append(outlet)
         if latched:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
-from collections import deque
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import suppress
 from typing import Any
@@ -14,50 +12,26 @@ import zenoh.ext
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
+from acsard.host.mailbox import Mailbox
 
 QUEUED = 1000
 """Samples queued for a slow reader. Beyond that the oldest are dropped."""
 
 
-class Arrivals:
-    """The queue between Zenoh's thread, which fills it, and the waiting reader."""
+class Arrivals(Mailbox[zenoh.Sample]):
+    """The samples that Zenoh's thread hands to the reader of a subscription."""
 
     def __init__(self) -> None:
+        super().__init__(QUEUED)
         self.declared: list[Any] = []
-        """The Zenoh subscribers that fill this queue."""
-        self._held: deque[zenoh.Sample] = deque(maxlen=QUEUED)
-        self._event = threading.Event()
-        self._wake: Callable[[], object] = self._event.set
-        self._closed = False
-
-    def take(self, sample: zenoh.Sample) -> None:
-        """Append a sample. Zenoh's thread calls this."""
-        self._held.append(sample)
-        self._wake()
-
-    def close(self) -> None:
-        """Mark the end: no more samples will arrive."""
-        self._closed = True
-        self._wake()
-
-    def wakes(self, wake: Callable[[], object]) -> None:
-        """Call `wake` on Zenoh's thread whenever a sample arrives or the subscription ends."""
-        self._wake = wake
+        """The Zenoh subscribers that fill it."""
 
     def try_recv(self) -> zenoh.Sample | None:
         """Return the next sample, or None if none has arrived; raise `ZError` after the end."""
-        try:
-            return self._held.popleft()
-        except IndexError:
-            if self._closed:
-                raise zenoh.ZError("the session has been closed") from None
-            return None
-
-    def wait(self, seconds: float | None) -> None:
-        """Wait until a sample arrives, the subscription ends or `seconds` pass."""
-        if not self._held and not self._closed:
-            self._event.wait(seconds)
-        self._event.clear()
+        sample = self.pop()
+        if sample is None and self.closed and not self.waiting:
+            raise zenoh.ZError("the session has been closed")
+        return sample
 
     def undeclare(self) -> None:
         """Undeclare the subscribers."""
@@ -89,7 +63,7 @@ class Subscription:
 
     def add(self, sample: zenoh.Sample) -> None:
         """Append a sample that a query fetched, as if it had been published."""
-        self._queue.take(sample)
+        self._queue.put(sample)
 
     def until_silence(self, timeout: float | None) -> Iterator[zenoh.Sample]:
         """Yield samples until none arrives for `timeout` s or the session closes."""
@@ -156,7 +130,7 @@ def encoded(sample: zenoh.Sample) -> tuple[str, bytes]:
 def queue_on(session: zenoh.Session, *keys: str, latched: bool) -> Arrivals:
     """Subscribe to the keys. With `latched` the kept sample of each key comes first."""
     arrivals = Arrivals()
-    handler = zenoh.handlers.Callback(arrivals.take, arrivals.close)
+    handler = zenoh.handlers.Callback(arrivals.put, arrivals.close)
     for key in keys:
         if latched:
             history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1)

@@ -2,7 +2,7 @@
 
 Zenoh has one error for all causes. The diagnosis repeats the connection step by step with Python's
 own TLS and has a message for each way it ends; it does not open the Zenoh session. Only the end
-date of a certificate (`ends_ns`) needs the library of the optional extra `lan`.
+date of a certificate (`ends_ns`) needs the library of the optional extra `tls`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def require_usable(directory: str) -> None:
     if not Path(directory).is_dir():
         raise CertificateError(
             f"there is no directory {directory}: name the directory with {CA}, {CERTIFICATE} and "
-            f"{KEY} that `acsard lan init` or `lan add` made"
+            f"{KEY} that `acsard tls init` or `tls add` made"
         )
     for name in (CA, CERTIFICATE, KEY):
         file = Path(directory) / name
@@ -47,7 +47,7 @@ def require_usable(directory: str) -> None:
             ) from None
         except OSError as error:
             raise CertificateError(
-                f"cannot read {file}: {error.strerror}; `acsard lan init` or `lan add` makes it"
+                f"cannot read {file}: {error.strerror}; `acsard tls init` or `tls add` makes it"
             ) from None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
@@ -58,7 +58,7 @@ def require_usable(directory: str) -> None:
     except (ssl.SSLError, ValueError) as error:
         raise CertificateError(
             f"the certificates in {directory} cannot be used ({error}): they are not PEM, or the "
-            "key belongs to another certificate or has a password; `acsard lan init` or `lan "
+            "key belongs to another certificate or has a password; `acsard tls init` or `tls "
             "add` makes new ones",
         ) from None
 
@@ -207,7 +207,7 @@ def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -
         case code if code == EXPIRED:
             return (
                 f"the certificate of {host} has expired, by this machine's clock ({now}); if the "
-                "clock is right, run `acsard lan renew` where ca-key.pem is, and restart the "
+                "clock is right, run `acsard tls renew` where ca-key.pem is, and restart the "
                 "daemon"
             )
         case code if code == NOT_YET:
@@ -219,12 +219,12 @@ def _of_theirs(error: ssl.SSLCertVerificationError, host: str, directory: str) -
         case code if code in (WRONG_NAME, WRONG_ADDRESS):
             return (
                 f"the certificate there is not for {host}; connect by a name or address that it "
-                f"contains, or run on the robot: `acsard lan renew --address {host}`, and "
+                f"contains, or run on the robot: `acsard tls renew --address {host}`, and "
                 "restart the daemon"
             )
     return (
         f"the certificate of {host} comes from another authority than {directory}/{CA} "
-        f"({error.verify_message}); get a directory that `acsard lan` made for this robot"
+        f"({error.verify_message}); get a directory that `acsard tls` made for this robot"
     )
 
 
@@ -237,12 +237,12 @@ def _of_ours(reason: str, host: str, directory: str) -> str:
     if "CERTIFICATE_EXPIRED" in reason:
         return (
             f"{host} says that {mine} has expired or is not valid yet: make a new one with "
-            "`acsard lan add` where ca-key.pem is, or set the clocks of both machines "
+            "`acsard tls add` where ca-key.pem is, or set the clocks of both machines "
             "(`timedatectl`)"
         )
     if "UNKNOWN_CA" in reason or "CERTIFICATE" in reason or "DECRYPT" in reason:
         return (
             f"{host} does not accept {mine}: it comes from another authority than the robot's; "
-            "get one that `acsard lan add` made there"
+            "get one that `acsard tls add` made there"
         )
     return f"{host} does not speak TLS here ({reason}); a plain endpoint begins with tcp/"

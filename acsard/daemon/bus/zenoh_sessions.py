@@ -68,7 +68,7 @@ def daemon_session(
     return _opened(settings, bus.plain)
 
 
-def door_session(
+def gateway_session(
     bus: BusConfig,
     robot_id: str,
     sources: tuple[str, ...],
@@ -170,7 +170,7 @@ def client_session(endpoint: str, tls: str = "") -> zenoh.Session:
     if secured and not tls:
         raise CertificateError(
             f"{endpoint} requires a certificate: add --tls DIRECTORY (tls= in Python), the "
-            "directory that `acsard lan init` or `lan add` made for you"
+            "directory that `acsard tls init` or `tls add` made for you"
         )
     if secured:
         # Zenoh reports unusable certificates as if the daemon were absent.

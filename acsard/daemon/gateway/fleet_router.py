@@ -80,7 +80,7 @@ def _for(robot: str, block: str) -> str:
 
 ROUTER_EVENTS: Events = {
     "open": "router_open",
-    "crowded": "router_crowded",
+    "full": "router_full",
     "stuck": "router_stuck",
     # "alone" is missing because the router does not wait for a daemon.
 }

@@ -12,7 +12,6 @@ import os
 import resource
 import select
 import signal
-import stat
 import threading
 from typing import Protocol
 
@@ -20,9 +19,9 @@ import zenoh
 
 from acsard.daemon.gateway.watch import Events, Look, Watch
 from acsard.host import clock
+from acsard.host.child import Parent, end_with_parent
 from acsard.host.errors import Exit
 from acsard.host.logs import Log
-from acsard.host.processes import end_with_parent
 from acsard.host.systemd import Systemd
 
 LOOK_S = 0.25
@@ -68,11 +67,8 @@ class Watched:
 
         If it is a socket, the process writes a sign of life to it at each look.
         """
-        self._side, self._log, self._manager, self._holder = side, log, manager, holder
-        self._beats = False
-        if holder is not None and stat.S_ISSOCK(os.fstat(holder).st_mode):
-            os.set_blocking(holder, False)
-            self._beats = True
+        self._side, self._log, self._manager = side, log, manager
+        self._parent = None if holder is None else Parent(holder)
         self._session: zenoh.Session | None = None
         """Kept open until the process ends, because closing it could take for ever."""
         self._look = Look(0)
@@ -86,7 +82,7 @@ class Watched:
         """
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             signal.signal(number, self._leave)
-        if self._holder is not None:
+        if self._parent is not None:
             end_with_parent(signal.SIGKILL)
         _confine()
         self._manager.ready()
@@ -113,13 +109,13 @@ class Watched:
     def _wait(self) -> bool:
         """Wait for `LOOK_S`, and return whether the process must end."""
         self._manager.alive()
-        held = [] if self._holder is None else [self._holder]
-        if self._beats and self._holder is not None:
-            # The socket's buffer is full, or the holder is gone.
-            with contextlib.suppress(OSError):
-                os.write(self._holder, b".")
-        ended, _, _ = select.select(held, [], [], LOOK_S)
-        return self._leaving or bool(ended and _at_end(held[0]))
+        parent = self._parent
+        if parent is None:
+            select.select([], [], [], LOOK_S)
+            return self._leaving
+        parent.beat()
+        readable, _, _ = select.select([parent.fd], [], [], LOOK_S)
+        return self._leaving or (bool(readable) and parent.gone())
 
     def _open(self) -> Watch:
         side = self._side
@@ -144,15 +140,6 @@ class Watched:
                 pause.wait(LOOK_S)
         except BaseException as error:  # noqa: BLE001 - raised by `run`, which ends the process
             self._error = error
-
-
-def _at_end(holder: int) -> bool:
-    """Return whether the other end of a readable descriptor is closed."""
-    try:
-        return not os.read(holder, 64)
-    except ConnectionResetError:
-        # The other end was closed before it had read all signs of life.
-        return True
 
 
 def _confine() -> None:

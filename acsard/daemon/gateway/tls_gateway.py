@@ -16,14 +16,14 @@ from zenoh.handlers import Callback
 
 from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode, encoding_name
-from acsard.core.messages.schema import DoorState
+from acsard.core.messages.schema import GatewayState
 from acsard.core.messages.topics import full_key
 from acsard.core.ros.transports import command_keys
 from acsard.core.values import NS_PER_S
-from acsard.daemon.bus.access import door_access
+from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.bus.tls import ends_ns, require_usable
-from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, door_session, reachable
-from acsard.daemon.gateway.watch import DOOR_EVENTS, Look, Watch
+from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
+from acsard.daemon.gateway.watch import GATEWAY_EVENTS, Look, Watch
 from acsard.host import clock
 
 CONNECT_S = 1.0
@@ -37,12 +37,12 @@ unanswered queries have been counted, even if the gateway waits for a core betwe
 """
 
 
-class Door:
+class Gateway:
     """The TLS gateway. It opens when the daemon runs, and reports its connections to the daemon."""
 
     most = MAX_SESSIONS - 1
     """Largest number of connections from the network; one more is the daemon's."""
-    events = DOOR_EVENTS
+    events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
         """Check the certificates.
@@ -69,8 +69,8 @@ class Door:
         """Open the session between the network and the daemon."""
         config = self._config
         sources = tuple(source.name for source in config.commands.sources)
-        limited, access = command_keys(config.ros), door_access(config)
-        session = door_session(config.bus, config.robot.id, sources, limited, access)
+        limited, access = command_keys(config.ros), gateway_access(config)
+        session = gateway_session(config.bus, config.robot.id, sources, limited, access)
         self._opened_ns = clock.mono_ns()
         return session
 
@@ -86,10 +86,10 @@ class Door:
         """Report to the daemon, which shows it in `state`."""
         if self._publisher is None:
             self._ends_ns = ends_ns(self._config.bus.tls) or 0
-            key, kind = full_key(self._config.robot.id, "door"), "DoorState"
+            key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
             encoding = encoding_name("msgpack", kind)
             self._publisher = session.declare_publisher(key, encoding=encoding)
-        said = DoorState(self._opened_ns, len(look.holders), watch.crowded, self._ends_ns)
+        said = GatewayState(self._opened_ns, len(look.holders), watch.full, self._ends_ns)
         self._publisher.put(encode(said, "msgpack"))
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Event, EventName
+from acsard.host.rate_limits import Bucket, Rate
 from acsard.host.silence import Silence
 
 STUCK_NS = NS_PER_S
@@ -17,7 +18,8 @@ STUCK_NS = NS_PER_S
 FIRST_NS, ALONE_NS = 5 * NS_PER_S, NS_PER_S
 """Time to wait for the daemon, ns: at the start, while other clients connect too, and later."""
 
-TOLD_EVERY_NS = 60 * NS_PER_S
+REPORTS = Rate(1 / 60)
+"""Rate of the reports that all connections are taken: one a minute."""
 
 UNANSWERED = 4
 """Number of consecutive queries without an end, each at least a second old, that show a dead
@@ -28,16 +30,16 @@ open.
 NAMES = 5
 """Number of clients named in a report, those with the most connections."""
 
-What = Literal["open", "crowded", "stuck", "alone"]
+What = Literal["open", "full", "stuck", "alone"]
 
 Events = dict[What, EventName]
 """Name of the log event for each incident."""
 
-DOOR_EVENTS: Events = {
-    "open": "door_open",
-    "crowded": "door_crowded",
-    "stuck": "door_stuck",
-    "alone": "door_alone",
+GATEWAY_EVENTS: Events = {
+    "open": "gateway_open",
+    "full": "gateway_full",
+    "stuck": "gateway_stuck",
+    "alone": "gateway_lost_daemon",
 }
 
 
@@ -56,25 +58,24 @@ class Look(Struct, frozen=True):
 class Watch:
     """Judgement of one look after the other."""
 
-    def __init__(self, most: int, opened_ns: int, events: Events = DOOR_EVENTS) -> None:
+    def __init__(self, most: int, opened_ns: int, events: Events = GATEWAY_EVENTS) -> None:
         """Start at the monotonic time `opened_ns`, with at most `most` connections from outside."""
         self._most, self._events = most, events
         self._linked_ns, self._patience_ns = opened_ns, FIRST_NS
         self._last_ns, self._silence = 0, Silence(STUCK_NS)
-        self._told_ns: int | None = None
-        self.crowded = 0
+        self._reports = Bucket(REPORTS)
+        self.full = 0
         """Number of looks at which all connections were in use."""
 
     def tell(self, look: Look) -> Event | None:
         """Return an event about a new look, or None."""
         if len(look.holders) < self._most:
             return None
-        self.crowded += 1
-        if self._told_ns is not None and look.at_ns - self._told_ns < TOLD_EVERY_NS:
+        self.full += 1
+        if not self._reports.take(look.at_ns):
             return None
-        self._told_ns = look.at_ns
         text = f"all {self._most} connections are taken, {crowd(look.holders)}"
-        return Event(self._events["crowded"], f"{text}: no other client is admitted", "warning")
+        return Event(self._events["full"], f"{text}: no other client is admitted", "warning")
 
     def reopen(self, look: Look, passed_ns: int) -> Event | None:
         """Return why the session must be opened again, `passed_ns` after the last call, or None."""

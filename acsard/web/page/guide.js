@@ -27,8 +27,8 @@ export class Guide {
     link.addEventListener("guide", ({ detail }) => this.#take(detail.guide));
     link.addEventListener("down", () => this.#running && this.#over("the connection is gone: the robot's computer has ended it"));
     $("check").addEventListener("click", () => this.#begin({ begin: "check", port: $("check-port").value }));
-    $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#way() }));
-    $("way").addEventListener("change", () => this.#ways());
+    $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#method() }));
+    $("method").addEventListener("change", () => this.#methods());
     // Act on pointerdown, like STOP: a finger that stays down or slides off has also pressed.
     for (const [name, act] of [["guide-halt", () => this.#key()], ["guide-leave", () => this.leave()]]) {
       $(name).addEventListener("pointerdown", act);
@@ -51,29 +51,29 @@ export class Guide {
   }
 
   /** Show the options that `api/guide` returned, or the reason why there are none. */
-  choices({ ways, way, advice, ports, note, error }) {
+  choices({ methods, method, advice, ports, note, error }) {
     text("guide-note", [error ?? note, this.#busy].filter(Boolean).join(" "));
     for (const id of ["check-card", "calibrate-card"]) $(id).hidden = Boolean(error);
     if (error) return;
     options($("check-port"), ports.map(({ port, what }) => [port, what ? `${port} (${what})` : port]));
-    const first = !$("way").options.length;
-    options($("way"), [["", "a gyro where the robot has one, else a tape"], ...Object.entries(ways).map(([way, needs]) => [way, `${way}: ${needs}`])]);
-    if (first) $("way").value = way; // keep a choice that the operator has made
+    const first = !$("method").options.length;
+    options($("method"), [["", "a gyro where the robot has one, else a tape"], ...Object.entries(methods).map(([name, needs]) => [name, `${name}: ${needs}`])]);
+    if (first) $("method").value = method; // keep a choice that the operator has made
     text("advice", advice);
-    this.#ways();
+    this.#methods();
   }
 
   refused(why) {
     text("guide-note", why);
   }
 
-  #ways() {
-    $("positions-row").hidden = $("way").value !== "positions";
+  #methods() {
+    $("positions-row").hidden = $("method").value !== "positions";
   }
 
-  #way() {
-    const way = $("way").value;
-    return way === "positions" ? { way, positions: $("positions").value.trim() } : { way };
+  #method() {
+    const method = $("method").value;
+    return method === "positions" ? { method, positions: $("positions").value.trim() } : { method };
   }
 
   #begin(wish) {
@@ -84,7 +84,7 @@ export class Guide {
   #take(said) {
     if ("running" in said) return this.#runs(said);
     if ("subject" in said) this.#subject(said);
-    if ("told" in said) this.#tell(made("li", "", worded(said.told)));
+    if ("message" in said) this.#tell(made("li", "", worded(said.message)));
     if ("doing" in said) text("guide-doing", said.doing);
     if ("finding" in said) this.#found(said.finding);
     if ("progress" in said) this.#progress(said.progress);

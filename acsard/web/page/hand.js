@@ -13,7 +13,7 @@ export const GRACE = 500; // for the robot to follow again after an interruption
 export const HICCUP = 250; // between two looks; after a longer gap the robot has braked, so the hold opens again with zeros
 export const FROZEN = 1000; // after a longer gap the page stood still, and the finger may be gone
 
-const NEVER = ["inactive", "stopped", "fault", "leaving"];
+const NEVER = ["inactive", "stopped", "fault", "shutdown"];
 export const ZERO = { linear_x: 0, angular_z: 0 };
 
 /** Return why the robot does not follow `sender`, in words, or "" if it does. */

@@ -1,6 +1,6 @@
 // The page: one link, one drive control, and the views.
 
-import { invited, refusal } from "./door.js";
+import { invited, refusal } from "./access.js";
 import { Drive, SOURCE } from "./drive.js";
 import { Guide } from "./guide.js";
 import { objection } from "./hand.js";
@@ -8,7 +8,7 @@ import { Link } from "./link.js";
 import { PathMap } from "./map.js";
 import { Minute } from "./minute.js";
 import { Recordings } from "./recordings.js";
-import { barred, hint, may, permit } from "./roles.js";
+import { barred, hint, permit } from "./roles.js";
 import { Settings } from "./settings.js";
 import { Stopping } from "./stopping.js";
 import * as views from "./views.js";
@@ -115,11 +115,12 @@ async function got(path) {
 async function listed() {
   if (OTHER) return recordings.show([], "", `those of ${OTHER} are listed on its own page`);
   const files = await got("api/recordings");
-  recordings.show(files.error ? [] : files, barred(hello?.role ?? "", "operator"), files.error);
+  recordings.show(files.error ? [] : files, barred(hello, "recordings"), files.error);
 }
 
 async function configured() {
-  if (hello?.role !== "maintainer") return views.text("set-told", "settings are for maintainers");
+  const why = barred(hello, "set");
+  if (why) return views.text("set-told", `settings are ${why}`);
   const rows = await got("api/settings");
   if (rows.error) return views.text("set-told", rows.error);
   settings.show(rows);
@@ -163,7 +164,7 @@ function stated({ detail }) {
   silent = "";
   // The daemon's stop does not end a running check, so it confirms STOP only if none is running.
   if (LATCHED.includes(state.mode) && !guide.going) stopping.heard(heard - link.lag);
-  views.banner(state, hello?.role === "viewer", OTHER);
+  views.banner(state, Boolean(hello?.barred.clear), OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
   views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
@@ -171,7 +172,7 @@ function stated({ detail }) {
   const { linear, angular } = state; // null without feedback from the board
   views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
   views.text("turn", `${figure(angular, 2)} of ${figure(wished?.angular, 2)} rad/s`);
-  const late = state.figures.period_lateness?.last_minute;
+  const late = state.latencies.period_lateness?.last_minute;
   plots.late.add(heard, late ? late.p99 / 1000 : null, late ? late.max / 1000 : null);
   plots.speed.add(heard, linear, null);
   plots.turn.add(heard, angular, null);
@@ -188,11 +189,11 @@ function greeted({ detail }) {
   $("role").textContent = hello.role;
   drive.sender = hello.sender;
   drive.limits = hello.limits;
-  drive.allowed = !OTHER && may(hello.role, "operator");
-  permit(hello.role, OTHER ? `only on the own page of ${OTHER}` : "");
+  drive.allowed = !OTHER && !barred(hello, "drive");
+  permit(hello, OTHER ? `only on the own page of ${OTHER}` : "");
   $("limit").max = String(hello.limits.linear);
   limited();
-  views.text("hint", hint(hello.role, OTHER));
+  views.text("hint", hint(hello, OTHER));
   if (uninvited) views.text("told", uninvited); // an earlier token still gave access
   uninvited = "";
   if (hello.simulated || OTHER) link.subscribe("sim/pose", 5, OTHER);

@@ -83,14 +83,14 @@ function empty(robot, own) {
   return card;
 }
 
-/** Show the mode, the reason and any warnings. */
-export function banner(state, viewer, elsewhere) {
+/** Show the mode, the reason and any warnings. `locked` is true for a client that may not clear. */
+export function banner(state, locked, elsewhere) {
   document.body.dataset.mode = state.mode;
   text("mode", state.mode.toUpperCase());
   const why = reason(state, elsewhere);
-  text("reason", viewer ? why.replace("press Clear", "an operator clears it") : why);
+  text("reason", locked ? why.replace("press Clear", "an operator clears it") : why);
   const doubt = document.getElementById("doubt");
-  const warned = [state.doubt, state.recording, state.latch_file, state.certificate.startsWith("valid") ? "" : state.certificate];
+  const warned = [state.wheel_fault, state.recording_error, state.latch_file_error, state.certificate_expiry.startsWith("valid") ? "" : state.certificate_expiry];
   doubt.textContent = warned.filter(Boolean).join("; ");
   doubt.hidden = !doubt.textContent;
 }

@@ -144,7 +144,7 @@ def configured(config: Config, **mcu: Any) -> Config:
 class Nobody:
     """An operator who confirms everything and sees nothing, as with `--yes`."""
 
-    def say(self, text: str) -> None: ...
+    def doing(self, text: str) -> None: ...
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:
         return answers[0] if len(answers) == 1 else None
@@ -156,7 +156,7 @@ class Person(Nobody):
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
 
-    def say(self, text: str) -> None:
+    def doing(self, text: str) -> None:
         self._robot.turned.clear()
 
     def ask(self, question: str, answers: Sequence[str]) -> str | None:

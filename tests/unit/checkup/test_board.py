@@ -76,7 +76,7 @@ def test_a_motor_that_no_zeros_stop_ends_the_check() -> None:
             if self.mcu.vehicle.speeds[0] > 2.0:
                 self.mcu.understand = lambda line: None
 
-    robot = Deaf("no_watchdog", "unprompted")
+    robot = Deaf("no_watchdog", "free_running")
     with robot.board() as board:
         board.drive((SPEED, 0.0, 0.0, 0.0), 0.3)
         with pytest.raises(StoppedError) as end:

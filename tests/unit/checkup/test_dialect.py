@@ -11,7 +11,7 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import StoppedError
 from acsard.checkup.outcomes import find
 from acsard.core.config.settings import Config, McuConfig
-from acsard.core.link.silence_diagnosis import Look
+from acsard.core.link.link_diagnosis import Look
 from tests.unit.checkup.robots import Checked, Robot
 
 
@@ -121,8 +121,8 @@ def test_the_check_is_used_where_it_is_known(
         ((), {}, "PASS", False),
         (("sparse_replies",), {}, "FAIL", False),
         (("sparse_replies",), {"reply_period": 0.1}, "WARN", False),
-        (("unprompted",), {}, "FAIL", True),
-        (("unprompted",), {"reply_period": 0.1}, "PASS", True),
+        (("free_running",), {}, "FAIL", True),
+        (("free_running",), {"reply_period": 0.1}, "PASS", True),
     ],
 )
 def test_the_pace_is_judged_by_what_the_host_waits_for(

@@ -27,10 +27,10 @@ def known(board: Board) -> None:
         (("no_sample", "slow_reply"), "PASS", 0.0),
         (("ftdi",), "PASS", 0.0),
         (("sparse_replies",), "PASS", 0.0),
-        (("unprompted",), "PASS", 0.0),
+        (("free_running",), "PASS", 0.0),
         (("lost_replies",), "FAIL", 0.2),
         (("lost_commands", "plain_only"), "FAIL", 0.2),
-        (("lost_replies", "unprompted"), "FAIL", 0.2),
+        (("lost_replies", "free_running"), "FAIL", 0.2),
         (("bit_errors",), "FAIL", 0.25),
     ],
 )
@@ -148,7 +148,7 @@ def test_the_way_is_told_by_what_the_motors_did(
 def test_commands_lost_to_a_board_that_reports_by_its_own_clock_are_seen(
     fault: str, verdict: str
 ) -> None:
-    assert check("unprompted", fault, reply_period=0.1)["lost where"].verdict == verdict
+    assert check("free_running", fault, reply_period=0.1)["lost where"].verdict == verdict
 
 
 @pytest.mark.slow
@@ -160,7 +160,7 @@ def test_it_does_not_matter_which_of_the_lines_is_the_first_that_is_lost(earlier
             for _ in range(earlier):
                 self.mcu.receive(self.now_ns(), b"ap00.00,bp00.00,cp00.00,dp00.00\r\n")
 
-    checked = Checked(Spoken("unprompted", "lost_commands", reply_period=0.1))
+    checked = Checked(Spoken("free_running", "lost_commands", reply_period=0.1))
     assert checked["lost where"].verdict == "FAIL"
 
 

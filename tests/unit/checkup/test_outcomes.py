@@ -10,7 +10,7 @@ import pytest
 from acsard.checkup.motion import WATCHDOG_MOST_S
 from acsard.checkup.outcomes import MANUAL, OUTCOMES, find
 from acsard.checkup.procedure import STEPS
-from acsard.core.link.contract import WATCHDOG_S
+from acsard.core.link.link_state import WATCHDOG_S
 
 
 @pytest.mark.parametrize("outcome", MANUAL)

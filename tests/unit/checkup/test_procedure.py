@@ -42,7 +42,7 @@ GOOD: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "plain": (("plain_only",), {}),
     "checked": (("no_sample",), {"link_check": "auto"}),
     "samples": ((), {"link_check": "require", "encoder_counts": 3200}),
-    "old sketch": (("unprompted", "plain_only"), {"reply_period": 0.1}),
+    "old sketch": (("free_running", "plain_only"), {"reply_period": 0.1}),
     "comma sent": ((), {"trailing_comma": True}),
 }
 
@@ -55,7 +55,7 @@ def test_a_robot_that_is_right_passes(
 ) -> None:
     checked = check(*faults, person=person, **mcu)
     assert checked.failed == []
-    assert checked.named("WARN") == (["reply form"] if "unprompted" in faults else [])
+    assert checked.named("WARN") == (["reply form"] if "free_running" in faults else [])
     assert not checked.left_turning
     new = {"mcu.link_check", "mcu.encoder_counts"} if not faults and len(mcu) == 1 else set()
     assert set(checked.changes) == new
@@ -71,7 +71,7 @@ def test_a_slow_wire_passes(baud: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.0, 0.2])
 def test_quick_and_slow_motors_pass_and_show_their_watchdog(lag: float) -> None:
-    for faults in ((), ("plain_only",), ("unprompted",)):
+    for faults in ((), ("plain_only",), ("free_running",)):
         checked = check(*faults, config=Config(sim=SimConfig(motor_time_constant=lag)))
         assert set(checked.failed) <= {"reply rate"}
         assert int(checked["watchdog"].figure.split()[0]) == pytest.approx(300, abs=60)
@@ -134,10 +134,10 @@ TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
     ("comma_latched", "trailing comma", "FAIL", "motor d (rear right) still turns after zeros",
      "trailing_comma = true", {"mcu.trailing_comma": True}),
     ("no_watchdog", "watchdog", "FAIL", "run on", "300 ms", {}),
-    ("fed_by_anything", "watchdog", "FAIL", "half-broken cable", "whole valid line", {}),
+    ("watchdog_fed_by_bad_lines", "watchdog", "FAIL", "half-broken cable", "whole valid line", {}),
     ("late_watchdog", "watchdog", "FAIL", "1.0 s after", "300 ms", {}),
     ("stuck_encoder=b", "motor b", "FAIL", "a dead encoder", "look whether", {}),
-    ("other_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
+    ("wrong_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
      {"mcu.baud_rate": 57600}),
     ("sparse_replies", "reply rate", "FAIL", "one reply in", "reply_period = 0.1",
      {"mcu.reply_period": 0.1}),
@@ -163,7 +163,7 @@ def test_a_planted_fault_is_found_and_named(
 
 
 def test_ten_replies_a_second_by_its_own_clock_are_the_same_mend() -> None:
-    checked = check("unprompted")
+    checked = check("free_running")
     assert checked["reply rate"].figure == "10 Hz, by its own clock"
     assert checked.changes["mcu.reply_period"] == 0.1
 
@@ -245,7 +245,7 @@ def test_old_firmware_with_its_comma_configured_fails_by_its_broken_lines_only()
 
 def test_several_faults_at_once_are_all_found() -> None:
     checked = check(
-        "comma_latched", "other_baud=57600", "reversed_motor=a", "stuck_encoder=b", "spaces",
+        "comma_latched", "wrong_baud=57600", "reversed_motor=a", "stuck_encoder=b", "spaces",
         "no_watchdog", "reversed_wheel=c", person=True,
     )  # fmt: skip
     assert [name.partition(" (")[0] for name in checked.failed] == [
@@ -534,7 +534,7 @@ def test_what_it_does_is_said_before_it_takes_time() -> None:
     said: list[str] = []
 
     class Listener(Nobody):
-        def say(self, text: str) -> None:
+        def doing(self, text: str) -> None:
             said.append(text)
 
     robot = Robot()
@@ -604,9 +604,9 @@ def names(checked: Checked) -> set[str]:
         (Busy, "no_sample", 0.04, 2),
         (Busy, "plain_only", 0.15, 5),
         (Starved, "no_sample", 0.4, 40),
-        (Busy, "unprompted", 0.06, 3),
+        (Busy, "free_running", 0.06, 3),
         (Busy, "no_sample", 0.4, 11),
-        (Starved, "unprompted", 0.15, 9),
+        (Starved, "free_running", 0.15, 9),
         (Starved, "plain_only", 0.06, 3),
         (Starved, "plain_only", 0.4, 11),
         (Busy, "no_sample", 0.03, 1),
@@ -616,7 +616,7 @@ def names(checked: Checked) -> set[str]:
 def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
     computer: type[Busy], fault: str, late_s: float, every: int
 ) -> None:
-    period = 0.1 if fault == "unprompted" else 0.0
+    period = 0.1 if fault == "free_running" else 0.0
     robot = computer(fault, late_s=late_s, every=every, reply_period=period, link_check="auto")
     checked = Checked(robot)
     assert checked.failed == []
@@ -647,7 +647,7 @@ def test_lines_of_a_board_whose_pace_was_not_measured_are_not_counted() -> None:
     unpaced = 0
     for until_s in range(2, 10):
         late = Busy(
-            "unprompted", "plain_only", late_s=0.45, every=9, until_s=until_s, reply_period=0.1
+            "free_running", "plain_only", late_s=0.45, every=9, until_s=until_s, reply_period=0.1
         )
         checked = Checked(late)
         if "reply rate" in names(checked):
@@ -680,7 +680,7 @@ def test_the_person_is_asked_once_about_a_motor_that_is_looked_at_again() -> Non
         ("reversed_encoder=b", "motor b (front left)"),
         ("swapped_motors=a:b", "motor a (front right)"),
         ("comma_latched", "trailing comma"),
-        ("other_baud=57600", "baud rate"),
+        ("wrong_baud=57600", "baud rate"),
         ("no_watchdog", "watchdog"),
     ],
 )
@@ -739,7 +739,7 @@ def test_motors_that_were_not_judged_are_said_to_be_unseen_not_wrong() -> None:
     ("fault", "name"),
     [
         ("late_watchdog", "watchdog"),
-        ("fed_by_anything", "watchdog"),
+        ("watchdog_fed_by_bad_lines", "watchdog"),
         ("bias=a:1.5", "motor a (front right)"),
     ],
 )
@@ -770,7 +770,7 @@ def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not()
         return command
 
     class Sees(Nobody):
-        def say(self, text: str) -> None:
+        def doing(self, text: str) -> None:
             if "once more" not in text:
                 robot.looked = text.startswith("trying the comma")
 

@@ -38,7 +38,7 @@ def measured(robot: Robot, *motors: int) -> tuple[str, str]:
 
 
 @pytest.mark.variations(3)
-@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
+@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
 @pytest.mark.parametrize("time_ms", [120, 450])
 @pytest.mark.parametrize("robot", [Robot, ByItsOwnClock])
 def test_a_time_within_the_contract_is_measured(
@@ -53,7 +53,7 @@ def test_a_time_within_the_contract_is_measured(
 
 
 @pytest.mark.variations(3)
-@pytest.mark.parametrize("kind", [("plain_only",), (), ("unprompted",)])
+@pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.3])
 def test_a_motor_s_own_run_out_is_not_taken_for_the_watchdog(
     kind: tuple[str, ...], lag: float
@@ -65,7 +65,7 @@ def test_a_motor_s_own_run_out_is_not_taken_for_the_watchdog(
         assert verdict == "PASS"
 
 
-@pytest.mark.parametrize("kind", ["plain_only", "no_sample", "unprompted"])
+@pytest.mark.parametrize("kind", ["plain_only", "no_sample", "free_running"])
 def test_none_and_one_too_long_fail(kind: str) -> None:
     for robot in (Robot, ByItsOwnClock):
         assert measured(robot(kind, "no_watchdog")) == ("FAIL", "none within 2.5 s")
@@ -85,13 +85,13 @@ def test_a_motor_that_does_not_turn_as_told_cannot_show_it() -> None:
         assert watchdog.finding(board, []).verdict == "SKIPPED"
 
 
-@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("unprompted",)])
+@pytest.mark.parametrize("kind", [("plain_only",), ("no_sample",), (), ("free_running",)])
 @pytest.mark.parametrize("lag", [0.0, pytest.param(0.6, marks=pytest.mark.slow)])
 def test_one_that_broken_lines_feed_fails_and_no_other(kind: tuple[str, ...], lag: float) -> None:
     config = Config(sim=SimConfig(motor_time_constant=lag))
     for robot in (Robot,) if lag else (Robot, ByItsOwnClock):
         assert measured(robot(*kind, config=config))[0] == "PASS"
-        verdict, figure = measured(robot(*kind, "fed_by_anything", config=config))
+        verdict, figure = measured(robot(*kind, "watchdog_fed_by_bad_lines", config=config))
         assert verdict == "FAIL"
         assert figure.endswith("fed by broken lines")
 
@@ -143,7 +143,7 @@ def silence(robot: Robot) -> Between:
     return found
 
 
-@pytest.mark.parametrize("kind", [("plain_only",), (), ("unprompted",)])
+@pytest.mark.parametrize("kind", [("plain_only",), (), ("free_running",)])
 @pytest.mark.parametrize("time_s", [0.2, 0.37])
 def test_the_true_time_lies_between_what_is_told(kind: tuple[str, ...], time_s: float) -> None:
     robot = Robot(*kind)
@@ -153,7 +153,7 @@ def test_the_true_time_lies_between_what_is_told(kind: tuple[str, ...], time_s: 
     assert most_s - least_s < 0.2
 
 
-@pytest.mark.parametrize("kind", ["plain_only", "no_sample", "unprompted"])
+@pytest.mark.parametrize("kind", ["plain_only", "no_sample", "free_running"])
 def test_motors_that_never_stop_have_no_time(kind: str) -> None:
     assert silence(Robot(kind, "no_watchdog"))[1] == UNKNOWN
 

@@ -42,7 +42,7 @@ def test_json_is_one_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert called(tmp_path, GOOD, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert 1.5 < found["wheel_separation_multiplier"] < 1.8
-    assert found["way"] == "yaw_rate"
+    assert found["reference"] == "yaw_rate"
 
 
 def test_write_keeps_the_comments_and_a_second_time_finds_nothing_to_improve(
@@ -172,14 +172,14 @@ def driving(*words: str) -> int:
     [
         ([], "person at the terminal"),
         (["--distance", "2.0"], "--distance goes with --log"),
-        (["--way", "positions"], "--positions KEY"),
-        (["--way", "tape", "--positions", "sim/pose"], "leave one out"),
+        (["--method", "positions"], "--positions KEY"),
+        (["--method", "tape", "--positions", "sim/pose"], "leave one out"),
         (["--positions-at", "tcp/127.0.0.1:7447"], "--positions KEY"),
         (["--positions", "odom"], "computed from the wheels themselves"),
         (["--positions", "acsard/acsar/odom"], "computed from the wheels themselves"),
-        (["--log", "drive.csv", "--way", "tape"], "--way is for a guided drive"),
+        (["--log", "drive.csv", "--method", "tape"], "--method is for a guided drive"),
         (["--log", "drive.csv", "--imu", "imu"], "--imu is for a guided drive"),
-        (["--way", "tape", "--imu", "imu"], "--imu is for --way gyro, not for --way tape"),
+        (["--method", "tape", "--imu", "imu"], "--imu is for --method gyro, not for --method tape"),
         (["--positions", "sim/pose", "--imu", "x/imu"], "not for --positions"),
         (["--log", "drive.csv", "--yes"], "--yes is for a guided drive"),
         (["--log", "drive.csv", "--json-lines"], "--json-lines is for a guided drive"),

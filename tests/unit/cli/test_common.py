@@ -20,6 +20,7 @@ from acsard.core.config.settings import Config
 from acsard.host import config_file
 from acsard.host.config_file import PLACES, find, writable
 from acsard.host.errors import Exit, ExitError, UsageError
+from tests.each import each
 
 
 class Places:
@@ -203,7 +204,7 @@ def test_a_key_that_nobody_has_is_warned_of_but_not_a_stranger_s_command(
 # keys of another type than the program expected
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "instead"),
     [
         ("info", "acsard get info"),
@@ -217,7 +218,7 @@ def test_what_is_never_published_says_what_to_type_instead(key: str, instead: st
         require_followed(key)
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "instead"),
     [
         ("srv/clear", "call clear"),

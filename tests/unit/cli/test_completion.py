@@ -13,6 +13,7 @@ import pytest
 from acsard.cli import VERBS, main
 from acsard.cli.completion import SHELLS
 from acsard.host.errors import Exit
+from tests.each import each
 from tests.system.harness import Program, environment, until
 from tests.system.test_cli import Terminal
 from tests.system.typed import typed
@@ -71,12 +72,12 @@ def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "offered"),
     [
         ("acsard ca", {"call", "calibrate"}),
         ("acsard call cl", {"clear"}),
-        ("acsard lan init --wr", {"--write"}),
+        ("acsard tls init --wr", {"--write"}),
         ("acsard service uninstall --pu", {"--purge"}),
         *VALUES,
     ],
@@ -94,7 +95,7 @@ def test_bash_offers_verbs_options_and_values(
     assert set(offers("bash", "-c", ask)) == offered
 
 
-@pytest.mark.parametrize(("words", "offered"), VALUES)
+@each(("words", "offered"), VALUES)
 def test_fish_offers_the_same_values(
     scripts: dict[str, Path], words: str, offered: set[str]
 ) -> None:
@@ -145,7 +146,7 @@ def test_recordings_are_offered_by_number_beside_the_files(
     (tmp_path / "42.mcap").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
-    script, words = scripts[shell], "acsard log show 4"
+    script, words = scripts[shell], "acsard recording show 4"
     ask = {
         "bash": ("-c", ASK.format(script=script, words=words, function="_shtab_acsard")),
         "fish": ("--no-config", "-c", f"source {script}; complete -C '{words}'"),
@@ -168,7 +169,7 @@ def test_every_shell_knows_every_verb_and_takes_its_script(
 def test_the_man_page_says_what_help_says(capsys: pytest.CaptureFixture[str]) -> None:
     page = printed(capsys, "man").replace("\\-", "-").replace("\\", "")
     assert page.startswith(".TH ACSARD")
-    words = ("acsard service uninstall", "--purge", "acsard lan renew", "exit codes: 0 done")
+    words = ("acsard service uninstall", "--purge", "acsard tls renew", "exit codes: 0 done")
     assert [word for word in words if word not in page] == []
 
 

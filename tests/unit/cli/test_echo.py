@@ -12,13 +12,14 @@ from acsard.cli.echo import _shown, json_line
 from acsard.core.messages.encodings import Decoder, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Twist, TwistStamped, Vector3
 from acsard.host.errors import Exit
+from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS
 
 BODY = {"linear": {"x": 0.5}, "name": ["ä", "b\n"], "n": -3, "ok": True, "none": None}
 
 
-@pytest.mark.parametrize("form", ["json", "msgpack"])
-@pytest.mark.parametrize("named", [True, False])
+@each("form", ["json", "msgpack"])
+@each("named", [True, False])
 def test_a_message_is_its_json_on_one_line(form: Format, named: bool) -> None:
     line = json_line(encoding_name(form, "State") if named else "", encode(BODY, form))
     assert msgspec.json.decode(line) == BODY
@@ -50,7 +51,7 @@ def test_a_number_that_is_not_finite_is_null() -> None:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "payload"),
     [
         ("", b""),
@@ -74,7 +75,7 @@ def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, paylo
     assert msgspec.json.decode(json_line(encoding, payload)) == {"undecodable": repr(payload)}
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         msgspec.msgpack.encode({None: 1}),
@@ -83,7 +84,6 @@ def test_what_cannot_be_decoded_is_shown_as_the_bytes_it_is(encoding: str, paylo
         b'{"a":' + b"[" * 3000 + b"]" * 3000 + b"}",
         b"\x81\xa1a" + b"\x91" * 3000 + b"\xc0",
     ],
-    ids=["none-key", "list-key", "ext", "deep-json", "deep-msgpack"],
 )
 def test_echo_survives_any_payload(payload: bytes) -> None:
     assert json_line("", payload).isprintable()
@@ -98,8 +98,8 @@ def test_a_key_without_a_short_form_is_refused_with_those_that_have_one(
     assert all(key in told for key in ("odom", "state", "cmd_vel_out", "sim/pose"))
 
 
-@pytest.mark.parametrize("form", ["json", "msgpack"])
-@pytest.mark.parametrize("whose", ["", "robot1"])
+@each("form", ["json", "msgpack"])
+@each("whose", ["", "robot1"])
 def test_a_short_line_says_whose_it_is_of_many(form: Format, whose: str) -> None:
     twist = TwistStamped(Header(), Twist(Vector3(0.5), Vector3(z=0.2)))
     payload = encode(twist, form)

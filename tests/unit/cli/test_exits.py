@@ -8,6 +8,7 @@ from acsard.cli import main
 from acsard.cli.exits import CODES, code_of
 from acsard.host import errors
 from acsard.host.errors import WORDS, Exit, ExitError, MendableError
+from tests.each import each
 
 PROMISED = [
     (errors.UsageError, ValueError, 2),
@@ -25,7 +26,7 @@ PROMISED = [
 """Error class, built-in base class and exit code, as section 6 of DESIGN lists them."""
 
 
-@pytest.mark.parametrize(("kind", "builtin", "code"), PROMISED)
+@each(("kind", "builtin", "code"), PROMISED)
 def test_an_error_is_of_a_family_of_pythons_and_has_its_code(
     kind: type[MendableError], builtin: type[Exception], code: int
 ) -> None:
@@ -53,6 +54,6 @@ def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(WORDS) == set(Exit)
 
 
-@pytest.mark.parametrize("code", list(Exit))
+@each("code", list(Exit))
 def test_a_verb_may_end_with_any_code(code: Exit) -> None:
     assert code_of(ExitError(code, "so")) is code

@@ -26,7 +26,8 @@ from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
-from acsard.prompts.check_prompts import Person, ended_by_signals
+from acsard.prompts.prompt import ended_by_signals
+from acsard.prompts.terminal_prompt import TerminalPrompt
 from tests.unit.checkup.robots import Busy, Robot
 
 
@@ -150,7 +151,7 @@ def test_write_without_tomlkit_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "tomlkit", None)
-    with pytest.raises(ExitError, match=r"pip install .*\[mcu\]'"):
+    with pytest.raises(ExitError, match=r"pip install .*\[write\]'"):
         called(tmp_path, "--port", "sim", "--yes", "--write")
 
 
@@ -223,7 +224,7 @@ def test_a_person_is_asked_until_the_answer_is_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("yes\n RL \n"))
-    assert Person().ask("which?", ("fr", "rl")) == "rl"
+    assert TerminalPrompt().ask("which?", ("fr", "rl")) == "rl"
     out, err = capsys.readouterr()
     assert out == ""
     assert "which? [fr/rl/q]" in err
@@ -264,7 +265,7 @@ def test_progress_does_not_go_into_a_pipe(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert called(tmp_path, "--port", "sim", "--yes") == 0
-    Person().say("a motor turns")
+    TerminalPrompt().doing("a motor turns")
     out, err = capsys.readouterr()
     assert err == ""
     assert "   ..." not in out
@@ -284,7 +285,7 @@ def test_q_and_the_end_of_the_input_end_the_check(
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
     with pytest.raises(KeyboardInterrupt):
-        Person().ask("lifted?", ("lifted",))
+        TerminalPrompt().ask("lifted?", ("lifted",))
 
 
 def test_who_is_asked_whether_the_wheels_are_lifted_is_told_the_way_out(
@@ -293,7 +294,7 @@ def test_who_is_asked_whether_the_wheels_are_lifted_is_told_the_way_out(
     monkeypatch.setattr(sys, "stdin", io.StringIO("q\n"))
     robot = Robot()
     with pytest.raises(KeyboardInterrupt):
-        procedure.run(robot, Person(), robot.config, lambda finding: None)
+        procedure.run(robot, TerminalPrompt(), robot.config, lambda finding: None)
     assert "q or Ctrl-C leaves" in capsys.readouterr().err
     assert not any(robot.later())
 
@@ -313,7 +314,7 @@ def test_a_signal_ends_it_once_and_a_second_one_does_not_disturb_the_zeros(
     reached = []
 
     def signalled() -> None:
-        with ended_by_signals():
+        with ended_by_signals(exits=True):
             try:
                 os.kill(os.getpid(), number)
             finally:

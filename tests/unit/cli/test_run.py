@@ -11,6 +11,7 @@ from acsard.cli import run
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
 from acsard.doctor.running import OPTIONS
+from tests.each import each
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:
@@ -41,7 +42,7 @@ def test_the_doctor_knows_all_that_options_set() -> None:
     assert keys == set(OPTIONS)
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "table"),
     [
         (["--port", "x"], "mcu"),

@@ -11,9 +11,10 @@ from acsard.cli import parser
 from acsard.cli.set import pairs
 from acsard.core.messages.schema import ServiceReply
 from acsard.host.errors import UsageError
+from tests.each import each
 
 
-@pytest.mark.parametrize(
+@each(
     ("word", "value"),
     [
         ("0.8", 0.8),

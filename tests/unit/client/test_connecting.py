@@ -56,7 +56,7 @@ def test_a_directory_without_certificates_is_said_and_not_taken_for_a_missing_da
     tmp_path: Path,
 ) -> None:
     with (
-        pytest.raises(client.CertificateError, match="acsard lan") as error,
+        pytest.raises(client.CertificateError, match="acsard tls") as error,
         client.connect(NOBODY_LISTENS, tls=str(tmp_path / "laptop-anna")),
     ):
         pass

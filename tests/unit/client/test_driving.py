@@ -21,6 +21,7 @@ from acsard.core.messages.encodings import encode, encoding_name
 from acsard.core.messages.schema import RobotState, SourceState, Time
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import NoAnswerError, NotDrivenError, UsageError
+from tests.each import each
 
 US, OTHER = "joe/1/aa", "ann/2/bb"
 NEUTRAL = "send a zero first: app must send a zero"
@@ -358,13 +359,13 @@ def test_a_drive_of_no_time_is_refused_before_anything_is_sent(seconds: float) -
     assert world.sent == []
 
 
-@pytest.mark.parametrize(
+@each(
     ("state", "words"),
     [
         (FOLLOWED, ""),
         (replace(FOLLOWED, sender=""), ""),  # an older daemon does not name the sender
         (replace(FOLLOWED, sources=[source("1 more of its senders: wait")]), ""),
-        (replace(FOLLOWED, sender=OTHER), f"another program drives as app, {OTHER}"),
+        (replace(FOLLOWED, sender=OTHER), f"another program drives the robot as app, {OTHER}"),
         (OPENING, NEUTRAL),
         (HIGHER, "teleop has priority"),
         (replace(STOPPED, mode="ready", sources=[source("a command", 7.0)]), "receives no command"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,6 +19,7 @@ from acsard.core.formatting import (
     rough,
     signed,
 )
+from tests.each import each
 
 MOST = 64
 
@@ -32,7 +32,7 @@ def test_nothing_that_a_terminal_obeys_is_left() -> None:
     assert printable("Zürich, 8.5 °C") == "Zürich, 8.5 °C"
 
 
-@pytest.mark.parametrize("data", [bytes(range(256)), b"\r\n", "é→`".encode(), b""])
+@each("data", [bytes(range(256)), b"\r\n", "é→`".encode(), b""])
 def test_bytes_are_shown_printable_and_few(data: bytes) -> None:
     text = printable_bytes(data, MOST)
     assert text.isprintable()
@@ -54,7 +54,7 @@ def test_json_stays_the_same_and_can_be_printed(text: str) -> None:
     assert line.isprintable()
 
 
-@pytest.mark.parametrize(
+@each(
     ("seconds", "text"),
     [
         (0.0, "0.0 µs"), (63.1e-6, "63 µs"), (999.4e-6, "999 µs"), (999.6e-6, "1.0 ms"),
@@ -66,7 +66,7 @@ def test_a_short_duration_has_two_digits_in_its_own_unit(seconds: float, text: s
     assert rough(seconds, 1e-6) == text
 
 
-@pytest.mark.parametrize(
+@each(
     ("seconds", "text"),
     [(None, "never"), (math.inf, "never"), (0.04, "0.0 s"), (9.96, "10 s"), (99.4, "99 s"),
      (240.0, "4.0 min"), (7300.0, "2.0 h"), (9e5, "10 d"), (math.nan, "?"), (-1.0, "?")],
@@ -80,7 +80,7 @@ def test_a_rough_duration_never_takes_more_than_7_characters(seconds: float, uni
     assert len(rough(seconds, unit)) <= 7
 
 
-@pytest.mark.parametrize(
+@each(
     ("seconds", "text"),
     [
         (0.04, "0 s"), (3.0, "3 s"), (59.94, "59.9 s"), (59.96, "1 min"), (303.0, "5 min 3 s"),
@@ -92,7 +92,7 @@ def test_a_duration_has_its_two_largest_units(seconds: float, text: str) -> None
     assert lasting(seconds) == text
 
 
-@pytest.mark.parametrize(
+@each(
     ("value", "text"),
     [(1.5, "  +1.50"), (-0.001, "  +0.00"), (-2.0, "  -2.00"), (1e12, " +1e+12"),
      (math.inf, "   +inf"), (math.nan, "      -")],

@@ -257,7 +257,7 @@ def test_no_wheel_may_be_faster_than_its_limit(guard: Guarded, wheel: int, sign:
     assert objection(guard, outputs(line(*speeds))) == TOO_FAST
 
 
-@pytest.mark.parametrize("limit", [0.1, 0.294, 0.295, 0.296, 1.005, 39.996, 40.0, 99.985, 99.99])
+@each("limit", [0.1, 0.294, 0.295, 0.296, 1.005, 39.996, 40.0, 99.985, 99.99])
 def test_a_wheel_at_its_limit_passes_however_the_limit_is_rounded(limit: float) -> None:
     guard = Guarded(STOP, limit, SOURCES)
     assert objection(guard, outputs(line(limit))) == ""
@@ -309,7 +309,7 @@ def test_from_rest_nothing_moves_without_a_command(guard: Guarded) -> None:
 
 
 @pytest.mark.parametrize(
-    "mode", ["inactive", "waiting", "ready", "stopped", "fault", "leaving", "", "Driving"]
+    "mode", ["inactive", "waiting", "ready", "stopped", "fault", "shutdown", "", "Driving"]
 )
 def test_a_wheel_grows_only_in_mode_driving(guard: Guarded, mode: str) -> None:
     assert objection(guard, outputs(line(1.0), mode=mode)) == GROWS
@@ -443,11 +443,11 @@ def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is
     assert set(trips[first + 1 :]) == {GROWS}
 
 
-@pytest.mark.parametrize(
+@each(
     ("mode", "ramp_ms"),
     [
         ("ready", 2000), ("waiting", 2000), ("inactive", 2000),
-        ("stopped", 500), ("fault", 500), ("leaving", 500),
+        ("stopped", 500), ("fault", 500), ("shutdown", 500),
     ],
 )  # fmt: skip
 def test_without_a_fresh_command_only_zero_passes_after_the_longest_ramp(
@@ -554,7 +554,7 @@ def test_at_rest_new_settings_bring_their_own_ramp() -> None:
     assert clocked.trip(1701, "ready") == LATE
 
 
-@pytest.mark.parametrize(
+@each(
     ("limits", "ramp_ms"),
     [
         (LimitsConfig(), 1000),

@@ -32,7 +32,7 @@ from acsard.core.config.settings import (
     Source,
 )
 from acsard.core.guard import Guard
-from acsard.core.link.free_running_times import BRIDGED_S
+from acsard.core.link.sample_time import BRIDGED_S
 from acsard.core.motion.arbiter_text import waiting
 from acsard.core.motion.odometry import TAKEN_BACK
 from acsard.core.robot import Robot
@@ -570,13 +570,13 @@ class RobotMachine(RuleBasedStateMachine):
         done = {r.verb for r, a in zip(requests, outputs.answers, strict=True) if did(a)}
         mode, was = outputs.mode, "" if self.before is None else self.before.mode
         if "stop" in done and "clear" not in done:
-            assert mode in ("stopped", "fault", "leaving")
-        if was == "leaving" or self.leaving:
-            assert mode == "leaving"
+            assert mode in ("stopped", "fault", "shutdown")
+        if was == "shutdown" or self.leaving:
+            assert mode == "shutdown"
         elif was in ("stopped", "fault") and "clear" not in done:
             assert mode in (was, "fault")
         if any(event.name == "fault" for event in outputs.events) and "clear" not in done:
-            assert mode in ("fault", "leaving")
+            assert mode in ("fault", "shutdown")
         if mode == "ready" and outputs.due:
             begins = ("send a zero first: ", "waiting for a command: ", "commands of ")
             assert outputs.reason.startswith(begins) or "is new: it drives" in outputs.reason
@@ -718,7 +718,7 @@ class RobotMachine(RuleBasedStateMachine):
         dt = (self.now_ns - self.sent_ns) / NS_PER_S
         if self.broken or (applied == REST and dt > 0.25):
             last = REST  # it was cut meanwhile, so no ramp applied
-        braking = outputs.mode in ("stopped", "fault", "leaving")
+        braking = outputs.mode in ("stopped", "fault", "shutdown")
         longest = max(0.05, 1.5 / self.config.rate_hz)
         full = limits.wheel_speed - 0.01
         drive = self.config.drive

@@ -10,6 +10,7 @@ from acsard.core.config.parsing import ConfigError
 from acsard.core.link.codec import FrameError
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.values import WHEELS, AcsardError, WheelSpeeds
+from tests.each import each
 
 STRUCTS = [
     thing
@@ -24,7 +25,7 @@ def test_four_wheel_values_are_in_the_order_of_wheels() -> None:
     assert speeds.as_tuple() == tuple(getattr(speeds, wheel) for wheel in WHEELS)
 
 
-@pytest.mark.parametrize("cls", STRUCTS)
+@each("cls", STRUCTS)
 def test_every_noun_is_frozen(cls: type[msgspec.Struct]) -> None:
     assert cls.__struct_config__.frozen
 

@@ -18,6 +18,7 @@ from acsard.daemon.kept_latches import (
     encode,
     stopped,
 )
+from tests.each import each
 
 NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
 
@@ -109,7 +110,7 @@ def test_a_file_without_one_of_its_names_is_refused() -> None:
             decode("acsar", msgspec.json.encode(less))
 
 
-@pytest.mark.parametrize(
+@each(
     ("data", "reason"),
     [
         (b"", "it is empty"),

@@ -260,13 +260,13 @@ class Stuck:
     """A disk that writes nothing until `goes` is set."""
 
     def __init__(self) -> None:
-        self.asked, self.goes, self.texts = threading.Event(), threading.Event(), list[str]()
+        self.asked, self.goes, self.contents = threading.Event(), threading.Event(), list[bytes]()
 
-    def replace(self, file: Path, text: str, *, synced: bool) -> None:
+    def replace(self, file: Path, content: bytes, *, synced: bool) -> None:
         self.asked.set()
         assert self.goes.wait(10.0)
-        self.texts.append(text)
-        replace_file(file, text, synced=synced)
+        self.contents.append(content)
+        replace_file(file, content, synced=synced)
 
 
 @pytest.fixture
@@ -287,18 +287,18 @@ def test_only_the_newest_is_written_when_the_disk_takes_again(
         file.keep(latches)
     stuck.goes.set()
     end(file)
-    assert stuck.texts == [encode("acsar", FAULT).decode(), encode("acsar", STOP).decode()]
+    assert stuck.contents == [encode("acsar", FAULT), encode("acsar", STOP)]
 
 
 def test_a_flood_of_stops_is_written_at_a_pace(
     tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, _ = started(tmp_path)
-    texts = []
+    contents = []
 
-    def counted(path: Path, text: str, *, synced: bool) -> None:
-        texts.append(text)
-        replace_file(path, text, synced=synced)
+    def counted(path: Path, content: bytes, *, synced: bool) -> None:
+        contents.append(content)
+        replace_file(path, content, synced=synced)
 
     monkeypatch.setattr(module, "replace", counted)
     began = time.monotonic()
@@ -306,8 +306,8 @@ def test_a_flood_of_stops_is_written_at_a_pace(
         file.keep(Latches(stop=Latch(number, NOW.wall_ns, "joe", "stopped by joe")))
         time.sleep(0.005)
     end(file)
-    assert len(texts) <= (time.monotonic() - began) / module.PACE_S + 2
-    assert '"number": 39' in texts[-1]
+    assert len(contents) <= (time.monotonic() - began) / module.PACE_S + 2
+    assert b'"number": 39' in contents[-1]
 
 
 def test_latches_are_held_from_the_rename_on(
@@ -325,6 +325,36 @@ def test_latches_are_held_from_the_rename_on(
     until(lambda: file.holds(STOP))
     assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
     syncs.set()
+
+
+def test_latches_that_come_with_the_end_are_written(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    pop = file._box.pop
+
+    def late() -> Latches | None:
+        latches = pop()
+        if latches is FAULT:  # the thread has taken it; now a stop and the end come at once
+            file.keep(STOP)
+            file._box.close()
+        return latches
+
+    monkeypatch.setattr(file._box, "pop", late)
+    file.keep(FAULT)
+    until(lambda: file._thread is not None and not file._thread.is_alive())
+    assert (tmp_path / NAME).read_bytes() == encode("acsar", STOP)
+
+
+def test_each_write_waits_for_the_file_and_for_its_name(
+    tmp_path: Path, started: Started, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, _ = started(tmp_path)
+    synced: list[Path] = []
+    monkeypatch.setattr(module, "sync", synced.append)
+    file.keep(STOP)
+    end(file)
+    assert synced[-2:] == [tmp_path / NAME, tmp_path]
 
 
 def test_to_wait_ends_once_the_latches_are_held(tmp_path: Path, started: Started) -> None:

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from acsard.core.values import Event
-from acsard.daemon.supervisor import DOOR, ROUTER, Kind, keep_door
+from acsard.daemon.supervisor import GATEWAY, ROUTER, Kind, keep_running
 
 
-async def told(kind: Kind = DOOR) -> Event:
+async def told(kind: Kind = GATEWAY) -> Event:
     """Return the first event of the supervisor."""
     said: asyncio.Queue[Event] = asyncio.Queue()
-    keeper = asyncio.create_task(keep_door(["door"], said.put_nowait, kind))
+    keeper = asyncio.create_task(keep_running(["gateway"], said.put_nowait, kind))
     first = asyncio.create_task(said.get())
     await asyncio.wait({keeper, first}, return_when=asyncio.FIRST_COMPLETED, timeout=10.0)
     assert not keeper.done(), keeper
@@ -29,7 +29,7 @@ async def told(kind: Kind = DOOR) -> Event:
 def test_without_a_program_to_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     event = asyncio.run(told())
-    assert (event.name, event.level) == ("door_ended", "warning")
+    assert (event.name, event.level) == ("gateway_ended", "warning")
     assert "could not be started" in event.text
 
 
@@ -50,7 +50,7 @@ def program(monkeypatch: pytest.MonkeyPatch, where: Path, text: str) -> None:
 
 
 def test_one_that_falls_silent_is_ended(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("acsard.daemon.supervisor.SILENT_NS", 0)
+    monkeypatch.setattr("acsard.host.child.SILENT_NS", 0)
     pid = tmp_path / "pid"
     stops = f"import os; os.write(0, b'.'); open({str(pid)!r}, 'w').write(str(os.getpid())); "
     program(monkeypatch, tmp_path, stops + "os.kill(os.getpid(), 19)")
@@ -65,11 +65,11 @@ def test_a_router_that_cannot_be_one_is_not_tried_again(
 ) -> None:
     program(monkeypatch, tmp_path, f"raise SystemExit({code})")
     said: list[Event] = []
-    assert asyncio.run(keep_door(["router"], said.append, ROUTER)) == code
+    assert asyncio.run(keep_running(["router"], said.append, ROUTER)) == code
     assert said == []
 
 
-@pytest.mark.parametrize(("kind", "code"), [(DOOR, 78), (ROUTER, 75), (ROUTER, 1)])
+@pytest.mark.parametrize(("kind", "code"), [(GATEWAY, 78), (ROUTER, 75), (ROUTER, 1)])
 def test_one_that_may_be_opened_later_is_tried_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: Kind, code: int
 ) -> None:

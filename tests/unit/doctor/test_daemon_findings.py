@@ -11,7 +11,7 @@ from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.schema import DiagnosticStatus, Time
 from acsard.doctor.daemon_findings import (
     clocks,
-    door,
+    gateway,
     gone,
     gyro,
     latch_file,
@@ -22,6 +22,7 @@ from acsard.doctor.daemon_findings import (
 )
 from acsard.doctor.finding import Finding
 from acsard.doctor.running import Running
+from tests.each import each
 from tests.unit.doctor.test_running import INFO, STATE
 
 NOW = 1_800_000_000_000_000_000
@@ -72,10 +73,10 @@ def test_periods_that_are_missed_now_are_told_after_months_without() -> None:
     assert "600 of 6000" in finding.text
 
 
-def test_a_door_is_told_where_it_listens() -> None:
-    with socket.create_server(("0.0.0.0", 0)) as door_of_ours:
-        endpoint = f"tls/0.0.0.0:{door_of_ours.getsockname()[1]}"
-        (finding,) = door(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
+def test_a_gateway_is_told_where_it_listens() -> None:
+    with socket.create_server(("0.0.0.0", 0)) as gateway_of_ours:
+        endpoint = f"tls/0.0.0.0:{gateway_of_ours.getsockname()[1]}"
+        (finding,) = gateway(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
     assert (finding.level, finding.text) == ("ok", f"open at {endpoint}")
 
 
@@ -84,7 +85,7 @@ def test_a_gyro_that_does_what_it_should_is_no_warning(does: str) -> None:
     assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
 
 
-@pytest.mark.parametrize("does", ["silent", "disagrees", "not believed", "what a later one does"])
+@each("does", ["silent", "disagrees", "not believed", "what a later one does"])
 def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
     (finding,) = gyro(does, {})
     assert (finding.subject, finding.level) == ("gyro", "warning")
@@ -93,10 +94,10 @@ def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
 
 
 def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None:
-    counters = {"imu_absurd": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
+    counters = {"imu_out_of_range": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
     _, finding = gyro("used", counters)
     assert finding.level == "warning"
-    assert "12 second sender, 3 absurd" in finding.text
+    assert "12 second sender, 3 out of range" in finding.text
     assert finding.mend
 
 
@@ -142,7 +143,7 @@ def test_lines_that_are_not_answered_are_a_warning() -> None:
     assert "mcu check" in finding.mend
 
 
-@pytest.mark.parametrize(
+@each(
     ("sent", "came", "period", "told"),
     [(100, 100, 0.0, 0), (100, 98, 0.0, 0), (100, 97, 0.0, 0), (100, 96, 0.0, 1),
      (100, 130, 0.0, 0), (10, 0, 0.0, 0), (100, 10, 0.1, 0)],
@@ -154,16 +155,16 @@ def test_what_is_no_loss_is_not_told(sent: int, came: int, period: float, told: 
 
 def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
     assert not list(refused({"lines": 1000, "line_malformed": 20, "lines_sent": 9}))
-    (text,) = refused({"lines": 1000, "line_malformed": 12, "line_wrong_check": 30})
-    assert "12 malformed, 30 wrong check" in text
+    (text,) = refused({"lines": 1000, "line_malformed": 12, "line_crc_error": 30})
+    assert "12 malformed, 30 crc error" in text
 
 
 def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_board() -> None:
-    (late,) = found({}, {"link_lost": 3, "link_lost_late": 3})
+    (late,) = found({}, {"link_lost": 3, "link_lost_host_stall": 3})
     assert "lost 3 times" in late.text
     assert "this computer" in late.text
     assert "mcu check" not in late.mend
-    late, board = found({}, {"link_lost": 5, "link_lost_late": 3})
+    late, board = found({}, {"link_lost": 5, "link_lost_host_stall": 3})
     assert "lost 2 times" in board.text
     assert "mcu check" in board.mend
     states = replace(STATE, counters={"link_lost": 2})
@@ -177,7 +178,7 @@ def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_bo
 
 
 def test_a_wheel_that_is_left_out_is_told() -> None:
-    *_, finding = found({}, {}, doubt="rear left: its encoder stands")
+    *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
     assert (finding.subject, finding.level) == ("wheels", "warning")
 
 

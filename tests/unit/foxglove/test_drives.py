@@ -14,15 +14,15 @@ from acsard.client.commander import STALE_NS, Wish
 from acsard.core import values
 from acsard.core.config.settings import DriveConfig, JointsConfig
 from acsard.core.incoming.commands import Arrival, Receiver
-from acsard.core.messages.encodings import encode
+from acsard.core.messages.encodings import DecodeError, encode
 from acsard.core.messages.schema import Header, Message, Time, Twist, TwistStamped, Vector3
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.values import NS_PER_S, REST, Command
 from acsard.foxglove import drives
-from acsard.foxglove.drives import Drives, Viewer
+from acsard.foxglove.drives import Drives, Viewer, encoding_of, wish
 from acsard.foxglove.notices import Notices
-from acsard.foxglove.twists import wish
 from acsard.host import clock
+from tests.each import each
 from tests.system.harness import until
 
 RECEIVER = Receiver(JointsConfig(), Kinematics(DriveConfig()))
@@ -173,7 +173,7 @@ def test_a_bus_that_fails_one_viewer_is_told_and_fails_no_other(viewers: Viewers
     viewers.heard(1, 1)
 
 
-@pytest.mark.parametrize(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
+@each(("rate", "slow"), [(1.0, True), (2.0, True), (5.0, False), (20.0, False)])
 def test_a_panel_that_publishes_too_seldom_is_known(rate: float, slow: bool) -> None:
     assert told_slow(NS_PER_S / rate) is slow
 
@@ -191,4 +191,64 @@ def told_slow(every_ns: float) -> bool:
 
 
 def said(notices: Notices) -> list[str]:
-    return [one.text for one in notices._waiting]
+    return [one.text for one in notices._waiting.waiting]
+
+
+# the messages of a panel: accepted whole, or refused with the reason
+
+MESSAGE = Twist(Vector3(x=0.3), Vector3(z=-0.2))
+STAMPED = TwistStamped(Header(Time(5)), MESSAGE)
+
+
+@pytest.mark.parametrize("name", ["geometry_msgs/Twist", "geometry_msgs/msg/Twist"])
+@pytest.mark.parametrize("form", ["json", "cdr"])
+def test_a_panel_s_twist_is_read(name: str, form: str) -> None:
+    encoding = encoding_of(form, name)
+    found = wish(encoding, encode(MESSAGE, "json" if form == "json" else "cdr"))
+    assert found == Wish(values.Twist(0.3, -0.2))
+
+
+@pytest.mark.parametrize("form", ["json", "cdr"])
+def test_a_stamped_one_too_with_its_stamp(form: str) -> None:
+    encoding = encoding_of(form, "geometry_msgs/msg/TwistStamped")
+    found = wish(encoding, encode(STAMPED, "json" if form == "json" else "cdr"))
+    assert found == Wish(values.Twist(0.3, -0.2), 5 * NS_PER_S)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [
+        ("json", "std_msgs/msg/String"),
+        ("json", "Twist"),
+        ("json", ""),
+        ("ros1", "geometry_msgs/Twist"),
+        ("", "geometry_msgs/Twist"),
+    ],
+)
+def test_what_drives_nothing_is_told_before_it_is_sent(form: str, name: str) -> None:
+    with pytest.raises(DecodeError, match="needed"):
+        encoding_of(form, name)
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        b"{}",
+        b'{"linear": {"x": 1}}',
+        b'{"linear": {"x": "fast"}, "angular": {}}',
+        b'{"linear": {"x": NaN}, "angular": {}}',
+        b'{"linear": {"x": 1}, "angular": {}, "more": 1}',
+        b"\xff" * 60,
+        b'{"linear": {"x": 1}, "angular": {}}' + b" " * 5000,
+    ],
+)
+def test_what_is_no_twist_is_refused(payload: bytes) -> None:
+    with pytest.raises(DecodeError):
+        wish(encoding_of("json", "geometry_msgs/Twist"), payload)
+
+
+@pytest.mark.parametrize("cut", range(0, 52, 4))
+def test_cdr_cut_anywhere_is_refused(cut: int) -> None:
+    with pytest.raises(DecodeError):
+        wish(encoding_of("cdr", "geometry_msgs/Twist"), encode(MESSAGE, "cdr")[:cut])

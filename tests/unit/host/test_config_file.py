@@ -45,24 +45,12 @@ def test_only_the_values_of_the_reference_change(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 
-@pytest.mark.parametrize(
-    ("text", "keys"),
-    [
-        ("[mcu]\n", {"mcu.baud_rate": 300}),
-        ("[mcu]\n", {"mcu.baud_rate": 9600}),
-        ("[mcu]\n", {"mcu.wheels.front_right": "+b"}),
-        ("[mcu\n", {"mcu.baud_rate": 57600}),
-        ("[mcu]\nbaud = 3\n", {"mcu.baud_rate": 57600}),
-    ],
-)
-def test_what_would_not_check_is_not_written(
-    tmp_path: Path, text: str, keys: dict[str, object]
-) -> None:
+def test_a_file_that_would_not_check_is_left_as_it_was(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
-    file.write_text(text)
+    file.write_text("[mcu]\n")
     with pytest.raises(ExitError, match="was not changed"):
-        change(file, keys)
-    assert file.read_text() == text
+        change(file, {"mcu.baud_rate": 300})
+    assert file.read_text() == "[mcu]\n"
     assert os.listdir(tmp_path) == ["acsard.toml"]
 
 

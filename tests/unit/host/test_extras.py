@@ -21,8 +21,8 @@ def installed(where: Path, **direct: object) -> Distribution:
     """Return a distribution with two extras that was installed from `direct`."""
     info = where / "acsard-1.dist-info"
     info.mkdir()
-    lines = ["Name: acsard", "Requires-Dist: zenoh", "Requires-Dist: one<2,>=1; extra == 'lan'"]
-    lines += ["Requires-Dist: two; extra == 'lan'", "Requires-Dist: three; extra == 'web'"]
+    lines = ["Name: acsard", "Requires-Dist: zenoh", "Requires-Dist: one<2,>=1; extra == 'tls'"]
+    lines += ["Requires-Dist: two; extra == 'tls'", "Requires-Dist: three; extra == 'web'"]
     (info / "METADATA").write_text("\n".join(lines) + "\n\n")
     if direct:
         (info / "direct_url.json").write_text(json.dumps(direct))
@@ -35,12 +35,12 @@ def test_from_a_clone_it_is_that_clone_again(tmp_path: Path, editable: bool) -> 
     clone.mkdir()
     (clone / "pyproject.toml").touch()
     found = installed(tmp_path, url=clone.as_uri(), dir_info={"editable": editable})
-    assert wanted_by(found, "lan") == [*(["-e"] if editable else []), f"{clone}[lan]"]
+    assert wanted_by(found, "tls") == [*(["-e"] if editable else []), f"{clone}[tls]"]
 
 
 @pytest.mark.parametrize("url", ["file:///gone/away", "https://example.org/acsard.whl"])
 def test_from_what_is_gone_it_is_the_libraries_alone(tmp_path: Path, url: str) -> None:
-    assert wanted_by(installed(tmp_path, url=url), "lan") == ["one<2,>=1", "two"]
+    assert wanted_by(installed(tmp_path, url=url), "tls") == ["one<2,>=1", "two"]
 
 
 def test_from_nobody_knows_where_it_is_the_libraries_alone(tmp_path: Path) -> None:

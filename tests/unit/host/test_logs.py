@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import LogConfig
 from acsard.core.values import Event
 from acsard.host.logs import MAX_VALUE, JournalStream, Log, is_journal, render
+from tests.each import each
 
 
 class Journal:
@@ -88,7 +89,7 @@ def test_a_line_without_a_text_shows_its_fields_in_the_message() -> None:
     assert line["ACSARD_RATE"] == "100.0"
 
 
-@pytest.mark.parametrize(
+@each(
     ("level", "priority"),
     [("debug", "7"), ("info", "6"), ("warning", "4"), ("error", "3"), ("odd", "6")],
 )

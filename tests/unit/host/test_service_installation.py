@@ -9,7 +9,7 @@ import pytest
 from acsard.host.errors import ExitError
 from acsard.host.installation_steps import File, Keep, Remove, RemoveAll, Run, Write
 from acsard.host.service_installation import (
-    DOOR,
+    GATEWAY,
     GONE,
     INSTALLED,
     PAGE,
@@ -25,12 +25,13 @@ from acsard.host.service_installation import (
     strangers,
     uninstalling,
 )
+from tests.each import each
 
 PROGRAM = "/usr/bin/env"
 """A program that every user may run."""
 
 
-@pytest.mark.parametrize(
+@each(
     ("prefix", "base", "good"),
     [
         ("/opt/acsard/venv", "/usr", True),
@@ -76,16 +77,16 @@ UNIT_FILE = File(ETC / UNIT, b"unit")
 STOP_FILE = File(ETC / STOP, b"stop", 0o755)
 RULES = File(ETC / "rules", b"rules")
 OWN = File(ETC / "acsard.toml", b"first", kept=True)
-DOOR_FILE = File(ETC / DOOR, b"door")
+GATEWAY_FILE = File(ETC / GATEWAY, b"gateway")
 PAGE_FILE = File(ETC / PAGE, b"page")
-ALL = [UNIT_FILE, DOOR_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
+ALL = [UNIT_FILE, GATEWAY_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
 
 
 def there(**other: bytes | None) -> Found:
     """Return a machine with all files installed, except for these."""
     names = {
         "unit": UNIT_FILE,
-        "door": DOOR_FILE,
+        "gateway": GATEWAY_FILE,
         "page": PAGE_FILE,
         "stop": STOP_FILE,
         "rules": RULES,
@@ -104,7 +105,7 @@ def test_all_files_are_written_where_there_is_none_then_the_commands_run() -> No
 
 def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
     steps = list(INSTALLED)
-    everything = Run(("systemctl", "enable", "--now", UNIT, DOOR, PAGE))
+    everything = Run(("systemctl", "enable", "--now", UNIT, GATEWAY, PAGE))
     alone = Run(("systemctl", "start", UNIT), may_fail=True)
     assert steps.index(alone) < steps.index(everything)
 
@@ -128,13 +129,13 @@ def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None
 
 def test_all_that_is_as_installed_is_removed() -> None:
     removed = [Remove(file.path) for file in ALL]
-    leaving = Run(("systemctl", "disable", "--now", PAGE, DOOR, UNIT))
+    leaving = Run(("systemctl", "disable", "--now", PAGE, GATEWAY, UNIT))
     assert uninstalling(ALL, there(), force=False) == [leaving, *removed, *GONE]
 
 
 def test_a_unit_that_is_not_there_is_not_disabled() -> None:
     """The machine was upgraded from a version without TLS gateway and page."""
-    leaving, *_ = uninstalling(ALL, there(door=None, page=None), force=False)
+    leaving, *_ = uninstalling(ALL, there(gateway=None, page=None), force=False)
     assert leaving == Run(("systemctl", "disable", "--now", UNIT))
 
 
@@ -161,8 +162,8 @@ def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
 
 
 def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
-    unit, door, page, _, _, configuration = files()
-    assert (unit.path.name, door.path.name, page.path.name) == (UNIT, DOOR, PAGE)
+    unit, gateway, page, _, _, configuration = files()
+    assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
     assert b'port = "/dev/acsar"' in configuration.content
     assert set(present([unit])) == {unit.path}
 

@@ -215,7 +215,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
 ) -> None:
     data, dice, path = whole.read_bytes(), random.Random(5), tmp_path / "cut.mcap"
     (first, _), *_ = chunks(data)
-    config_end = data.index(b"acsard.Told")
+    config_end = data.index(b"acsard.TimelineEntry")
     for _ in range(cuts):
         size = dice.randrange(first)
         tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
@@ -308,7 +308,7 @@ def test_of_two_damaged_chunks_beside_one_another_both_beginnings_are_read(tmp_p
 def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_path: Path) -> None:
     data, dice, path = whole.read_bytes(), random.Random(3), tmp_path / "random.mcap"
     said: list[str] = []
-    for _ in range(100):
+    for _ in range(40):
         bad = bytearray(data)
         for _ in range(dice.randint(1, 20)):
             bad[dice.randrange(len(bad))] = dice.randrange(256)

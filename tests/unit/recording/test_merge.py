@@ -48,6 +48,6 @@ def test_what_follows_from_the_configuration_is_of_the_other_and_what_happened_s
 
 def test_a_part_that_the_state_does_not_know_begins_as_a_new_one_does() -> None:
     robot = driven()
-    del robot._dropped
+    del robot._answered
     adopt(robot, Robot(PLAIN), Robot(PLAIN))
-    assert vars(robot._dropped) == vars(Robot(PLAIN)._dropped)
+    assert vars(robot._answered) == vars(Robot(PLAIN)._answered)

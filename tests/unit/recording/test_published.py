@@ -71,4 +71,4 @@ def test_what_no_recording_knows_is_not_said() -> None:
     assert rows
     assert not rows & MEASURED
     states = [m.message for m in published if m.channel.name == "state"]
-    assert all(one.figures == {} and one.certificate == "" for one in states)
+    assert all(one.latencies == {} and one.certificate_expiry == "" for one in states)

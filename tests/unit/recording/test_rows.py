@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import random
+from functools import cache
 
 import msgspec
 import pytest
@@ -31,6 +32,7 @@ from acsard.core.values import (
 )
 from acsard.recording.recorded_steps import Taken, microposes, status_of
 from acsard.recording.rows import MOST_ROWS, Batch, BatchError, Rare, decode, encode, first_of
+from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
 
@@ -91,18 +93,17 @@ def test_all_that_can_come_in_comes_back(inputs: list[Inputs], first: int) -> No
     assert {step.said.left for step in steps} == {b"other"}
 
 
+@cache
 def driven() -> list[Taken]:
+    """Return the steps of a drive through faults."""
     tape = Tape()
     drive_through_faults(World(recorder=tape), 3.0)
     return tape.taken
 
 
-TAKEN = driven()
-
-
 def test_what_went_out_comes_back() -> None:
-    for at in range(0, len(TAKEN), 100):
-        batch = TAKEN[at : at + 100]
+    for at in range(0, len(driven()), 100):
+        batch = driven()[at : at + 100]
         for taken, step in zip(batch, decode(encode(at, batch)), strict=True):
             said, outputs = step.said, taken.outputs
             assert (said.line, said.left) == (outputs.line, taken.left)
@@ -127,7 +128,7 @@ def test_steps_at_one_time_come_back_in_their_order() -> None:
 
 
 def test_bytes_that_are_no_batch_are_refused_and_never_more() -> None:
-    whole, dice = encode(0, TAKEN[:100]), random.Random(1)
+    whole, dice = encode(0, driven()[:100]), random.Random(1)
     for _ in range(500):
         data = bytearray(whole)
         for _ in range(dice.randint(1, 4)):
@@ -150,7 +151,7 @@ def test_the_number_of_the_first_step_is_read_alone() -> None:
 
 @pytest.fixture(scope="module")
 def batch() -> Batch:
-    return msgspec.msgpack.decode(encode(0, TAKEN[:100]), type=Batch)
+    return msgspec.msgpack.decode(encode(0, driven()[:100]), type=Batch)
 
 
 def steps_of(batch: Batch) -> int:
@@ -164,8 +165,8 @@ def with_rare(batch: Batch, rare: Rare) -> Batch:
     return replace(batch, rows=tuple(rows))
 
 
-@pytest.mark.parametrize("far", [1 << 62, (1 << 63) - 1, -(1 << 63)])
-@pytest.mark.parametrize("name", ["mono_ns", "offset_ns", "unit"])
+@each("far", [1 << 62, (1 << 63) - 1, -(1 << 63)])
+@each("name", ["mono_ns", "offset_ns", "unit"])
 def test_a_time_that_no_clock_shows_is_refused(name: str, far: int, batch: Batch) -> None:
     with pytest.raises(BatchError, match=r"no clock|>= 1"):
         steps_of(replace(batch, **{name: far}))

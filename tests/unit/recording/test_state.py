@@ -21,6 +21,7 @@ from acsard.recording.file import Recording
 from acsard.recording.replayed import Onlooker, live
 from acsard.recording.state import StateError, freeze, thaw
 from acsard.report.course import Course
+from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
@@ -51,7 +52,7 @@ def test_who_was_heard_but_once_is_soon_no_part_of_it() -> None:
     assert len(pickle.dumps(freshness)) < len(freeze(Robot(Config()), Memory())) / 10
 
 
-@pytest.mark.parametrize("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
+@each("value", [1, (1, 2), ("robot", b""), (Instant(1, 2), b"")])
 def test_what_is_no_robot_is_refused(value: object) -> None:
     with pytest.raises(StateError):
         thaw(pickle.dumps(value))

@@ -18,6 +18,7 @@ from acsard.core.motion.modes import Mode
 from acsard.core.values import Twist
 from acsard.recording.state import TABLE, freeze, part, thaw
 from acsard.recording.unpickling import DEEPEST, MOST_BYTES, MOST_OPCODES, MOST_PARTS, unpickled
+from tests.each import each
 from tests.recordings.__main__ import CHECKED
 from tests.scenarios.taped import Tape, drive_through_faults
 from tests.scenarios.world import World
@@ -45,7 +46,7 @@ def said() -> dict[str, str]:
     return words
 
 
-@pytest.mark.parametrize("name", ATTACKS)
+@each("name", ATTACKS)
 def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[str, str]) -> None:
     words = said[name]
     assert "the state at its start" in words
@@ -53,7 +54,7 @@ def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[st
     assert len(words) < 300
 
 
-@pytest.mark.parametrize(
+@each(
     "value",
     [
         None, True, -(1 << 90), 1.5, "text", "t" * 300, b"bytes", b"b" * 300, (), (1,),
@@ -61,7 +62,6 @@ def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[st
         frozenset({"a"}), [*range(3000)], Counter(a=2), deque([1, 2], 3), deque(["a"]),
         Mode.DRIVING, Twist(0.5, 1.0),
     ],
-    ids=lambda value: f"{value!r:.12}",
 )  # fmt: skip
 def test_a_value_comes_back_as_it_was(value: object) -> None:
     again = unpickled(pickled(value), part)

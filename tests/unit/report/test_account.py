@@ -75,7 +75,7 @@ def test_the_longest_reason_comes_first() -> None:
 
 def test_sentences_that_differ_by_a_number_are_one_reason_as_the_longest_says_it() -> None:
     course, _ = course_of(lambda world: world.run(0.1))
-    band = course.commanders.bands["app"]
+    band = course.sources.bands["app"]
     for n, t in enumerate((1.0, 1.5, 3.5)):
         band.add(t, "waits", f"lines come 0.1{n} s apart")
     band.end(4.0)

@@ -176,7 +176,7 @@ def test_lines_that_are_no_good_are_dropped_and_not_lost() -> None:
 def test_a_line_that_could_not_be_true_is_dropped_too() -> None:
     link = Link()
     link.step(0.0, True, {"lines": 0})
-    link.step(0.5, True, {"lines": 2, "line_impossible": 1})
+    link.step(0.5, True, {"lines": 2, "line_implausible": 1})
     link.end()
     assert (link.totals.good, link.totals.dropped) == (1, 1)
 

@@ -7,13 +7,13 @@ import io
 from msgspec.structs import replace
 from rich.console import Console
 
-from acsard.core.messages.schema import Figure, Info, RobotState, SourceState, Spread, Time
+from acsard.core.messages.schema import Info, Latency, RobotState, SourceState, Spread, Time
 from acsard.daemon.latencies import NAMES
 from acsard.top.screen_data import ScreenData
 from acsard.top.view import screen
 
-MEASURED = Figure(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
-UNMEASURED = Figure(Spread(0, 0.0, 0.0, 0.0), Spread(0, 0.0, 0.0, 0.0))
+MEASURED = Latency(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))
+UNMEASURED = Latency(Spread(0, 0.0, 0.0, 0.0), Spread(0, 0.0, 0.0, 0.0))
 
 STATE = RobotState(
     stamp=Time(1000, 0),
@@ -34,7 +34,7 @@ STATE = RobotState(
     ],
     refused="",
     counters={"lines": 1300, "lines_sent": 1301, "commands": 220, "missed_periods": 3},
-    figures=dict.fromkeys(NAMES, MEASURED),
+    latencies=dict.fromkeys(NAMES, MEASURED),
 )
 BEFORE = replace(
     STATE,

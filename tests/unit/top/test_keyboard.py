@@ -18,6 +18,7 @@ from acsard.core.messages.schema import RobotState, Time
 from acsard.core.values import REST, Twist
 from acsard.top import keyboard
 from acsard.top.keyboard import HOLD_S, Keyboard, Ride, split
+from tests.each import each
 from tests.unit.top.screens import STATE
 
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
@@ -56,7 +57,7 @@ def test_it_opens_with_three_zeros_and_falls_silent() -> None:
     assert ZEROS == 3
 
 
-@pytest.mark.parametrize(("key", "linear", "angular"), MOVES)
+@each(("key", "linear", "angular"), MOVES)
 def test_each_key_drives_its_way(key: str, linear: int, angular: int) -> None:
     keys = pressed(key, 10.0)
     assert keys.wish(10.0) == Twist(0.5 * linear, 2.0 * angular)
@@ -87,7 +88,7 @@ def test_another_key_changes_the_way_at_once() -> None:
     assert keys.wish(10.0 + HOLD_S) == Twist(0.0, 2.0)
 
 
-@pytest.mark.parametrize("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
+@each("key", [" ", "k", "p", "\x1b", "\x1b[H", "I", "\n", "�", ""])
 def test_any_other_key_stops_at_once(key: str) -> None:
     keys = pressed("i", 10.0)
     keys.press(key, 10.1)
@@ -100,7 +101,7 @@ def test_a_stop_at_rest_sends_its_zeros_too() -> None:
     assert [keys.wish(10.0) for _ in range(4)] == [REST] * 3 + [None]
 
 
-@pytest.mark.parametrize(("key", "linear", "angular"), SPEEDS)
+@each(("key", "linear", "angular"), SPEEDS)
 def test_speed_keys_change_ten_percent_and_do_not_move(
     key: str, linear: float, angular: float
 ) -> None:
@@ -117,7 +118,7 @@ def test_a_speed_key_while_driving_counts_at_once_and_does_not_hold_longer() -> 
     assert keys.wish(10.0 + HOLD_S) == REST
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "keys"),
     [
         ("", []),

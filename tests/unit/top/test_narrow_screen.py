@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 
-import pytest
 from rich.cells import cell_len
 
 from acsard.core.messages.schema import SourceState
+from tests.each import each
 from tests.unit.top.screens import SEEN, STATE, line_with, lines_of, of, painted
 
 WIDTHS = (40, 60, 80, 160)
@@ -18,9 +18,9 @@ FULL = of(
     mode="waiting",
     reason=REASON,
     refused="source nav: NaN or infinity in its twist",
-    certificate="valid for 12 days",
+    certificate_expiry="valid for 12 days",
     gyro="used",
-    track="learned 1.603 ± 0.032 in use, configured 1.000",
+    effective_track="learned 1.603 ± 0.032 in use, configured 1.000",
     counters=STATE.counters
     | {"lines_superseded": 12_345, "bus_overrun": 7, "line_malformed": 30, "command_stale": 4},
 )
@@ -30,7 +30,7 @@ def read(width: int) -> str:
     return " ".join(" ".join(lines_of(FULL, width, None)).split())
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@each("width", WIDTHS)
 def test_every_figure_is_on_a_screen_of_any_width(width: int) -> None:
     told, lines = read(width), lines_of(FULL, width, None)
     for figure in (

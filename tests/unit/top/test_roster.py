@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.top.roster import HEADS, Row, table
+from tests.each import each
 from tests.unit.top.screens import STATE
 
 ROW = Row("robot1", True, replace(STATE, reason="driving: commanded by app"), 0.1, "0.1.0")
@@ -31,7 +31,7 @@ def test_robots_are_in_the_order_of_their_names() -> None:
     assert [line[0] for line in table(rows, 80)[1:]] == ["a", "b", "c"]
 
 
-@pytest.mark.parametrize(
+@each(
     ("row", "words"),
     [
         (replace(ROW, here=False, age=90.0), "GONE, was: commanded by app"),
@@ -51,8 +51,8 @@ def test_a_narrow_terminal_has_what_matters_most() -> None:
     assert "driving" in line
 
 
-@pytest.mark.parametrize("width", [40, 80, 160])
-@pytest.mark.parametrize(
+@each("width", [40, 80, 160])
+@each(
     "ids",
     [
         ("warehouse-west-1", "warehouse-west-2"),
@@ -90,7 +90,7 @@ IN_NEED = {
 }
 
 
-@pytest.mark.parametrize("need", IN_NEED)
+@each("need", IN_NEED)
 def test_of_more_robots_than_lines_the_one_that_needs_a_person_is_shown(need: str) -> None:
     rows = [replace(ROW, robot_id=f"robot{n:02d}") for n in range(29)]
     shown = table([*rows, replace(IN_NEED[need], robot_id="robot99")], 120, 22)

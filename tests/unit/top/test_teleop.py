@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -10,6 +9,7 @@ from msgspec.structs import replace
 from acsard.core.motion.modes import Mode
 from acsard.top.screen_data import MODES
 from acsard.top.teleop import HELP, Teleop, lines, news, parting
+from tests.each import each
 from tests.unit.top.screens import STATE
 
 SEEN = Teleop("acsar", "tcp/127.0.0.1:7448", "teleop", 0.5, 1.0, STATE, 0.1)
@@ -35,7 +35,7 @@ def texts(seen: Teleop, width: int, height: int | None = 24) -> list[str]:
     return [line.plain for line in lines(seen, width, height)]
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@each("width", WIDTHS)
 def test_at_every_width_the_reason_is_whole_the_pose_has_units_and_the_help_is_there(
     width: int,
 ) -> None:
@@ -81,14 +81,14 @@ def test_a_silence_is_told_with_its_length() -> None:
     assert "first state" in texts(replace(SEEN, state=None), 80)[1]
 
 
-@pytest.mark.parametrize("mode", list(Mode))
+@each("mode", list(Mode))
 def test_the_mode_is_said_once(mode: Mode) -> None:
     seen = of(mode=mode.value, reason=f"{mode.value}: because")
     assert texts(seen, 80)[1].split() == [mode.value.upper(), "because"]
     assert news(seen, 80)[0].startswith(f"{mode.value}: because; ")
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@each("width", WIDTHS)
 def test_without_a_screen_no_word_and_no_figure_is_broken_at_the_edge(width: int) -> None:
     said = news(of(mode="waiting", reason=LONG, x=1.5), width)
     assert max(map(len, said)) <= width

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
 from acsard.top.text import bar, clean, count, ends, rate, rule
 from acsard.top.text import row as labelled
+from tests.each import each
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "shown"),
     [
         ("commanded by app", "commanded by app"),
@@ -39,15 +39,13 @@ def test_cleaned_text_is_printable_and_bounded(text: str) -> None:
     assert len(clean(text)) <= 256
 
 
-@pytest.mark.parametrize(
-    ("number", "text"), [(0, "0"), (1234567, "1,234,567"), (10**30, "1.0e+30"), (-5, "-5")]
-)
+@each(("number", "text"), [(0, "0"), (1234567, "1,234,567"), (10**30, "1.0e+30"), (-5, "-5")])
 def test_a_count_is_readable_however_large(number: int, text: str) -> None:
     assert count(number) == text
     assert len(count(number**1000)) < 15
 
 
-@pytest.mark.parametrize(
+@each(
     ("later", "earlier", "seconds", "text"),
     [
         (300, 200, 1.0, "100.0/s"),
@@ -63,7 +61,7 @@ def test_a_rate_that_cannot_be_told_is_not_made_up(
     assert rate(later, earlier, seconds) == text
 
 
-@pytest.mark.parametrize(
+@each(
     ("value", "drawn"),
     [(0.0, ""), (20.0, "██████"), (-20.0, "██████"), (10.0, "███"), (99.0, "██████"),
      (0.5, "▏"), (math.nan, "")],

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rich.cells import cell_len
 
-from acsard.core.messages.schema import Figure, RobotState, SourceState, Spread, Time
+from acsard.core.messages.schema import Latency, RobotState, SourceState, Spread, Time
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
 from acsard.top.screen_data import MODES, ScreenData
+from tests.each import each
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 
 ENOUGH = "\x1b[2J\x1b]0;x\x07[red]\u202e\x9b1m\n"
@@ -32,7 +33,7 @@ def test_the_head_says_who_where_and_how_fresh() -> None:
         assert told in head
 
 
-@pytest.mark.parametrize("mode", list(Mode))
+@each("mode", list(Mode))
 def test_every_mode_has_a_badge_of_its_colour_and_its_reason(mode: Mode) -> None:
     seen = of(mode=mode.value, reason="because")
     assert lines_of(seen)[1].strip() == f"{mode.value.upper()}   because"
@@ -133,8 +134,8 @@ def test_a_hostile_text_changes_nothing_but_its_own_place() -> None:
         ENOUGH,
         replace(
             STATE, mode=ENOUGH, reason=ENOUGH, link=ENOUGH, source=ENOUGH, refused=ENOUGH,
-            certificate=ENOUGH, sources=[source], counters={f"line_{ENOUGH}": 1},
-            figures={ENOUGH: MEASURED},
+            certificate_expiry=ENOUGH, sources=[source], counters={f"line_{ENOUGH}": 1},
+            latencies={ENOUGH: MEASURED},
         ),
         info=replace(INFO, port=ENOUGH, version=ENOUGH),
     )  # fmt: skip
@@ -170,8 +171,8 @@ states = st.builds(
         integer,
         max_size=9,
     ),
-    certificate=anything,
-    figures=st.dictionaries(st.sampled_from(NAMES), st.builds(Figure, spread, spread)),
+    certificate_expiry=anything,
+    latencies=st.dictionaries(st.sampled_from(NAMES), st.builds(Latency, spread, spread)),
 )  # fmt: skip
 
 

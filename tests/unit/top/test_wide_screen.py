@@ -7,9 +7,10 @@ import re
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Figure, SourceState, Time
+from acsard.core.messages.schema import Latency, SourceState, Time
 from acsard.daemon.latencies import NAMES
 from acsard.top.wide_screen import FIGURES
+from tests.each import each
 from tests.unit.top.screens import (
     BEFORE,
     INFO,
@@ -24,9 +25,9 @@ from tests.unit.top.screens import (
 
 
 def test_first_contact_is_counted_beside_the_commands_and_is_no_refusal() -> None:
-    counters = {**STATE.counters, "commands_first_contact": 40}
+    counters = {**STATE.counters, "commands_of_new_senders": 40}
     shown = lines_of(replace(SEEN, state=replace(STATE, counters=counters)))
-    (line,) = [line for line in shown if "first contact 40" in line]
+    (line,) = [line for line in shown if "of new senders 40" in line]
     assert line.startswith("commands")
     assert any(line.startswith("rejected") and "nothing" in line for line in shown)
 
@@ -41,7 +42,7 @@ def test_the_wheels_are_where_they_are_on_the_robot() -> None:
     assert re.search(r"rear  ▲ \+12.50 .*▼  -7.50", line_with("rear"))
 
 
-@pytest.mark.parametrize("wheels", [[], [1.0], [1.0] * 9, [float("nan")] * 4])
+@each("wheels", [[], [1.0], [1.0] * 9, [float("nan")] * 4])
 def test_wheels_that_are_not_four_numbers_are_shown_as_far_as_they_go(wheels: list[float]) -> None:
     assert len(lines_of(of(wheels=wheels))) == 24 - 1
 
@@ -75,8 +76,8 @@ def test_rates_are_taken_between_two_states() -> None:
     assert "-/s of 1,200" in line_with("superseded", replace(SEEN, state=BEFORE, before=STATE))
 
 
-@pytest.mark.parametrize("set_by", [3600, -3600, 1, -1])
-@pytest.mark.parametrize("width", [80, 60])
+@each("set_by", [3600, -3600, 1, -1])
+@each("width", [80, 60])
 def test_a_robot_s_clock_that_is_set_changes_no_rate(set_by: int, width: int) -> None:
     stepped = replace(STATE, stamp=Time(1000 + set_by, 0))
     told = "\n".join(lines_of(replace(SEEN, state=stepped, passed=1.0), width))
@@ -92,18 +93,18 @@ def test_missed_periods_are_counted_and_stand_out_while_they_grow() -> None:
 
 
 def test_rejects_are_told_by_reason_and_stand_out_while_they_grow() -> None:
-    counters = {"line_malformed": 3, "line_impossible": 12, "command_stale": 4, "line_zero": 0}
+    counters = {"line_malformed": 3, "line_implausible": 12, "command_stale": 4, "line_zero": 0}
     seen = of(counters=counters, refused="source nav: NaN or infinity")
     assert line_with("rejected", seen).split(maxsplit=1)[1] == (
-        "lines impossible 12, malformed 3 · commands stale 4"
+        "lines implausible 12, malformed 3 · commands stale 4"
     )
     assert "source nav: NaN or infinity" in line_with("last one", seen)
-    assert "\x1b[33mimpossible 12\x1b[0m" in painted(seen)
-    assert "\x1b[33mimpossible" not in painted(replace(seen, before=seen.state))
+    assert "\x1b[33mimplausible 12\x1b[0m" in painted(seen)
+    assert "\x1b[33mimplausible" not in painted(replace(seen, before=seen.state))
     assert "nothing" in line_with("rejected")
 
 
-@pytest.mark.parametrize("does", ["used", "silent", "disagrees", "not believed"])
+@each("does", ["used", "silent", "disagrees", "not believed"])
 def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
     assert line_with("gyro", of(gyro=does)).split(maxsplit=1)[1].startswith(does)
     assert not any("gyro" in line for line in lines_of(SEEN))
@@ -111,13 +112,13 @@ def test_what_the_gyro_does_is_told_where_there_is_one(does: str) -> None:
 
 def test_the_track_that_was_learned_stands_beside_the_configured_one() -> None:
     told = "learned 1.603 ± 0.032 (only shown), configured 1.000 in use"
-    assert line_with("track", of(gyro="used", track=told)).split(maxsplit=1)[1] == told
+    assert line_with("track", of(gyro="used", effective_track=told)).split(maxsplit=1)[1] == told
     assert not any("track" in line for line in lines_of(of(gyro="used")))
 
 
 def test_samples_of_a_gyro_that_do_not_count_are_among_the_rejects() -> None:
-    seen = of(counters={"imu_second_sender": 1200, "imu_absurd": 3})
-    assert "gyro second sender 1,200, absurd 3" in line_with("rejected", seen)
+    seen = of(counters={"imu_second_sender": 1200, "imu_out_of_range": 3})
+    assert "gyro second sender 1,200, out of range 3" in line_with("rejected", seen)
 
 
 def test_the_link_is_told_with_its_port() -> None:
@@ -134,9 +135,9 @@ def test_the_link_is_told_with_its_port() -> None:
 def test_the_certificate_is_told_when_there_is_one() -> None:
     assert "certificate" not in "".join(lines_of(SEEN))
     assert "certificate valid for 700 days" in line_with(
-        "link ", of(certificate="valid for 700 days")
+        "link ", of(certificate_expiry="valid for 700 days")
     )
-    ended = of(certificate="expired 3 days ago: TLS refuses every client")
+    ended = of(certificate_expiry="expired 3 days ago: TLS refuses every client")
     assert "certificate expired 3 days ago" in line_with("link ", ended)
 
 
@@ -149,6 +150,6 @@ def test_each_figure_is_told_for_the_last_minute_and_since_the_start() -> None:
 
 
 @pytest.mark.parametrize("figures", [{}, dict.fromkeys(NAMES, UNMEASURED)])
-def test_a_figure_without_a_measurement_is_a_dash(figures: dict[str, Figure]) -> None:
+def test_a_figure_without_a_measurement_is_a_dash(figures: dict[str, Latency]) -> None:
     for name in NAMES:
-        assert line_with(name, of(figures=figures)).split()[-6:] == ["-"] * 6
+        assert line_with(name, of(latencies=figures)).split()[-6:] == ["-"] * 6

@@ -21,11 +21,12 @@ from acsard.web.callers import (
     tokens_in,
     unmapped,
 )
+from tests.each import each
 
 NAMES = frozenset({"robot.local", "192.168.1.7"})
 
 
-@pytest.mark.parametrize(
+@each(
     ("peer", "host"),
     [
         ("127.0.0.1", "localhost:8080"),
@@ -40,7 +41,7 @@ def test_who_is_at_the_machine_is_here(peer: str, host: str) -> None:
     assert place(Asked(peer, True, host), NAMES) == "here"
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "reason"),
     [
         # a name of an attacker that resolves to 127.0.0.1
@@ -62,8 +63,8 @@ def test_any_other_name_is_refused(asked: Asked, reason: str) -> None:
     assert found.value.reason == reason
 
 
-@pytest.mark.parametrize("secure", [False, True])
-@pytest.mark.parametrize("host", ["localhost:8080", "robot.local"])
+@each("secure", [False, True])
+@each("host", ["localhost:8080", "robot.local"])
 def test_who_comes_through_a_proxy_is_nobody_we_know(secure: bool, host: str) -> None:
     with pytest.raises(RefusedError, match="proxy") as found:
         place(Asked("127.0.0.1", secure, host, proxied=True), NAMES)
@@ -77,7 +78,7 @@ def test_by_https_and_a_name_of_the_robot_s_one_is_away(host: str) -> None:
     assert place(Asked("127.0.0.1", True, host), NAMES) == "away"
 
 
-@pytest.mark.parametrize(
+@each(
     ("secure", "host", "origin", "site"),
     [
         (False, "localhost:8080", "http://localhost:8080", None),
@@ -93,7 +94,7 @@ def test_our_own_page_and_programs_may(
     require_own_origin(Asked("127.0.0.1", secure, host, origin, site))
 
 
-@pytest.mark.parametrize(
+@each(
     ("origin", "site"),
     [
         ("http://evil.example", None),

@@ -25,6 +25,7 @@ from acsard.web.frames import (
     Wish,
     decode,
 )
+from tests.each import each
 
 COMMAND = {"cmd": {"linear_x": 0.2, "angular_z": -0.1}, "stamp": 1763700000123.4}
 
@@ -37,7 +38,7 @@ def test_each_kind_is_told_by_its_field() -> None:
     assert decode('{"call": "set", "payload": {"a": 1}, "id": "x"}') == Call("set", "x", {"a": 1})
     assert decode('{"ping": 12.5}') == Ping(12.5)
     assert decode('{"begin": "check", "port": "sim"}') == Begin("check", "sim")
-    assert decode('{"begin": "calibrate", "way": "tape"}') == Begin("calibrate", "", "tape")
+    assert decode('{"begin": "calibrate", "method": "tape"}') == Begin("calibrate", "", "tape")
     assert decode('{"reply": 3, "value": 1.5}') == Reply(3, 1.5)
     assert decode('{"reply": 3, "value": "start"}') == Reply(3, "start")
     assert decode('{"reply": 3}') == Reply(3)
@@ -50,7 +51,7 @@ def test_a_stamp_keeps_its_tenth_of_a_ms_in_ns() -> None:
     assert abs(frame.stamp_ns - 1763700000123_400000) < 1000
 
 
-@pytest.mark.parametrize("stamp", [9.3e12, 1.8e13, 2.0**51, LATEST_STAMP_MS])
+@each("stamp", [9.3e12, 1.8e13, 2.0**51, LATEST_STAMP_MS])
 def test_a_stamp_that_no_signature_holds_is_refused(stamp: float) -> None:
     with pytest.raises(FrameError, match="ms since 1970"):
         decode(json.dumps(COMMAND | {"stamp": stamp}))
@@ -71,7 +72,7 @@ def test_a_command_of_two_zeros_moves_nothing() -> None:
     assert (still.moves, turn.moves) == (False, True)
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "about"),
     [
         ("", "message"),

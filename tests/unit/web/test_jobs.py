@@ -9,10 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.calibration.guided.needs import NEEDS, SIMULATED
-from acsard.calibration.guided.ways import KINDS
+from acsard.calibration.guided.ways import WAYS
 from acsard.cli import calibrate, mcu
 from acsard.web.frames import Begin, FrameError
 from acsard.web.jobs import KEY, Reach, words
+from tests.each import each
 
 REACH = Reach("/etc/acsard/acsard.toml", "tls/robot:7447", "robot2", "/etc/acsard/tls")
 PORTS = ("/dev/acsar", "sim")
@@ -34,22 +35,24 @@ def test_a_check_has_the_port_and_the_file_and_asks() -> None:
     assert [args.yes, args.write, args.wheels_are_lifted] == [False] * 3
 
 
-@pytest.mark.parametrize("way", ["", *NEEDS])
+@each("way", ["", *NEEDS])
 def test_a_calibration_goes_to_the_robot_of_the_page_and_asks(way: str) -> None:
     positions = "sim/pose" if way == "positions" else ""
     args = parsed(words(Begin("calibrate", "", way, positions), REACH, ()))
     assert (args.connect, args.id, args.tls) == (REACH.endpoint, REACH.robot_id, REACH.tls)
-    assert (args.way or "", args.positions or "") == (way, positions)
+    assert (args.method or "", args.positions or "") == (way, positions)
     assert args.json_lines
     assert [args.yes, args.write, args.log] == [False, False, None]
 
 
 def test_what_is_not_known_is_not_given() -> None:
     given = words(Begin("calibrate"), Reach("", "tcp/127.0.0.1:7448", "acsar", ""), ())
-    assert not any(word.startswith(("--config", "--tls", "--way", "--positions")) for word in given)
+    assert not any(
+        word.startswith(("--config", "--tls", "--method", "--positions")) for word in given
+    )
 
 
-@pytest.mark.parametrize(
+@each(
     "wish",
     [
         Begin("check", ""),
@@ -86,12 +89,12 @@ def test_no_text_becomes_an_option_of_its_own(
     names = {word.partition("=")[0] for word in given}
     assert names <= {
         "mcu", "check", "calibrate", "--json-lines", "--config", "--port", "--connect", "--id",
-        "--tls", "--way", "--positions",
+        "--tls", "--method", "--positions",
     }  # fmt: skip
 
 
 def test_the_ways_are_those_there_are() -> None:
-    assert {name: kind.needs for name, kind in KINDS.items()} == NEEDS
+    assert WAYS.keys() == NEEDS.keys()
 
 
 def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:
@@ -100,7 +103,7 @@ def test_what_is_said_of_the_simulator_tells_of_every_way() -> None:
     assert [one for one in NEEDS if one not in why] == []
 
 
-@pytest.mark.parametrize("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
+@each("key", ["a//b", "a/", "/a", "-a", "a" * 81, "a*", "a b", "a\n"])
 def test_what_is_no_key_is_no_positions(key: str) -> None:
     assert not KEY.match(key)
     assert KEY.match("sim/pose")

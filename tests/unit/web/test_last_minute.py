@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import msgspec
-import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Figure, RobotState, Spread, Time, Twist, Vector3
+from acsard.core.messages.schema import Latency, RobotState, Spread, Time, Twist, Vector3
 from acsard.core.values import NS_PER_S
 from acsard.web.last_minute import LASTS_NS, ROWS, STEP_NS, Minute, Plotted
+from tests.each import each
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
 
 STATE = RobotState(
     Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
     [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {},
-    figures={"period_lateness": Figure(SPREAD, SPREAD)},
+    latencies={"period_lateness": Latency(SPREAD, SPREAD)},
 )  # fmt: skip
 
 WISHED = Twist(Vector3(0.3, 0.0, 0.0), Vector3(0.0, 0.0, -0.6))
@@ -56,7 +56,7 @@ def test_it_is_the_last_minute_and_no_more_however_long_it_goes_on() -> None:
     assert {len(column) for column in columns(told)} == {len(told.age)}
 
 
-@pytest.mark.parametrize("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
+@each("look_ns", [1_000_000, 30_000_000, 90_000_000, 110_000_000])
 def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns: int) -> None:
     told = lived(100.0, look_ns).plotted(100 * NS_PER_S)
     assert len(told.age) <= ROWS
@@ -65,7 +65,7 @@ def test_whoever_looks_how_often_it_is_bounded_and_reaches_back_a_minute(look_ns
 
 def test_what_nobody_heard_or_measured_is_none() -> None:
     minute = Minute()
-    unknown = replace(STATE, linear=None, angular=None, wheels=[], figures={})
+    unknown = replace(STATE, linear=None, angular=None, wheels=[], latencies={})
     minute.add(0, unknown, None)
     told = minute.plotted(1)
     assert told.age == [0]

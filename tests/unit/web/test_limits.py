@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from pathlib import Path
 
 import pytest
 
 from acsard.core.values import NS_PER_S
+from acsard.host.rate_limits import Buckets
 from acsard.web.limits import (
     CONNECTIONS,
     CONNECTIONS_ALIKE,
@@ -17,73 +17,9 @@ from acsard.web.limits import (
     GUESSES,
     GUESSES_OF_ONE,
     REQUESTS,
-    Bucket,
-    Buckets,
-    Places,
-    Rate,
     Seats,
     Shares,
 )
-
-
-def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
-    bucket = Bucket(Rate(10.0, 20.0), 0)
-    assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
-    taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
-    assert 99 <= taken <= 100  # within ten seconds
-
-
-def test_a_bucket_holds_no_more_than_its_most_after_a_long_rest() -> None:
-    bucket = Bucket(Rate(10.0, 20.0), 0)
-    assert sum(bucket.take(3600 * NS_PER_S) for _ in range(100)) == 20
-
-
-def test_wrong_tokens_are_enough_after_some_and_a_minute_forgets_them() -> None:
-    guesses, most = Buckets(GUESSES_OF_ONE, GUESSES), int(GUESSES_OF_ONE.most)
-    assert [guesses.take("a", 0) for _ in range(most + 1)] == [True] * most + [False]
-    assert guesses.take("b", 0)
-    assert all(guesses.take("a", 61 * NS_PER_S) for _ in range(most))
-
-
-def test_an_address_has_no_moment_at_which_it_may_guess_twice_as_often() -> None:
-    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
-    assert guesses.take("b", 0)
-    tenths = [n * NS_PER_S // 10 for n in range(595, 610) for _ in range(20)]
-    assert sum(guesses.take("a", at_ns) for at_ns in tenths) <= GUESSES_OF_ONE.most + 1
-
-
-def test_many_addresses_together_are_held_too() -> None:
-    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
-    assert all(guesses.take(f"10.0.0.{n}", 0) for n in range(int(GUESSES.most)))
-    assert not guesses.take("never seen", 0)
-
-
-def test_an_address_that_may_guess_no_more_uses_up_nothing_of_the_others() -> None:
-    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
-    for _ in range(2 * int(GUESSES.most)):
-        guesses.take("a", 0)
-    assert guesses.take("b", 0)
-
-
-def test_a_name_that_rests_is_forgotten_so_that_names_fill_no_memory() -> None:
-    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
-    tracemalloc.start()
-    try:
-        for n in range(10_000):
-            guesses.take(f"address {n}", n * NS_PER_S // 10)
-        held, _ = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert held < 200_000  # bytes; all names together take 2.3 MB
-
-
-def test_places_are_bounded_by_address_and_in_all() -> None:
-    places = Places(3, 2)
-    assert [places.enter("a") for _ in range(3)] == [True, True, False]
-    assert [places.enter("b"), places.enter("c")] == [True, False]
-    places.leave("a")
-    assert places.enter("c")
-    assert places.taken == 3
 
 
 def test_a_token_has_a_share_of_the_pages_from_however_many_addresses_and_leaves_room() -> None:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from acsard.certificates.authority import Authority
 from acsard.cli import web
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
-from acsard.lan.authority import Authority
 from acsard.web.listen import (
     Listen,
     bound,
@@ -115,9 +115,9 @@ def test_a_port_that_is_taken_is_told_or_passed_over() -> None:
 def test_https_without_a_certificate_is_told_and_http_needs_none(tmp_path: Path) -> None:
     away, here = listens("https://0.0.0.0:8443"), listens("http://127.0.0.1:8080")
     require_certificate([here], "")
-    with pytest.raises(CertificateError, match="lan init"):
+    with pytest.raises(CertificateError, match="tls init"):
         require_certificate([here, away], "")
-    with pytest.raises(CertificateError, match="lan init"):
+    with pytest.raises(CertificateError, match="tls init"):
         require_certificate([away], str(tmp_path))
 
 
@@ -130,6 +130,6 @@ def test_nobody_is_invited_to_where_the_server_could_not_start(
     parser = argparse.ArgumentParser()
     web.add(parser.add_subparsers())
     words = ["web", *tls, "--address", "https://0.0.0.0:8443", "--invite", "viewer"]
-    with pytest.raises(CertificateError, match="lan init"):
+    with pytest.raises(CertificateError, match="tls init"):
         web.main(parser.parse_args(words))
     assert list(tmp_path.iterdir()) == []

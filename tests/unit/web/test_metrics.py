@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 from prometheus_client.parser import text_string_to_metric_families
 
-from acsard.core.messages.schema import Figure, RobotState, Spread, Time
+from acsard.core.messages.schema import Latency, RobotState, Spread, Time
 from acsard.web.metrics import text
 
 SPREAD = Spread(10, 5.0, 20.0, 80.0)
@@ -13,7 +13,7 @@ SPREAD = Spread(10, 5.0, 20.0, 80.0)
 STATE = RobotState(
     Time(1, 0), "driving", "driving: commanded by app", 1.0, 2.0, 0.5, 0.25, -0.5,
     [1.0, 2.0, 3.0, 4.0], "up", "app", [], "", {"lines": 7, "missed_periods": 2},
-    figures={"period_lateness": Figure(SPREAD, SPREAD)},
+    latencies={"period_lateness": Latency(SPREAD, SPREAD)},
 )  # fmt: skip
 
 
@@ -41,8 +41,8 @@ def test_what_the_robot_says_is_there_with_its_labels() -> None:
     assert got["acsard_mode", frozenset({own, ("mode", "stopped")})] == 0
     assert got["acsard_linear_speed_mps", frozenset({own})] == 0.25
     assert got["acsard_robot_total", frozenset({own, ("what", "missed_periods")})] == 2
-    late = frozenset({own, ("figure", "period_lateness"), ("at", "p99")})
-    assert abs(got["acsard_figure_seconds", late] - 20e-6) < 1e-12
+    late = frozenset({own, ("latency", "period_lateness"), ("at", "p99")})
+    assert abs(got["acsard_latency_seconds", late] - 20e-6) < 1e-12
     assert got["acsard_page_viewers", frozenset({own})] == 3
     assert got["acsard_page_total", frozenset({own, ("what", "commands")})] == 4
     assert got["acsard_page_refused_total", frozenset({own, ("reason", "host")})] == 5

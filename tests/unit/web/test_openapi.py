@@ -8,16 +8,16 @@ from collections.abc import Hashable
 from pathlib import Path
 from typing import Any
 
-import pytest
 from jsonschema import Draft202012Validator
 from openapi_spec_validator import OpenAPIV31SpecValidator
 
+from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import SERVICES, TOPICS
-from acsard.daemon.bus.access import SERVICE_ROLES, least_role
 from acsard.web.app import ROUTES
 from acsard.web.frames import KINDS, FrameError, decode
 from acsard.web.openapi import FROM_ROBOT, TO_ROBOT, document
 from acsard.web.routes import PARAMETERS, asked
+from tests.each import each
 
 WHOLE = document("1.2.3", ROUTES)
 
@@ -74,7 +74,7 @@ def test_the_page_has_a_message_of_each_kind() -> None:
     assert {type(decode(one)) for one in MESSAGES} == set(KINDS.values())
 
 
-@pytest.mark.parametrize("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
+@each("message", [*MESSAGES, "{}", '{"ping": 1, "call": "stop"}', '{"cmd": {}}'])
 def test_what_the_socket_takes_is_what_its_schema_says(message: str) -> None:
     meant = {"components": WHOLE["components"], "$ref": f"#/components/schemas/{TO_ROBOT}"}
     try:

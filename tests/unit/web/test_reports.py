@@ -15,6 +15,7 @@ import pytest
 from acsard.core.values import NS_PER_S
 from acsard.web import reports
 from acsard.web.reports import BYTES, KEEP_NS, NICE, Reports, ReportState
+from tests.each import each
 
 PATIENCE_S = 30.0
 
@@ -85,14 +86,14 @@ def test_a_recording_that_has_grown_is_drawn_anew_and_one_that_has_not_is_not() 
     run(story)
 
 
-@pytest.mark.parametrize(
+@each(
     ("program", "why"),
     [
         ("import sys; sys.exit('acsard: needs the library plotly; run: pip')", "needs the library"),
         ("raise MemoryError", "memory: draw it on another machine"),
         ("{}['x']", "KeyError: 'x'"),
         ("import os; os.kill(os.getpid(), 9)", "most likely because memory ran out"),
-        ("import os; os.kill(os.getpid(), 15)", "ended with -15"),
+        ("import os; os.kill(os.getpid(), 15)", "was ended by signal 15"),
         (f"import sys; sys.stdout.write('x' * {BYTES + 1})", "draw a part of it"),
     ],
 )
@@ -124,7 +125,7 @@ def test_it_takes_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
 
     async def story() -> None:
         told = await become(drawn_by(WAITS), A, "ready", "failed")
-        assert "acsard log report" in told.text
+        assert "acsard recording report" in told.text
 
     run(story)
 

@@ -6,8 +6,8 @@ import re
 from collections import Counter
 from pathlib import Path
 
+from acsard.core.messages.permissions import SERVICE_ROLES
 from acsard.core.messages.topics import SERVICES, row_of
-from acsard.daemon.bus.access import SERVICE_ROLES
 from acsard.web.app import ROUTES
 
 PAGE = (Path(__file__).parents[3] / "deploy/web/README.md").read_text()

@@ -13,21 +13,24 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
-from acsard.web import job_lines, socket_messages
+from acsard.prompts import json_messages
+from acsard.web import socket_messages
 from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, LINES, SENT, VALUE
 from acsard.web.socket_sender import Following
 from acsard.web.streams import KEYS as FOLLOWED
 from tests.described import FRAMES, GUIDES, SCHEMAS, kinds, spoilt, taken
+from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 GREETING = socket_messages.Greeting(
-    "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0
+    "acsar", "1", "operator", "phone/1f", socket_messages.Limits(1.0, 4.0), True, 10.0,
+    {"set": "for maintainers; you are operator"},
 )  # fmt: skip
 
 SAID: tuple[Struct, ...] = (
     socket_messages.Hello(GREETING),
-    socket_messages.Way([(0.0, 1.5)], []),
+    socket_messages.DrivenPath([(0.0, 1.5)], []),
     socket_messages.LastMinute(Minute().plotted(0)),
     socket_messages.Answer(7, True, "stopped"),
     socket_messages.Rows([socket_messages.Row("acsar", None, "", None, "", None, "")], ""),
@@ -39,13 +42,13 @@ SAID: tuple[Struct, ...] = (
 GUIDED: tuple[Struct, ...] = (
     socket_messages.Running("check", "here", True),
     socket_messages.Ended(0, "success", ""),
-    job_lines.Subject("port sim", True),
-    job_lines.JobProgress("so"),
-    job_lines.Doing("so"),
-    job_lines.Progress(0.5),
-    job_lines.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
-    job_lines.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
-    job_lines.Result("all"),
+    json_messages.Subject("port sim", True),
+    json_messages.JobMessage("so"),
+    json_messages.Doing("so"),
+    json_messages.Progress(0.5),
+    json_messages.Question(question=1, words="How far?", unit="m", least=0.5, most=3.0),
+    json_messages.Found(Finding("watchdog", "PASS", keys={"mcu.port": "sim"})),
+    json_messages.Result("all"),
 )
 
 
@@ -60,14 +63,14 @@ def test_all_that_may_be_followed_is_described() -> None:
     }
 
 
-@pytest.mark.parametrize("message", SAID, ids=lambda one: type(one).__name__)
+@each("message", SAID)
 def test_what_is_said_is_as_described_and_nothing_of_it_may_be_missing(message: Struct) -> None:
     frame = as_told(message)
     assert kinds([frame]) == {type(message).__name__}
     assert [one for one in spoilt(frame) if taken(one)] == []
 
 
-@pytest.mark.parametrize("line", GUIDED, ids=lambda one: type(one).__name__)
+@each("line", GUIDED)
 def test_what_a_check_or_calibration_says_is_as_described(line: Struct) -> None:
     assert kinds([as_told({"guide": line})]) == {"Guided", type(line).__name__}
     assert not taken({"guide": {}})

@@ -11,11 +11,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from acsard.calibration.guided.legs import Ask, Leg, Setup, Way, setup
+from acsard.calibration.guided.legs import Leg, Setup, setup
+from acsard.calibration.guided.runner import guide
+from acsard.calibration.guided.ways import WAYS
 from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
+from acsard.prompts.prompt import Ask
+from acsard.prompts.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
@@ -127,15 +131,26 @@ class Player:
         return round(math.degrees(off) + float(self.robot.rng.normal(0, 2.0)))
 
 
-def play(way: Way, player: Player) -> Calibration:
+class Asked(NoPrompt):
+    """A prompt that passes every question to the simulated person."""
+
+    def __init__(self, player: Player) -> None:
+        super().__init__()
+        self._player = player
+
+    def number(self, ask: Ask) -> float:
+        return self._player.answer(ask)
+
+
+def play(way: str, player: Player) -> Calibration:
     """Play a calibration to its end."""
-    step = next(way)
-    try:
-        while True:
-            step = way.send(player.ride(step) if isinstance(step, Leg) else player.answer(step))
-    except StopIteration as end:
-        found: Calibration = end.value
-        return found
+    return guide(way, usual_setup(), Asked(player), player.ride)
+
+
+def leg(way: str, name: str, track: float = 1.6) -> Leg:
+    """Return one leg of a way for a track."""
+    (found,) = [one for one in WAYS[way].legs(usual_setup(), track) if one.name == name]
+    return found
 
 
 def usual_setup() -> Setup:

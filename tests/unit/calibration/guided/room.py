@@ -9,8 +9,8 @@ import cmath
 import math
 from collections.abc import Iterator, Sequence
 
-from acsard.calibration.guided import tape, tour, umbmark, wall
 from acsard.calibration.guided.legs import Leg, Setup
+from acsard.calibration.guided.ways import WAYS, side_of_square
 
 SIDE = 3.0
 STEP_S = 0.05
@@ -31,28 +31,22 @@ Drive = tuple[Start, Sequence[Leg]]
 def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
     """Yield every drive of a calibration if `track` is the estimated track.
 
-    In the poses x is forward and y is left.
+    A drive begins with a leg before which the person sets the robot by hand. In the poses x is
+    forward and y is left.
     """
-    edge = complex(setup.reach + 0.1, SIDE / 2), 0.0
-    if way == "gyro":
-        yield edge, (tour.straight(setup), tour.spins(setup))
-    elif way == "positions":
-        yield edge, (tour.straight(setup), tour.petals(setup))
-    elif way == "tape":
-        spins = [tape.spin(setup, number, track) for number in (0, 1)]
-        yield edge, (tape.straight(setup), tape.back(setup), tape.first_turn(setup), *spins)
-    elif way == "umbmark":
-        yield edge, (umbmark.straight(setup), umbmark.first_turn(setup))
-        aside = (SIDE - umbmark.length(setup)) / 2
-        for side in (1, -1):
-            place = complex(aside, aside if side > 0 else SIDE - aside)
-            yield (place, 0.0), [umbmark.square(setup, side, track)]
-    else:
-        back = complex(setup.reach, SIDE / 2), 0.0
-        yield back, (wall.out(setup), wall.first_turn(setup), wall.home(setup))
-        for side in (1, -1):
-            yield back, [wall.there_and_back(setup, side, track)]
-        yield back, [wall.spun(setup, track)]
+    aside = (SIDE - side_of_square(setup)) / 2
+    starts: dict[str, Start] = {
+        "square to the left": (complex(aside, aside), 0.0),
+        "square to the right": (complex(aside, SIDE - aside), 0.0),
+    }
+    drive: list[Leg] = []
+    for leg in reversed(WAYS[way].legs(setup, track)):
+        drive.insert(0, leg)
+        if any(words in leg.words for words in ("Push", "Set the robot")):
+            edge = setup.reach + (0.0 if way == "wall" else 0.1)
+            yield starts.get(leg.name, (complex(edge, SIDE / 2), 0.0)), drive
+            drive = []
+    assert not drive, "nobody says where the first leg begins"
 
 
 def places(drive: Drive, setup: Setup, track: float, bend: float) -> Iterator[complex]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import msgspec
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,14 +12,12 @@ from hypothesis import strategies as st
 from acsard.calibration.guided.legs import (
     FASTEST_WHEEL,
     SLOW,
-    Ask,
     GuideError,
     Leg,
     Move,
-    ask,
-    ride,
     setup,
 )
+from acsard.calibration.guided.ways import WAYS
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from tests.unit.calibration.guided.room import beyond
 
@@ -64,9 +61,6 @@ def test_a_turn_by_the_true_track_is_the_angle_whatever_is_configured(
     assert move.angular * multiplier / track * move.seconds == pytest.approx(angle)
 
 
-WAYS = "gyro", "positions", "tape", "wall", "umbmark"
-
-
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("separation", [0.15, 0.3, 0.6])
 @pytest.mark.parametrize("multiplier", [1.0, 1.6])
@@ -104,22 +98,4 @@ def test_the_straight_drive_ends_short_however_weak_the_brakes() -> None:
 
 
 def test_a_leg_lasts_as_long_as_its_moves() -> None:
-    assert Leg("", (Move(1.5), Move(2.0, 0.3))).seconds == 3.5
-
-
-def test_a_number_that_is_sent_is_what_was_asked_for() -> None:
-    asking = ask("how far?", "m", 0.0, 2.0, 1.0)
-    assert next(asking) == Ask("how far?", "m", 0.0, 2.0, 1.0)
-    with pytest.raises(StopIteration) as end:
-        asking.send(0.7)
-    assert end.value.value == 0.7
-
-
-def test_what_is_sent_for_a_leg_is_its_run() -> None:
-    leg = Leg("", (Move(1.0),))
-    riding = ride(leg)
-    assert next(riding) is leg
-    run = np.zeros(3)
-    with pytest.raises(StopIteration) as end:
-        riding.send(run)
-    assert end.value.value is run
+    assert Leg("", "", (Move(1.5), Move(2.0, 0.3))).seconds == 3.5

@@ -13,19 +13,16 @@ from hypothesis import strategies as st
 
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.evidence import LEFT, RIGHT, TURN
-from acsard.calibration.guided.legs import WIDEST, GuideError
+from acsard.calibration.guided.legs import WIDEST, GuideError, What
 from acsard.calibration.guided.readings import (
-    MOST_SPIN_S,
     Reading,
-    What,
     effective,
     found,
     joined,
-    once_round,
     predicted,
     slant,
-    turns,
 )  # fmt: skip
+from acsard.calibration.guided.ways import MOST_SPIN_S, once_round, turns
 from acsard.calibration.runs import Run
 from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.cut import BASE, IDEAL, log_of

@@ -5,22 +5,30 @@ The simulated person reads to a few mm.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from acsard.calibration.guided.legs import MOST_S, setup
-from acsard.calibration.guided.ways import KINDS
+from acsard.calibration.doubts import RefusedError
+from acsard.calibration.guided.legs import MOST_S, WIDEST, GuideError, Slant, setup
+from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.runner import guide
+from acsard.calibration.guided.ways import WAYS, side_of_square
+from acsard.calibration.log_table import LogError
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
-from tests.unit.calibration.guided.played import Player, anyone, play, usual_setup
-from tests.unit.calibration.robots import Drive, Robot, drive, wander
+from acsard.prompts.prompt import Ask
+from tests.unit.calibration.cut import IDEAL
+from tests.unit.calibration.guided.played import Asked, Player, anyone, leg, play, usual_setup
+from tests.unit.calibration.robots import SEPARATION, Drive, Robot, drive, wander
 from tests.unit.calibration.test_solve import off
 
 FEW, MANY = 1, 20
 
-each_way = pytest.mark.parametrize("way", KINDS)
+each_way = pytest.mark.parametrize("way", WAYS)
 so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.soak)])
 
 
@@ -34,7 +42,7 @@ def robots(way: str, count: int) -> list[tuple[Robot, Calibration, Player, Drive
     for seed in range(count):
         robot = anyone(seed)
         player = Player(robot, gyro=way == "gyro", places=way == "positions")
-        found = play(KINDS[way].begin(usual_setup()), player)
+        found = play(way, player)
         made.append((robot, found, player, drive(robot, wander(robot.rng, 300.0))))
     return made
 
@@ -80,9 +88,8 @@ def test_ninety_seconds_of_driving_are_enough(way: str, count: int) -> None:
 def test_no_track_makes_it_longer_than_it_may_be(way: str, separation: float) -> None:
     made = setup(Config(drive=DriveConfig(wheel_separation=separation)))
     tracks = [1.0 + 0.05 * step for step in range(31)]
-    longest = max(KINDS[way].longest_s(made, track) for track in tracks)
-    assert longest <= MOST_S
-    assert f"at most {longest:.0f} s" in KINDS[way].told(made)
+    longest = max(sum(leg.seconds for leg in WAYS[way].legs(made, track)) for track in tracks)
+    assert WAYS[way].longest_s(made) == longest <= MOST_S
 
 
 @each_way
@@ -92,3 +99,177 @@ def test_what_it_improves_is_told(way: str) -> None:
         assert now is not None
         assert then is not None
         assert then < now / 5
+
+
+# the legs of each way
+
+
+class Talk(Asked):
+    """A prompt that records what it shows and asks."""
+
+    def __init__(self, player: Player) -> None:
+        super().__init__(player)
+        self.shown: list[str] = []
+        self.asked: list[Ask] = []
+
+    def say(self, text: str) -> None:
+        self.shown.append(text)
+
+    def start(self, text: str, by_key: bool = False) -> None:
+        self.shown.append(text)
+
+    def number(self, ask: Ask) -> float:
+        self.asked.append(ask)
+        return super().number(ask)
+
+
+@cache
+def talk(way: str) -> Talk:
+    player = Player(anyone(0), gyro=way == "gyro", places=way == "positions")
+    talk = Talk(player)
+    guide(way, usual_setup(), talk, player.ride)
+    return talk
+
+
+@each_way
+def test_a_person_reads_what_is_needed_and_how_long_each_leg_takes(way: str) -> None:
+    first, *legs = talk(way).shown
+    assert first.startswith(f"Calibration with {NEEDS[way]}. It drives for at most ")
+    assert f" {WAYS[way].longest_s(usual_setup()):.0f} s in all." in first
+    assert [text.split(".")[0] for text in legs] == [str(n + 1) for n in range(len(legs))]
+    assert all(text.endswith(" s)") for text in legs)
+
+
+@each_way
+def test_the_names_of_a_table_are_its_own(way: str) -> None:
+    table = WAYS[way]
+    legs = table.legs(usual_setup(), 1.6)
+    names = [leg.name for leg in legs]
+    assert len(set(names)) == len(names)
+    for number, one in enumerate(legs):
+        asked = [ask.name for ask in one.asks]
+        assert len(set(asked)) == len(asked)
+        for measure in one.measures:
+            assert set(measure.over) <= set(names[: number + 1])
+            if isinstance(measure, Slant):
+                assert {measure.near, measure.far} <= set(asked)
+                assert measure.apart in {ask.name for ask in table.asks}
+                assert measure.since in ("", *names[:number])
+            else:
+                assert set(measure.answers) <= set(asked)
+
+
+@each_way
+def test_legs_before_the_track_is_known_do_not_depend_on_it(way: str) -> None:
+    narrow, wide = (WAYS[way].legs(usual_setup(), track) for track in (1.0, WIDEST))
+    for one, other in zip(narrow, wide, strict=True):
+        assert one == other
+        if any(measure.what == "turned" for measure in one.measures):
+            break
+
+
+class Hasty(Player):
+    """A person who ends the first turn after less than half a revolution."""
+
+    def _round_s(self, angular: float) -> float:
+        return super()._round_s(angular) / 2.3
+
+
+def test_a_first_turn_that_was_ended_half_way_is_found_out() -> None:
+    with pytest.raises(GuideError, match="one whole turn"):
+        play("tape", Hasty(Robot(chi=1.7)))
+
+
+def test_short_lengths_are_asked_in_mm_and_the_long_one_in_m() -> None:
+    units = [ask.unit for ask in talk("tape").asked]
+    assert units.count("m") == 1
+    assert set(units) == {"mm", "m"}
+
+
+def test_left_and_right_come_apart_by_what_is_driven_between_two_half_turns() -> None:
+    robot = anyone(1)
+    robot.left, robot.right = 1.005, 0.995
+    found = play("wall", Player(robot)).found
+    ratio = found.values[1] / found.values[2]
+    assert ratio == pytest.approx(1.01, abs=0.006)
+
+
+def test_it_stops_short_of_the_wall_it_comes_back_to() -> None:
+    for name in ("half round to the left", "round at the wall"):
+        moves = leg("wall", name).moves
+        ways = [move.linear * move.seconds for move in moves if move.linear]
+        assert abs(ways[1]) < ways[0] - 0.1
+
+
+class Exact(Player):
+    """A person who notes where the squares of a robot without noise ended."""
+
+    def __init__(self, robot: Robot) -> None:
+        super().__init__(robot)
+        self.ends: list[complex] = []
+
+    def answer(self, ask: Ask) -> float:
+        if "left of its marks" in ask.words:
+            self.ends.append(self.place)
+        return super().answer(ask)
+
+
+def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
+    """Compare with the equations for E_d and E_b of Borenstein and Feng.
+
+    They use the mean ends of left and right squares.
+
+    Their nominal robot is one whose squares would close: it has equal wheels and the track that was
+    used to command the turns.
+    """
+    robot = replace(Robot(chi=1.3, left=0.999, right=1.001), **IDEAL)  # type: ignore[arg-type]
+    player = Exact(robot)
+    found = play("umbmark", player).found
+    side = side_of_square(usual_setup())
+    left, right = player.ends
+    # Left is counter-clockwise. In the frame of their paper the first side is along x, and y is to
+    # the left.
+    beta = (right.real - left.real) / (-4 * side)
+    ratio = math.tan(beta / 2) * SEPARATION * 1.3 / side
+    assert found.values[2] / found.values[1] - 1 == pytest.approx(2 * ratio, abs=1.2e-3)
+
+
+def test_two_squares_close_enough_to_be_measured() -> None:
+    rng = np.random.default_rng(4)
+    player = Exact(Robot(chi=1.8, rng=rng))
+    play("umbmark", player)
+    assert max(map(abs, player.ends)) < 0.8
+
+
+class Blind(Player):
+    """A person without a tape, who answers each question with its default."""
+
+    def answer(self, ask: Ask) -> float:
+        assert ask.usual is not None
+        return ask.usual
+
+
+def test_a_tape_beside_the_gyro_measures_the_wheels() -> None:
+    robot = replace(anyone(3), left=0.95, right=0.952)
+    found = play("gyro", Player(robot, gyro=True))
+    assert found.scale == "distance"
+    assert found.found.values[1] == pytest.approx(0.95, rel=0.02)
+
+
+def test_without_a_tape_the_size_of_the_wheels_stays_as_configured() -> None:
+    found = play("gyro", Blind(anyone(3), gyro=True))
+    assert found.scale == ""
+    assert found.found.values[1:].mean() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_gyro_that_says_one_and_the_same_is_refused() -> None:
+    robot = replace(anyone(3), gyro_noise=0.0, gyro_hz=0.001)
+    with pytest.raises((LogError, RefusedError), match=r"gyro|record"):
+        play("gyro", Blind(robot, gyro=True))
+
+
+@pytest.mark.parametrize("way", ["gyro", "positions"])
+def test_every_curve_is_driven_back(way: str) -> None:
+    curves = [move for move in leg(way, "turns").moves if move.linear and move.angular]
+    assert sum(move.angular * move.seconds for move in curves) == pytest.approx(0.0)
+    assert sum(move.linear * move.seconds for move in curves) == pytest.approx(0.0)

@@ -17,6 +17,7 @@ from acsard.core.config.settings import (
     RosConfig,
     SimConfig,
 )
+from tests.each import each
 
 
 def problems(**tables: object) -> list[str]:
@@ -35,12 +36,12 @@ HERE = "tcp/127.0.0.1:7448"
 def test_a_tls_endpoint_needs_certificates(endpoint: str) -> None:
     listen = (HERE, endpoint)
     (line,) = problems(bus=BusConfig(listen=listen))
-    assert "acsard lan init" in line
+    assert "acsard tls init" in line
     assert problems(bus=BusConfig(listen=listen, tls="/etc/acsard/tls")) == []
     assert problems(bus=BusConfig(connect=(endpoint,), tls="/etc/acsard/tls")) == []
 
 
-def test_the_door_needs_a_way_to_the_daemon() -> None:
+def test_the_gateway_needs_a_way_to_the_daemon() -> None:
     (line,) = problems(bus=BusConfig(listen=("tls/0.0.0.0:7449",), tls="/etc/acsard/tls"))
     assert line == (
         'bus.listen = ["tls/0.0.0.0:7449"]: clients that connect by TLS reach the daemon '
@@ -51,12 +52,12 @@ def test_the_door_needs_a_way_to_the_daemon() -> None:
 @pytest.mark.parametrize("endpoint", ["tcp/0.0.0.0:7448", "tcp/[::]:7448", "tcp/robot:7448"])
 def test_a_plain_endpoint_stays_on_this_machine_even_with_certificates(endpoint: str) -> None:
     (line,) = problems(bus=BusConfig(listen=(endpoint,), tls="/etc/acsard/tls"))
-    assert "acsard lan init" in line
+    assert "acsard tls init" in line
     assert "bus.insecure = true" in line
     assert problems(bus=BusConfig(listen=(endpoint,), insecure=True)) == []
 
 
-@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
+@each("endpoint", ["udp/127.0.0.1:1", "tls/:7449", "tls/host", "tls/host:0"])
 def test_anything_else_is_no_endpoint(endpoint: str) -> None:
     (line,) = problems(bus=BusConfig(listen=(HERE, endpoint), tls="/etc/acsard/tls"))
     assert "not an endpoint" in line
@@ -68,7 +69,7 @@ def test_a_client_needs_somewhere_to_connect_to() -> None:
     assert problems(bus=BusConfig(mode="client", connect=("tcp/127.0.0.1:7447",))) == []
 
 
-@pytest.mark.parametrize("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
+@each("listen", [(), ("nonsense",), ("tcp/0.0.0.0:7448",), ("tls/1.2.3.4:5",)])
 def test_where_a_client_would_listen_is_neither_refused_nor_a_surprise(
     listen: tuple[str, ...],
 ) -> None:
@@ -141,7 +142,7 @@ def test_the_sample_fields_take_more_still() -> None:
     assert "control.rate = 80 takes 86% of the wire at 57600 baud" in warning
 
 
-@pytest.mark.parametrize(
+@each(
     ("mcu", "count"),
     [
         (McuConfig(), 33),

@@ -7,6 +7,7 @@ from tomlkit.exceptions import NonExistentKey
 
 from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError, parse
+from tests.each import each
 
 KEYS: dict[str, object] = {
     "mcu.baud_rate": 57600,
@@ -17,7 +18,7 @@ KEYS: dict[str, object] = {
 }
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "",
@@ -40,7 +41,7 @@ def test_keys_are_set_however_the_file_is_written(text: str) -> None:
     assert all(line in after for line in text.splitlines() if line.startswith("#"))
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "keys"),
     [
         ("[mcu]\n", {"mcu.baud_rate": 300}),
@@ -55,9 +56,7 @@ def test_what_would_not_check_is_not_written(text: str, keys: dict[str, object])
         edited(text, keys)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n']
-)
+@each("text", ["", "[bus]\n", "bus.tls = ''\n", '[bus]\nlisten = [\n  "tcp/[::1]:1",  # here\n]\n'])
 def test_a_list_is_set_as_any_other_value(text: str) -> None:
     endpoints = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:7449"]
     after = edited(text, {"bus.listen": endpoints, "bus.tls": "/etc/acsard/tls"})

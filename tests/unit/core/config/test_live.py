@@ -16,6 +16,7 @@ from acsard.core.config.live import LIVE, changed, flat, live
 from acsard.core.config.parsing import ConfigError, effective, parse
 from acsard.core.config.settings import Config, LimitsConfig, RobotConfig
 from acsard.core.config.writing import document
+from tests.each import each
 
 CONFIG = Config(robot=RobotConfig("r7"))
 KEYS = dict(flat(effective(CONFIG)))
@@ -53,7 +54,7 @@ def test_every_row_is_a_key_and_every_source_has_its_own() -> None:
     assert all(row.what for row in LIVE.values())
 
 
-@pytest.mark.parametrize(
+@each(
     "key",
     ["mcu.port", "drive.wheel_radius", "feedback.fault_time", "commands.neutral_first",
      "commands.sources.nav.priority", "bus.listen", "access.maintainers", "robot.id",
@@ -85,7 +86,7 @@ def test_a_whole_number_is_a_number_and_a_list_is_one() -> None:
     assert made.odometry.twist_covariance_diagonal == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
-@pytest.mark.parametrize(
+@each(
     "wishes",
     [
         {"limits.linear_speed": 1.0},
@@ -93,7 +94,6 @@ def test_a_whole_number_is_a_number_and_a_list_is_one() -> None:
         dict(KEYS),
         {},
     ],
-    ids=["one", "fixed ones", "all, as `ros2 param load` has them", "none"],
 )
 def test_what_is_so_already_is_no_change_whatever_it_is(wishes: dict[str, object]) -> None:
     assert changed(CONFIG, wishes, False) == (CONFIG, "")
@@ -113,10 +113,8 @@ VALUES: dict[str, list[object]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [(key, value) for key, values in VALUES.items() for value in values]
-)
-@pytest.mark.parametrize("beside", [{}, {"limits.angular_speed": 20.0, "limits.linear_speed": 4.5}])
+@each(("key", "value"), [(key, value) for key, values in VALUES.items() for value in values])
+@each("beside", [{}, {"limits.angular_speed": 20.0, "limits.linear_speed": 4.5}])
 def test_a_change_is_judged_as_the_file_is(
     key: str, value: object, beside: dict[str, object]
 ) -> None:
@@ -145,7 +143,7 @@ def test_limits_beyond_what_feedback_may_say_are_refused() -> None:
     assert "feedback.wheel_speed = 80: the limits allow commands of 79.0 rad/s for a wheel" in line
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "value", "words"),
     [
         ("limits.linear_sped", 1.0, "did you mean limits.linear_speed?"),
@@ -177,7 +175,7 @@ def test_of_many_that_cannot_be_set_one_is_explained() -> None:
 SOFTER = [key for key, row in LIVE.items() if row.when == "raised"]
 
 
-@pytest.mark.parametrize("key", SOFTER)
+@each("key", SOFTER)
 def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> None:
     config = replace(CONFIG, limits=LimitsConfig(linear_speed=0.2, angular_speed=0.2))
     now = dict(flat(effective(config)))[key]
@@ -189,9 +187,9 @@ def test_braking_may_get_harder_while_it_drives_and_softer_at_rest(key: str) -> 
     assert "only while the robot stands; stop the robot first" in line
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "value"),
-    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.pause", 2.0),
+    [("limits.wheel_speed", 39.0), ("limits.wheel_speed", 41.0), ("commands.neutral_pause", 2.0),
      ("commands.sources.nav.timeout", 0.5)],
 )  # fmt: skip
 def test_what_would_jump_or_forget_who_drives_waits_for_rest(key: str, value: float) -> None:
@@ -200,7 +198,7 @@ def test_what_would_jump_or_forget_who_drives_waits_for_rest(key: str, value: fl
     assert changed(CONFIG, {key: value}, at_rest=True)[1]
 
 
-@pytest.mark.parametrize("key", [key for key, row in LIVE.items() if row.when == "always"])
+@each("key", [key for key, row in LIVE.items() if row.when == "always"])
 def test_the_others_may_be_set_at_any_time(key: str) -> None:
     now = KEYS[key]
     other: object = {"model": "constant", "info": "debug"}.get(str(now))

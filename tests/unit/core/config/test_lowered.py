@@ -7,12 +7,13 @@ from msgspec.structs import replace
 
 from acsard.core.config.lowered import lowered, with_lowered
 from acsard.core.config.settings import Config, LimitsConfig
+from tests.each import each
 
 FILE = LimitsConfig(linear_speed=1.0, linear_jerk=5.0)
 SOFT = 0.5
 
 
-@pytest.mark.parametrize(
+@each(
     ("now", "kept"),
     [
         (FILE, {}),

@@ -17,6 +17,7 @@ from acsard.core.config.settings import Config, DriveConfig, FeedbackConfig, Lim
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import Limiter
 from acsard.core.values import REST, Twist
+from tests.each import each
 
 DT = 0.01
 
@@ -160,7 +161,7 @@ def test_a_smaller_wheel_has_to_turn_faster() -> None:
     assert "commands of 40.0 rad/s" in line
 
 
-@pytest.mark.parametrize(
+@each(
     ("period", "fault_s", "most"),
     [(0.25, 0.5, None), (0.25, 0.49, 0.245), (0.26, 0.5, 0.25), (0.25, 0.0, None),
      (0.26, 0.0, 0.25), (2.0, 10.0, 0.25), (0.0, 0.01, None)],

@@ -10,16 +10,17 @@ from acsard.core.config.contradictions import warnings
 from acsard.core.config.named_faults import NamedFault, forms, named
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config, McuConfig, SimConfig
+from tests.each import each
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "values"),
     [
         ("mute", ()),
         ("stuck_encoder=a", (0,)),
         ("swapped_wheels=b:d", (1, 3)),
         ("bias=c:1.2", (2, 1.2)),
-        ("other_baud=57600", (57600,)),
+        ("wrong_baud=57600", (57600,)),
         ("pushed=0.12", (0.12,)),
         ("stalls=5:0.15", (5, 0.15)),
         ("reset=0.5", (0.5,)),
@@ -45,7 +46,7 @@ REFUSED = [
     ("pushed=nan", "write a number like"),
     ("pushed=-inf", "write a number like"),
     ("pushed=1000001", "up to 1e+06"),
-    ("other_baud=300", "rates are 9600"),
+    ("wrong_baud=300", "rates are 9600"),
     ("stalls=0.1:0.2", "fewer seconds for each"),
     ("stalls=0.2:0.2", "fewer seconds for each"),
     ("stalls=5:0", "both at least 0.001"),
@@ -53,7 +54,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "words"),
     [*REFUSED, ("", "not a known fault"), ("reset=0", "above 0"), ("reset=-1", "above")],
 )
@@ -81,7 +82,7 @@ def test_a_file_may_have_any_of_them() -> None:
     assert config.sim.faults == ("ftdi", "stalls=5:0.15", "stuck_encoder=b")
 
 
-@pytest.mark.parametrize(("text", "words"), REFUSED)
+@each(("text", "words"), REFUSED)
 def test_what_is_no_fault_is_told_with_its_key_and_place(text: str, words: str) -> None:
     (told,) = problems(f'["ftdi", "{text}"]')
     assert told.startswith(f'sim.faults[1] = "{text}": ')
@@ -99,7 +100,7 @@ def test_what_needs_a_timer_is_told_where_it_goes() -> None:
     ]
 
 
-@pytest.mark.parametrize("faults", ['"ftdi"', "[1]", '[""]', r'["mute\n"]', f'["{"x" * 65}"]'])
+@each("faults", ['"ftdi"', "[1]", '[""]', r'["mute\n"]', f'["{"x" * 65}"]'])
 def test_what_is_no_list_of_short_texts_is_told_as_of_any_key(faults: str) -> None:
     (told,) = problems(faults)
     assert told.startswith("sim.faults = ")

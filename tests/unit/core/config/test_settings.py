@@ -126,14 +126,12 @@ def test_a_name_is_letters_digits_underscore_and_minus(name: str) -> None:
     assert build(Source, {"name": name, "priority": 1}, "t", []) is not None
 
 
-@pytest.mark.parametrize(
-    "name", ["", "x" * 33, "a b", "a/b", "*", "**", "$*", "é", "a.b", "#", "?"]
-)
+@each("name", ["", "x" * 33, "a b", "a/b", "*", "**", "$*", "é", "a.b", "#", "?"])
 def test_a_name_that_would_mean_something_in_a_key_is_refused(name: str) -> None:
     assert build(Source, {"name": name, "priority": 1}, "t", []) is None
 
 
-@pytest.mark.parametrize("frame", ["", "/odom", "a b", "x" * 65, "é", "a-b"])
+@each("frame", ["", "/odom", "a b", "x" * 65, "é", "a-b"])
 def test_a_frame_name_that_tf2_would_not_take_is_refused(frame: str) -> None:
     assert build(JointsConfig, {"front_left": frame}, "t", []) is None
 
@@ -142,7 +140,7 @@ def test_a_frame_name_may_have_a_prefix() -> None:
     assert build(JointsConfig, {"front_left": "robot1/front_left"}, "t", []) is not None
 
 
-@pytest.mark.parametrize("baud", [300, 14400, 230400, 0, -9600])
+@each("baud", [300, 14400, 230400, 0, -9600])
 def test_only_the_baud_rates_of_the_board_are_taken(baud: int) -> None:
     assert build(McuConfig, {"baud_rate": baud}, "t", []) is None
 
@@ -151,7 +149,7 @@ def test_a_control_rate_is_taken_as_it_is_written() -> None:
     assert Config(control=ControlConfig(rate=50)).rate_hz == 50.0
 
 
-@pytest.mark.parametrize(
+@each(
     ("baud", "trailing_comma", "rate"),
     [
         (9600, False, 23.0),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from msgspec import Meta, Struct
 
 from acsard.core.config.validation import build, show, write
+from tests.each import each
 
 
 class Leg(Struct, frozen=True):
@@ -78,7 +79,7 @@ def test_a_whole_number_stands_for_a_float() -> None:
     assert made({"speed": 3}).speed == 3.0
 
 
-@pytest.mark.parametrize(
+@each(
     ("table", "line"),
     [
         ({"toes": 6}, "toes = 6: expected a whole number from 3 to 5; the default is toes = 4"),
@@ -137,9 +138,7 @@ def test_a_long_value_is_shown_cut_to_eighty_characters() -> None:
     assert show("x" * 500) == '"' + "x" * 76 + "..."
 
 
-@pytest.mark.parametrize(
-    "value", ["", "plain", 'quote " and \\', "tab\tnl\n", "é ∞", True, False, 0]
-)
+@each("value", ["", "plain", 'quote " and \\', "tab\tnl\n", "é ∞", True, False, 0])
 def test_a_written_value_is_toml_for_the_same_value(value: object) -> None:
     assert tomllib.loads(f"key = {write(value)}") == {"key": value}
 

@@ -13,6 +13,7 @@ from acsard.core.config.wire_time import (
     wire_ns,
     wire_use,
 )
+from tests.each import each
 from tests.vectors.lines import SEED_LINE, WIRE
 
 MS = 1_000_000
@@ -26,14 +27,14 @@ TABLE = [
 bauds = st.sampled_from([9600, 19200, 38400, 57600, 115200])
 
 
-@pytest.mark.parametrize(("baud", "count", "ms", "most"), TABLE)
+@each(("baud", "count", "ms", "most"), TABLE)
 def test_a_line_takes_as_long_as_the_table_says(
     baud: int, count: int, ms: float, most: int
 ) -> None:
     assert wire_ns(count, baud) / MS == pytest.approx(ms, rel=0.005)
 
 
-@pytest.mark.parametrize(("baud", "count", "ms", "most"), TABLE)
+@each(("baud", "count", "ms", "most"), TABLE)
 def test_the_highest_rate_is_the_one_in_the_table(
     baud: int, count: int, ms: float, most: int
 ) -> None:

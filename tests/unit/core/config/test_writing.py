@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import tomllib
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.config.parsing import effective, from_builtins, parse
 from acsard.core.config.settings import Config, McuConfig
 from acsard.core.config.writing import document, excerpt
+from tests.each import each
 from tests.unit.keys import KEYS
 
 CONFIGS = [
@@ -28,7 +28,7 @@ def printed(config: Config) -> str:
     return "\n".join(document(effective(config)))
 
 
-@pytest.mark.parametrize("text", CONFIGS)
+@each("text", CONFIGS)
 def test_what_is_printed_means_the_same_configuration(text: bytes) -> None:
     config = parse(text)
     assert from_builtins(tomllib.loads(printed(config))) == config

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import msgspec
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.incoming.commands import asker
 from acsard.core.messages.signature import DIGITS, MAX_NAME, public_name
+from tests.each import each
 
 
 def signed(name: str) -> bytes:
@@ -21,7 +21,7 @@ def test_a_native_call_has_the_name_it_gives() -> None:
         assert asker("native", signature) == "alice@laptop patrol/b8978a0526b85c8d (native)"
 
 
-@pytest.mark.parametrize(
+@each(
     "attachment",
     [b"", b"joe", b"{}", b'{"sender": 7}', b'{"sender": "\xff"}', b"\x81", signed("")],
 )
@@ -43,7 +43,7 @@ def test_a_bridge_tells_nothing() -> None:
     assert asker("bridge", b"rqh" + bytes(17)) == "unnamed (bridge)"
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "kept"),
     [
         ("mallory (rmw 00)", "mallory ?rmw 00?"),

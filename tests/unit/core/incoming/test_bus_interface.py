@@ -4,50 +4,51 @@ from __future__ import annotations
 
 from collections import Counter
 
-import pytest
-
-from acsard.core.incoming.bus_interface import DOOR_KEY, DoorTold, RoutersTold
+from acsard.core.incoming.bus_interface import GATEWAY_KEY, GatewayTold, RoutersTold
 from acsard.core.incoming.commands import Arrival
 from acsard.core.messages.encodings import encode, encoding_name
-from acsard.core.messages.schema import DoorState
+from acsard.core.messages.schema import GatewayState
 from acsard.core.values import Event, RoutersStatus
+from tests.each import each
 
 
 def arrival(payload: bytes, encoding: str = "") -> Arrival:
-    return Arrival(DOOR_KEY, True, payload, encoding, 0, None, "")
+    return Arrival(GATEWAY_KEY, True, payload, encoding, 0, None, "")
 
 
-class DoorDaemon:
+class GatewayDaemon:
     """The daemon's record of the gateway's reports."""
 
     def __init__(self) -> None:
-        self.told, self.counters = DoorTold(), Counter[str]()
+        self.told, self.counters = GatewayTold(), Counter[str]()
 
-    def hears(self, state: DoorState) -> int | None:
-        heard = arrival(encode(state, "msgpack"), encoding_name("msgpack", "DoorState"))
+    def hears(self, state: GatewayState) -> int | None:
+        heard = arrival(encode(state, "msgpack"), encoding_name("msgpack", "GatewayState"))
         return self.told.hear(heard, self.counters)
 
 
 def test_each_opening_and_each_look_at_a_crowd_counts_once() -> None:
-    daemon = DoorDaemon()
+    daemon = GatewayDaemon()
     for opened, crowded in ((7, 0), (7, 3), (7, 3), (7, 4), (9, 0), (9, 2)):
-        daemon.hears(DoorState(opened, 255, crowded))
-    assert daemon.counters == {"door_opened": 2, "door_crowded": 6}
+        daemon.hears(GatewayState(opened, 255, crowded))
+    assert daemon.counters == {"gateway_opened": 2, "gateway_full": 6}
 
 
 def test_a_crowd_that_was_there_before_the_daemon_counts_whole() -> None:
-    daemon = DoorDaemon()
-    daemon.hears(DoorState(7, 255, 40))
-    assert daemon.counters == {"door_opened": 1, "door_crowded": 40}
+    daemon = GatewayDaemon()
+    daemon.hears(GatewayState(7, 255, 40))
+    assert daemon.counters == {"gateway_opened": 1, "gateway_full": 40}
 
 
 def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
-    daemon = DoorDaemon()
-    assert daemon.hears(DoorState(7, 0, 0, 1_800_000_000_000_000_000)) == 1_800_000_000_000_000_000
-    assert daemon.hears(DoorState(7, 0, 0)) is None
+    daemon = GatewayDaemon()
+    assert (
+        daemon.hears(GatewayState(7, 0, 0, 1_800_000_000_000_000_000)) == 1_800_000_000_000_000_000
+    )
+    assert daemon.hears(GatewayState(7, 0, 0)) is None
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         b"",
@@ -55,14 +56,14 @@ def test_it_tells_when_the_certificate_ends_if_it_knows() -> None:
         b"{}",
         b'{"opened": "now"}',
         b"[]",
-        b'{"opened": -1, "connections": 0, "crowded": 0}',
-        b'{"opened": 1, "connections": 0, "crowded": 1' + b"0" * 30 + b"}",
-        b'{"opened": 1, "connections": 0, "crowded": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
+        b'{"opened": -1, "connections": 0, "full": 0}',
+        b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 30 + b"}",
+        b'{"opened": 1, "connections": 0, "full": 0, "certificate_ends": 1' + b"0" * 400 + b"}",
     ],
 )
 def test_what_cannot_be_read_counts_nothing(payload: bytes) -> None:
     counters = Counter[str]()
-    assert DoorTold().hear(arrival(payload), counters) is None
+    assert GatewayTold().hear(arrival(payload), counters) is None
     assert not counters
 
 
@@ -115,7 +116,7 @@ def test_a_peer_in_a_routers_place_is_told_once_with_what_it_means() -> None:
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     told.hear(RoutersStatus((A,), peers=(A,)), counters, events)
     found = [(event.name, event.level) for event in events]
-    assert found == [("router_found", "info"), ("no_router", "warning")]
+    assert found == [("router_found", "info"), ("not_a_router", "warning")]
     assert events[-1].text.startswith(f"{A} is not a router")
     assert "call stop --id '*'" in events[-1].text
 

@@ -127,7 +127,7 @@ def test_both_parts_of_a_twist_are_required(missing: str) -> None:
     assert refused({"header": {}, "twist": body}) == "wrong_shape"
 
 
-@pytest.mark.parametrize(
+@each(
     "body",
     [
         {},
@@ -151,8 +151,8 @@ def test_any_other_shape_is_refused_whole(body: object) -> None:
     assert refused(body) == "wrong_shape"
 
 
-@pytest.mark.parametrize("bad", NOT_FINITE)
-@pytest.mark.parametrize(("part", "axis"), AXES)
+@each("bad", NOT_FINITE)
+@each(("part", "axis"), AXES)
 def test_one_axis_that_is_not_finite_refuses_the_command_whole(
     part: str, axis: str, bad: float
 ) -> None:
@@ -190,7 +190,7 @@ def test_joint_names_are_the_configured_ones() -> None:
     assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
 
 
-@pytest.mark.parametrize(
+@each(
     "body",
     [
         {},
@@ -212,8 +212,8 @@ def test_all_four_wheels_or_none(body: object) -> None:
     assert refused(body, key="wheel_cmd/app") == "wrong_wheels"
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("place", range(5))
+@each("form", FORMATS)
+@each("place", range(5))
 def test_the_joints_of_an_arm_among_the_wheels_are_not_for_us(form: Format, place: int) -> None:
     names, speeds = list(JOINTS), [1.0, 2.0, 4.0, 8.0]
     names.insert(place, "arm")
@@ -229,8 +229,8 @@ def test_what_an_arm_does_is_no_speed_of_the_wheels() -> None:
     assert (got.twist, got.cancelled) == (Twist(), False)
 
 
-@pytest.mark.parametrize("bad", NOT_FINITE)
-@pytest.mark.parametrize("place", range(4))
+@each("bad", NOT_FINITE)
+@each("place", range(4))
 def test_one_wheel_that_is_not_finite_refuses_all_four(place: int, bad: float) -> None:
     velocity = [1.0] * 4
     velocity[place] = bad
@@ -256,8 +256,8 @@ def test_a_twist_on_a_wheel_key_and_wheels_on_a_twist_key_are_refused() -> None:
 # wheel speeds that cancel each other
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize(
+@each("form", FORMATS)
+@each(
     ("speeds", "cancelled"),
     [
         ((0.0, 0.0, 0.0, 0.0), False),
@@ -276,8 +276,8 @@ def test_wheel_speeds_that_cancel_out_are_no_zero_of_one_who_let_go(
     assert (got.twist == Twist(0.0, 0.0)) is (cancelled or not any(speeds))
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize(("part", "axis"), AXES)
+@each("form", FORMATS)
+@each(("part", "axis"), AXES)
 def test_a_twist_of_axes_that_the_base_cannot_follow_is_no_zero_of_one_who_let_go(
     form: Format, part: str, axis: str
 ) -> None:
@@ -320,8 +320,8 @@ def native_joints(header: bytes, velocity: list[float]) -> bytes:
     return body + cdr(header, f"{len(velocity)}dI", *velocity, 0)[4:]
 
 
-@pytest.mark.parametrize("header", ORDERS)
-@pytest.mark.parametrize("encoding", ["", "zenoh/bytes", "application/cdr"])
+@each("header", ORDERS)
+@each("encoding", ["", "zenoh/bytes", "application/cdr"])
 def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -> None:
     payload = native_twist(header)
     assert len(payload) == 52
@@ -330,8 +330,8 @@ def test_a_native_twist_of_52_bytes_is_a_command(header: bytes, encoding: str) -
     assert got == plain
 
 
-@pytest.mark.parametrize("header", ORDERS)
-@pytest.mark.parametrize(("frame", "size"), [(b"", 68), (b"base_link", 76)])
+@each("header", ORDERS)
+@each(("frame", "size"), [(b"", 68), (b"base_link", 76)])
 def test_a_native_stamped_twist_is_a_command_with_its_stamp(
     header: bytes, frame: bytes, size: int
 ) -> None:
@@ -341,13 +341,13 @@ def test_a_native_stamped_twist_is_a_command_with_its_stamp(
     assert (got.twist, got.stamp_ns, got.clock) == (Twist(0.5, 0.2), 3_000_000_004, HEADER_S)
 
 
-@pytest.mark.parametrize("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
+@each("frame", [b"f" * n for n in (1, 2, 3, 4, 8, 16, 200)])
 def test_a_native_stamped_twist_may_have_any_frame(frame: bytes) -> None:
     assert RECEIVER.command(arrival(native_stamped(ORDERS[1], frame))).twist == Twist(0.5, 0.2)
 
 
-@pytest.mark.parametrize("surplus", range(4))
-@pytest.mark.parametrize("fill", [b"\x00", b"\xff"])
+@each("surplus", range(4))
+@each("fill", [b"\x00", b"\xff"])
 def test_the_padding_of_dds_makes_no_other_command(surplus: int, fill: bytes) -> None:
     more = fill * surplus
     assert RECEIVER.command(arrival(native_twist() + more)).twist == Twist(0.5, 0.2)
@@ -408,8 +408,8 @@ def test_native_wheel_speeds_are_the_twist_they_give(header: bytes) -> None:
     assert got.twist == wheels(joints(4.0, 2.0, 2.0, 4.0)).twist
 
 
-@pytest.mark.parametrize("header", ORDERS)
-@pytest.mark.parametrize("bad", NOT_FINITE)
+@each("header", ORDERS)
+@each("bad", NOT_FINITE)
 def test_a_native_number_that_is_not_finite_is_refused(header: bytes, bad: float) -> None:
     for place in range(6):
         axes = [0.1 * place] * 6
@@ -428,7 +428,7 @@ def test_no_native_twist_has_another_length(size: int) -> None:
     assert refusal(arrival(payload)) == ("malformed" if size < 52 else "wrong_shape")
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "payload"),
     [
         ("cmd/app", native_stamped(ORDERS[1], b"", nanosec=1_000_000_000)),
@@ -438,7 +438,6 @@ def test_no_native_twist_has_another_length(size: int) -> None:
         ("wheel_cmd/app", native_twist()),
         ("wheel_cmd/app", native_joints(ORDERS[1], [1.0] * 4)[:-1]),
     ],
-    ids=["nanosec", "not utf-8", "no end of string", "lengths", "another type", "cut"],
 )
 def test_a_native_payload_that_is_not_the_message_is_malformed(key: str, payload: bytes) -> None:
     assert refusal(arrival(payload, key=key)) == "malformed"
@@ -475,7 +474,7 @@ def test_a_native_command_has_the_same_limit_as_any_other() -> None:
 # the transport of a sample
 
 
-@pytest.mark.parametrize(
+@each(
     "key",
     ["cmd/*", "cmd/**", "**", "*/app", "wheel_cmd/*", "wheel_cmd/**", "cmd/a$*", "*",
      "acsard/*/cmd/app", "cmd/app/anna/more", "cmd/app/*", "acsard/**"],
@@ -535,32 +534,32 @@ def test_the_age_counts_from_the_arrival_whatever_the_stamp_says() -> None:
 # services
 
 
-@pytest.mark.parametrize("verb", ["stop", "deactivate", "reset_odometry"])
-@pytest.mark.parametrize("payload", [b"", b"{}", b"\xff garbage"])
+@each("verb", ["stop", "deactivate", "reset_odometry"])
+@each("payload", [b"", b"{}", b"\xff garbage"])
 def test_a_service_without_arguments_minds_no_payload(verb: Any, payload: bytes) -> None:
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
-@pytest.mark.parametrize("verb", ["clear", "activate"])
-@pytest.mark.parametrize("form", ["json", "msgpack"])
+@each("verb", ["clear", "activate"])
+@each("form", ["json", "msgpack"])
 def test_clear_and_activate_take_the_number_of_a_latch(form: Format, verb: Verb) -> None:
     payload = encode({"latch": 1_800_000_000_123}, form)
     request = Receiver.request(verb, 7, "", payload, 5)
     assert request == Request(verb, 7, asked_ns=5, latch=1_800_000_000_123)
 
 
-@pytest.mark.parametrize("verb", ["clear", "activate"])
-@pytest.mark.parametrize("payload", [b"", b"{}", b'{"latch": null}', b"\x80"])
+@each("verb", ["clear", "activate"])
+@each("payload", [b"", b"{}", b'{"latch": null}', b"\x80"])
 def test_clear_and_activate_may_come_without_a_number(payload: bytes, verb: Verb) -> None:
     assert Receiver.request(verb, 7, "", payload) == Request(verb, 7)
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [b"\xff garbage", b'{"latch": "5"}', b'{"latch": -1}', b'{"latch": 5.5}', b'{"stop": 5}',
      b'{"latch": 9007199254740992}', b'{"latch": true}'],
 )  # fmt: skip
-@pytest.mark.parametrize("verb", ["clear", "activate"])
+@each("verb", ["clear", "activate"])
 def test_clear_and_activate_refuse_any_other_payload(payload: bytes, verb: Verb) -> None:
     with pytest.raises(DecodeError):
         Receiver.request(verb, 7, "", payload)
@@ -574,7 +573,7 @@ def test_set_pose_takes_x_y_and_yaw(form: Format) -> None:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("body", "reason"),
     [
         ({}, "wrong_shape"),
@@ -680,7 +679,7 @@ def test_twenty_thousand_damaged_payloads_raise_nothing_but_decode_errors() -> N
     assert expected | {"not_finite", "too_big"} == set(reasons)
 
 
-@pytest.mark.parametrize("digits", [19, 40, 400, 4000])
+@each("digits", [19, 40, 400, 4000])
 def test_a_stamp_beyond_any_clock_is_refused(digits: int) -> None:
     body = '{"header":{"stamp":{"sec":%s}},"twist":{"linear":{},"angular":{}}}' % ("9" * digits)
     with pytest.raises(DecodeError):

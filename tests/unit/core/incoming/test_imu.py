@@ -16,6 +16,7 @@ from acsard.core.incoming.imu import FOLLOWED_NS, MAX_RATE, OWN, ImuTold, readin
 from acsard.core.messages.encodings import FORMATS, DecodeError, Format, encode, encoding_name
 from acsard.core.messages.schema import Header, Imu, Quaternion, Time, Vector3
 from acsard.core.values import Event, GyroSample
+from tests.each import each
 
 ZEROS = [0.0] * 9
 FULL = Imu(
@@ -44,8 +45,8 @@ def turning(rate: float, at_ns: int = 7, who: str = "imu") -> Arrival:
     return said(at_ns, who, angular_velocity={"z": rate})
 
 
-@pytest.mark.parametrize("named", [True, False])
-@pytest.mark.parametrize("form", FORMATS)
+@each("named", [True, False])
+@each("form", FORMATS)
 def test_an_imu_is_read_in_every_encoding(form: Format, named: bool) -> None:
     encoding = encoding_name(form, "Imu") if named else ""
     got = reading(arrival(encode(FULL, form), encoding))
@@ -71,7 +72,7 @@ def test_no_rate_is_let_in_that_no_base_has(rate: float) -> None:
         return
     with pytest.raises(DecodeError) as refused:
         reading(arrival(encode(imu, "cdr")))
-    assert refused.value.reason == ("absurd" if math.isfinite(rate) else "not_finite")
+    assert refused.value.reason == ("out_of_range" if math.isfinite(rate) else "not_finite")
 
 
 REFUSED: dict[str, Arrival] = {
@@ -83,14 +84,14 @@ REFUSED: dict[str, Arrival] = {
             Imu(Header(), Quaternion(), ZEROS, Vector3(x=math.nan), ZEROS, Vector3(), ZEROS), "cdr"
         )
     ),
-    "absurd": turning(50.1),
+    "out_of_range": turning(50.1),
     "no_rate": said(angular_velocity={"z": 0.1}, angular_velocity_covariance=[-1.0, *ZEROS[1:]]),
     "too_big": arrival(b"{" + b" " * 5000),
     "not_a_put": arrival(encode(FULL, "json"), put=False),
 }
 
 
-@pytest.mark.parametrize("reason", REFUSED)
+@each("reason", REFUSED)
 def test_what_is_refused_is_counted_and_told_by_its_reason(reason: str) -> None:
     counters, events = Counter[str](), list[Event]()
     assert ImuTold().hear(REFUSED[reason], counters, events) is None
@@ -154,5 +155,5 @@ def test_beside_a_gyro_of_its_own_a_robot_follows_no_other_however_long_that_is_
 
 def test_what_is_refused_keeps_nobody_out() -> None:
     daemon = Daemon()
-    daemon.told.hear(REFUSED["absurd"], daemon.counters, daemon.events)
+    daemon.told.hear(REFUSED["out_of_range"], daemon.counters, daemon.events)
     assert daemon.hears(0.1, 8, "other")

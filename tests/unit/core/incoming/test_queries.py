@@ -76,8 +76,8 @@ def answer(asked: Query, outputs: Outputs | None = OUTPUTS) -> Reply:
 # readable keys
 
 
-@pytest.mark.parametrize("topic", [t for t in PUBLISHED if not t.simulated], ids=lambda t: t.key)
-@pytest.mark.parametrize("form", ["msgpack", "json"])
+@each("topic", [t for t in PUBLISHED if not t.simulated])
+@each("form", ["msgpack", "json"])
 def test_a_published_key_answers_with_its_last_value(topic: Any, form: Format) -> None:
     reply = answer(query(topic.key, fmt=form))
     assert reply == Reply(
@@ -94,7 +94,7 @@ def test_a_key_of_the_json_tree_answers_as_the_plain_one(key: str) -> None:
     assert answer(query(f"json/{key}")) == replace(plain, key=f"json/{key}")
 
 
-@pytest.mark.parametrize("topic", [t for t in PUBLISHED if t.key in NATIVE], ids=lambda t: t.key)
+@each("topic", [t for t in PUBLISHED if t.key in NATIVE])
 def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
     reply = answer(query(topic.key, fmt="cdr"))
     assert (reply.ticket, reply.key, reply.ok) == (7, topic.key, True)
@@ -104,7 +104,7 @@ def test_a_ros_message_is_also_answered_as_cdr(topic: Any) -> None:
     assert told == report().current(topic.key, lambda: SNAPSHOT)
 
 
-@pytest.mark.parametrize(
+@each(
     ("topic", "asked", "kind"),
     [
         ("state", "state", "RobotState"),
@@ -126,13 +126,13 @@ def test_what_is_no_ros_message_is_refused_as_cdr_in_words(
     )
 
 
-@pytest.mark.parametrize("topic", PUBLISHED, ids=lambda t: t.key)
-@pytest.mark.parametrize("fmt", ["", "cdr"])
+@each("topic", PUBLISHED)
+@each("fmt", ["", "cdr"])
 def test_a_published_key_without_a_value_yet_has_no_answer(topic: Any, fmt: str) -> None:
     assert queries().serve(query(topic.key, fmt=fmt), nothing, None) == []
 
 
-@pytest.mark.parametrize("asked", ["odom", "**", "*", "acsard/*/odom"])
+@each("asked", ["odom", "**", "*", "acsard/*/odom"])
 def test_a_last_value_may_be_asked_by_wildcard_and_has_its_own_key(asked: str) -> None:
     assert answer(query("odom", asked)).key == "odom"
 
@@ -167,7 +167,7 @@ def test_whoami_says_the_role_that_was_asked_as_and_who_asks(role: str) -> None:
     }
 
 
-@pytest.mark.parametrize("asked", ["whoami/*", "whoami/**", "**", "whoami/admin"])
+@each("asked", ["whoami/*", "whoami/**", "**", "whoami/admin"])
 def test_nobody_is_told_a_role_that_was_not_asked_for_by_its_name(asked: str) -> None:
     assert answers(query("whoami/<role>", asked)) == []
 
@@ -182,7 +182,7 @@ def test_topics_is_the_whole_table_with_full_keys() -> None:
     assert reply.encoding == encoding_name("json", "Topics")
 
 
-@pytest.mark.parametrize("name", SCHEMAS)
+@each("name", SCHEMAS)
 def test_each_type_has_its_schema(name: str) -> None:
     reply = answer(query("schema/<Type>", f"schema/{name}"))
     assert reply.key == f"schema/{name}"
@@ -190,14 +190,14 @@ def test_each_type_has_its_schema(name: str) -> None:
     assert reply.encoding == "application/json"
 
 
-@pytest.mark.parametrize("asked", ["schema/*", "schema/**", "**", "acsard/*/schema/*"])
+@each("asked", ["schema/*", "schema/**", "**", "acsard/*/schema/*"])
 def test_a_wildcard_gives_the_schema_of_every_type(asked: str) -> None:
     assert [reply.key for reply in answers(query("schema/<Type>", asked))] == [
         f"schema/{name}" for name in SCHEMAS
     ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("asked", "found"),
     [
         ("schema/Odo$*", ["Odometry"]),
@@ -220,7 +220,7 @@ def test_a_wildcard_gives_the_schemas_whose_key_it_includes(asked: str, found: l
     ]
 
 
-@pytest.mark.parametrize("name", ["", "Nothing", "odometry", "Odometry/x", "<Type>"])
+@each("name", ["", "Nothing", "odometry", "Odometry/x", "<Type>"])
 def test_there_is_no_schema_of_what_is_no_type(name: str) -> None:
     assert answers(query("schema/<Type>", f"schema/{name}")) == []
 
@@ -244,7 +244,7 @@ def test_the_error_for_an_unknown_format_says_which_there_are(form: Format) -> N
     assert f"fmt={form}" in answer(query("odom", fmt="xml")).payload.decode()
 
 
-@pytest.mark.parametrize("key", ["odom", "info", "config", "topics", "interfaces"])
+@each("key", ["odom", "info", "config", "topics", "interfaces"])
 def test_without_a_format_the_answer_is_json_for_people(key: str) -> None:
     reply = answer(query(key))
     assert reply.ok
@@ -302,7 +302,7 @@ def payload_for(verb: str) -> bytes:
     return {"set_pose": POSE, "set": SETTINGS, "clear": CLEAR}.get(verb, b"")
 
 
-@pytest.mark.parametrize("verb", SERVICES)
+@each("verb", SERVICES)
 def test_a_service_asked_by_its_exact_key_is_a_request_of_the_robot(verb: Any) -> None:
     got = queries().serve(query(f"srv/{verb}", payload=payload_for(verb)), nothing, OUTPUTS)
     pose = Pose(1.0, 2.0, 3.0) if verb == "set_pose" else None
@@ -320,7 +320,7 @@ def test_a_wildcard_never_runs_a_service(verb: str, asked: str) -> None:
     assert made.answered(Answer(7, True, "done"), WALL_NS) is None
 
 
-@pytest.mark.parametrize("asked", ["srv/stop/", "srv", "/srv/stop", "srv/clear", "SRV/STOP", ""])
+@each("asked", ["srv/stop/", "srv", "/srv/stop", "srv/clear", "SRV/STOP", ""])
 def test_a_service_does_not_run_by_a_key_that_is_only_like_its_own(asked: str) -> None:
     assert queries().serve(query("srv/stop", asked), nothing, None) == []
 
@@ -354,7 +354,7 @@ def test_an_answer_nobody_waits_for_goes_nowhere() -> None:
     assert queries().answered(Answer(0, True, "stopped"), WALL_NS) is None
 
 
-@pytest.mark.parametrize(
+@each(
     ("fmt", "payload", "encoding", "form"),
     [
         ("", b"", "", "json"),
@@ -397,7 +397,7 @@ def test_a_service_without_arguments_runs_whatever_the_payload(verb: str) -> Non
     assert isinstance(got, Request)
 
 
-@pytest.mark.parametrize(
+@each(
     ("payload", "words"),
     [
         (b"", "neither a JSON object, a msgpack map nor CDR"),
@@ -440,8 +440,8 @@ def ros_query(topic: str, via: str = "rmw", payload: bytes = EMPTY, **changes: A
     return query(topic, **given)
 
 
-@pytest.mark.parametrize("via", ["bridge", "rmw"])
-@pytest.mark.parametrize("verb", TRIGGERS)
+@each("via", ["bridge", "rmw"])
+@each("verb", TRIGGERS)
 def test_a_trigger_asks_the_robot_and_its_answer_is_cdr(verb: str, via: str) -> None:
     made = queries()
     got = made.serve(ros_query(f"srv/{verb}", via), nothing, OUTPUTS)
@@ -469,14 +469,14 @@ def test_by_a_bridge_a_reply_needs_no_attachment() -> None:
     assert reply.attachment == b""
 
 
-@pytest.mark.parametrize("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
+@each("payload", [b"", EMPTY[:4], EMPTY, EMPTY + bytes(3)])
 def test_a_trigger_takes_a_request_of_any_length(payload: bytes) -> None:
     got = queries().serve(ros_query("srv/stop", "bridge", payload), nothing, OUTPUTS)
     assert isinstance(got, Request)
 
 
-@pytest.mark.parametrize("topic", ["srv/clear", "parameters/list_parameters"])
-@pytest.mark.parametrize("attachment", [b"", bytes(20)])
+@each("topic", ["srv/clear", "parameters/list_parameters"])
+@each("attachment", [b"", bytes(20)])
 def test_over_rmw_a_request_without_its_attachment_is_not_answered(
     topic: str, attachment: bytes
 ) -> None:
@@ -499,8 +499,8 @@ def test_the_parameter_services_tell_the_configuration(via: str) -> None:
         assert reply.attachment == b""
 
 
-@pytest.mark.parametrize("via", ["bridge", "rmw"])
-@pytest.mark.parametrize("service", PARAMETER_SERVICES)
+@each("via", ["bridge", "rmw"])
+@each("service", PARAMETER_SERVICES)
 def test_a_parameter_request_that_cannot_be_read_is_answered_by_a_refusal(
     service: str, via: str
 ) -> None:
@@ -578,8 +578,8 @@ def test_over_rmw_nobody_is_found_without_the_attachment_of_the_request() -> Non
     assert refused(ros_query("srv/clear", attachment=b""), BUSY, WALL_NS) is None
 
 
-@pytest.mark.parametrize("via", ["bridge", "rmw"])
-@pytest.mark.parametrize(
+@each("via", ["bridge", "rmw"])
+@each(
     ("namespace", "clear", "activate"),
     [
         ("", "/acsard/clear", "/acsard/activate"),
@@ -606,8 +606,8 @@ def test_to_others_the_services_are_called_by_their_keys() -> None:
     assert msgspec.json.decode(reply.payload)["message"] == "call srv/clear first"
 
 
-@pytest.mark.parametrize("via", ["bridge", "rmw"])
-@pytest.mark.parametrize("service", rcl.SETTING)
+@each("via", ["bridge", "rmw"])
+@each("service", rcl.SETTING)
 def test_a_request_to_set_parameters_asks_the_robot_and_hears_its_answer(
     service: str, via: str
 ) -> None:

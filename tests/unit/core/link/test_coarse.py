@@ -47,7 +47,7 @@ def drive(counts: int, seed: int, seconds: float) -> Driven:
     host = Host()
     for line in lines(wheels, counts):
         host.hear(line)
-    assert host.session.snapping.counts == (counts,) * 4
+    assert host.session.count_recovery.counts == (counts,) * 4
     pose, true = host.odometry.pose, end(np.diff(wheels, axis=0))
     exact = counted(wheels, counts) * math.tau / counts
     plain = np.round(exact / PERIOD, 2) * PERIOD
@@ -121,7 +121,7 @@ def test_no_line_is_dropped_of_a_firmware_that_filters(counts: int, share: float
         rows.append(speed)
     host = heard(np.round(np.array(rows), 2))
     assert (host.dropped, host.why) == (0, "")
-    assert host.session.snapping.counts == (0,) * 4
+    assert host.session.count_recovery.counts == (0,) * 4
 
 
 def wild(wheels: int, seed: int) -> Host:

@@ -176,7 +176,7 @@ def test_each_wheel_must_be_there_exactly_once(codec: Codec, letters: str) -> No
     line = ",".join(f"{letter}p01.00" for letter in letters).encode()
     with pytest.raises(FrameError) as caught:
         codec.decode(line)
-    assert caught.value.reason == "wheel_twice"
+    assert caught.value.reason == "duplicate_wheel"
 
 
 # the wiring
@@ -323,7 +323,7 @@ def wire(rng: random.Random, count: int) -> Iterator[bytes]:
 )
 def test_a_damaged_line_is_rejected_whole_or_is_itself_a_well_formed_line(count: int) -> None:
     rng, reader, codec = random.Random(20_240_229), LineReader(), Codec(WheelMap())
-    seen = {"read": 0, "malformed": 0, "wheel_twice": 0, "over_range": 0}
+    seen = {"read": 0, "malformed": 0, "duplicate_wheel": 0, "over_range": 0}
     for piece in wire(rng, count):
         for line, _ in reader.feed(piece):
             expected = independent(line)

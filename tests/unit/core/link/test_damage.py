@@ -17,7 +17,7 @@ from acsard.core.config.settings import FeedbackConfig, WheelMap
 from acsard.core.link.codec import Codec, FrameError, Motors
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.lines import LineReader
-from acsard.core.link.quantization import Snapping
+from acsard.core.link.quantization import CountRecovery
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import STILL, Instant, WheelSpeeds
 
@@ -126,7 +126,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
     The quantization steps are learned from all lines. Return the number of wrong readings, of those
     accepted, and of those that would be accepted without the learned steps.
     """
-    rng, codec, snapping = random.Random(5), Codec(WheelMap()), Snapping()
+    rng, codec, recovery = random.Random(5), Codec(WheelMap()), CountRecovery()
     sanity, wrong, believed, before = Sanity(FeedbackConfig()), 0, [0, 0], STILL
     for i, line in enumerate(lines):
         truth, speeds = codec.decode(line[:-2]), None
@@ -135,7 +135,7 @@ def live(lines: list[bytes], every: int) -> tuple[int, int, int]:
             speeds = codec.decode(sent[:-2])
         except FrameError:
             continue
-        steps = snapping.look(Feedback(AT, speeds, 0.01)).steps
+        steps = recovery.look(Feedback(AT, speeds, 0.01)).steps
         if speeds != truth and i > len(lines) // 10:
             wrong += 1
             believed[0] += plausible(sanity, before, speeds, steps)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import WheelMap
 from acsard.core.link.codec import Codec
-from acsard.core.link.echo import LINES, REPORTS, EchoDetector
+from acsard.core.link.negotiation import LINES, REPORTS, EchoDetector
 from acsard.core.values import WheelSpeeds
 
 CODEC = Codec(WheelMap())

@@ -11,7 +11,7 @@ import pytest
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.link.check import Reading
 from acsard.core.link.codec import Codec
-from acsard.core.link.feedback import Feedback, Timeline
+from acsard.core.link.feedback import Feedback, ReplyStyle, Timeline
 from acsard.core.values import Instant, WheelSpeeds
 
 MS = 1_000_000
@@ -331,5 +331,66 @@ def test_answers_that_become_the_clock_go_on_where_the_slots_were(seed: int) -> 
         bench.timeline.read(at, LENGTH, 1, 0)
         dt = bench.timeline.place(SPEEDS, None, 0, LENGTH, False).dt
         total += dt if number >= 150 else 0.0
-    assert bench.timeline._told.clock == "prompts"
+    assert bench.timeline._last_placed.clock == "prompts"
     assert total == pytest.approx(0.8, abs=0.0003)
+
+
+def stall(style: ReplyStyle, lines: int, periods: float, left: int) -> None:
+    for _ in range(left):
+        style.left()
+    style.read(lines, periods)
+
+
+def test_while_we_send_every_period_nobody_can_tell() -> None:
+    style = ReplyStyle(speaks=False)
+    for _ in range(1000):
+        stall(style, 1, 1.0, 1)
+    assert style.speaks is None
+
+
+@pytest.mark.parametrize(("lines", "speaks"), [(15, True), (12, True), (1, False), (2, False)])
+def test_a_stall_of_ours_tells_by_the_lines_that_came_in_it(lines: int, speaks: bool) -> None:
+    style = ReplyStyle(speaks=False)
+    stall(style, lines, 15.2, 1)
+    assert style.speaks is speaks
+
+
+def test_short_stalls_tell_together() -> None:
+    style = ReplyStyle(speaks=False)
+    stall(style, 3, 3.0, 1)
+    assert style.speaks is None
+    stall(style, 3, 3.0, 1)
+    assert style.speaks is True
+
+
+def test_lines_that_an_adapter_still_holds_belong_to_the_stall_they_were_made_in() -> None:
+    style = ReplyStyle(speaks=False)
+    stall(style, 13, 15.2, 11)
+    assert style.speaks is None, "neither is clearly nearer"
+    stall(style, 2, 0.3, 0)
+    assert style.speaks is True
+
+
+def test_a_silence_that_fits_neither_tells_nothing() -> None:
+    style = ReplyStyle(speaks=False)
+    stall(style, 1, 40.0, 13)
+    assert style.speaks is None
+
+
+def test_later_evidence_counts() -> None:
+    style = ReplyStyle(speaks=False)
+    stall(style, 15, 15.0, 1)
+    stall(style, 1, 15.0, 1)
+    assert style.speaks is False
+
+
+def test_what_is_configured_is_not_doubted() -> None:
+    style = ReplyStyle(speaks=True)
+    stall(style, 1, 15.0, 1)
+    assert style.speaks is True
+
+
+def test_nothing_is_expected_after_a_long_silence() -> None:
+    style = ReplyStyle(speaks=False)
+    stall(style, 1, 200.0, 1)
+    assert style.speaks is None

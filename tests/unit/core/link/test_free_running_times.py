@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acsard.core.link.free_running_times import Slots
+from acsard.core.link.sample_time import FreeRunningTimes
 
 MS = 1_000_000
 PERIOD = 0.01
@@ -26,7 +26,7 @@ class Bench:
     """
 
     def __init__(self, period: float = PERIOD, known: tuple[float, ...] = (PERIOD,)) -> None:
-        self.slots = Slots(known)
+        self.slots = FreeRunningTimes(known)
         self.period_ns = period * 1e9
         self.made = 0
         self.counted = 0.0
@@ -121,7 +121,7 @@ def test_a_lossless_link_counts_each_line_once_whatever_stalls(
 @given(seed=st.integers(0, 1000), held=st.integers(3, 100))
 def test_a_batched_link_without_loss_counts_each_line_once(seed: int, held: int) -> None:
     chance = random.Random(seed)
-    slots, waiting, made, counted, stall = Slots((PERIOD,)), 0, 0, 0, 0
+    slots, waiting, made, counted, stall = FreeRunningTimes((PERIOD,)), 0, 0, 0, 0
     batch_ns = 16 * MS
     for read in range(1, 2000):
         due = read * batch_ns + int(chance.expovariate(1.0) * 0.3 * MS)
@@ -168,7 +168,7 @@ def packets(size: int, lines: int, phase: float) -> list[tuple[int, int]]:
 def test_lines_that_fill_an_adapter_s_packets_have_the_period_they_are_made_at(
     size: int, phase: float
 ) -> None:
-    slots, counted = Slots((PERIOD,)), 0
+    slots, counted = FreeRunningTimes((PERIOD,)), 0
     for at, lines in packets(size, 1000, phase):
         had = slots.period is not None
         counted += had * slots.read(at, lines, True)
@@ -189,7 +189,7 @@ each other only after it.
 
 
 def test_a_first_line_out_of_turn_makes_no_other_period_of_batches() -> None:
-    slots, slot, before = Slots((PERIOD,)), 0, 0.0
+    slots, slot, before = FreeRunningTimes((PERIOD,)), 0, 0.0
     for late in [*OUT_OF_TURN, *OUT_OF_TURN[5:]]:
         lines = round(1.6 - late + before)  # the lines of 16 ms
         slot, before = slot + lines, late
@@ -268,7 +268,7 @@ def test_another_period_is_found_out_and_found(period: float) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_lines_without_a_period_have_no_clock(seed: int) -> None:
     chance = random.Random(seed)
-    slots, at, known = Slots((PERIOD,)), 10**12, 0
+    slots, at, known = FreeRunningTimes((PERIOD,)), 10**12, 0
     for _ in range(3000):
         at += int(chance.uniform(4.0, 30.0) * MS)
         slots.read(at, 1, True)
@@ -284,7 +284,9 @@ def test_a_line_is_as_old_as_its_slot_not_as_its_read() -> None:
         late_ms = chance.uniform(0.0, 1.0) + chance.expovariate(1 / 0.3)
         bench.line(late_ms)
         if number > 500:
-            errors.append((bench.slots.time_ns(0) - bench.time_ns()) / MS)
+            placed = bench.slots.place(0)
+            assert placed is not None
+            errors.append((placed.due_ns - bench.time_ns()) / MS)
             raw.append(late_ms)
     assert deviation(errors) < deviation(raw) / 6
 

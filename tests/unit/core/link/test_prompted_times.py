@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.core.link.prompted_times import Prompts
+from acsard.core.link.sample_time import PromptedTimes
 
 MS = 1_000_000
 DELAY_MS = 9.0
@@ -19,7 +19,7 @@ class Bench:
     """A sequence of sent lines and received replies."""
 
     def __init__(self) -> None:
-        self.prompts = Prompts(soonest_ns=6 * MS)
+        self.prompts = PromptedTimes(soonest_ns=6 * MS)
 
     def leave(self, ms: float) -> None:
         self.prompts.left(int(ms * MS))
@@ -30,7 +30,7 @@ class Bench:
         said = []
         for _ in range(lines):
             asked = None if asked_ms is None else int(asked_ms * MS)
-            answered = self.prompts.answer(asked)
+            answered = self.prompts.place(asked)
             assert answered is not None
             said += [round((answered.dt or 0.0) * 1000, 3), round(answered.bridged * 1000, 3)]
         return said
@@ -44,9 +44,9 @@ class Bench:
 
 
 def test_a_reply_that_no_line_waits_for_has_no_line() -> None:
-    prompts = Prompts(0)
+    prompts = PromptedTimes(0)
     prompts.read(10 * MS, 1)
-    assert prompts.answer() is None
+    assert prompts.place() is None
 
 
 def test_replies_are_as_far_apart_as_their_lines() -> None:
@@ -200,7 +200,7 @@ def batched(
         if ready:
             bench.prompts.read(int(at * MS), len(ready))
         for number in ready:
-            answered = bench.prompts.answer()
+            answered = bench.prompts.place()
             if number > 100 and answered is not None:
                 told += 1000 * (answered.dt or 0.0)
                 if offs is not None:

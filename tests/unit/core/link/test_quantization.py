@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from acsard.core.link.feedback import Feedback
-from acsard.core.link.quantization import LONG, LOOK, Snapping
+from acsard.core.link.quantization import LONG, LOOK, CountRecovery
 from acsard.core.values import Instant, WheelSpeeds
 from tests.unit.core.link.counted import PERIOD, Array, angles, counted
 
@@ -41,11 +41,11 @@ def whole(counts: int | list[int], wheels: Array | None = None) -> Array:
 
 
 def look(
-    snapping: Snapping, rows: Array, dt: float = PERIOD, bridged: float = 0.0
+    recovery: CountRecovery, rows: Array, dt: float = PERIOD, bridged: float = 0.0
 ) -> list[Feedback]:
     """Feed each row as a line, `dt` seconds after the one before."""
     lines = (Feedback(AT, WheelSpeeds(*row), dt, bridged=bridged) for row in rows.tolist())
-    return [snapping.look(line) for line in lines]
+    return [recovery.look(line) for line in lines]
 
 
 def total(lines: list[Feedback]) -> Array:
@@ -59,19 +59,19 @@ def folded(line: Feedback) -> Four:
     return a, b, c, d
 
 
-def known(counts: int = 400) -> Snapping:
-    snapping = Snapping()
-    look(snapping, speeds(counts))
-    assert snapping.counts == (counts,) * 4
-    return snapping
+def known(counts: int = 400) -> CountRecovery:
+    recovery = CountRecovery()
+    look(recovery, speeds(counts))
+    assert recovery.counts == (counts,) * 4
+    return recovery
 
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("counts", [16, 20, 40, 96, 400, 1000, 4000])
 def test_the_counts_are_found_within_seconds_and_no_rounding_is_left(counts: int) -> None:
-    snapping = Snapping()
-    lines = look(snapping, speeds(counts))
-    assert snapping.counts == (counts,) * 4
+    recovery = CountRecovery()
+    lines = look(recovery, speeds(counts))
+    assert recovery.counts == (counts,) * 4
     first = next(i for i, line in enumerate(lines) if line.counted)
     assert first < 15 / PERIOD
     assert total(lines) == pytest.approx(
@@ -80,29 +80,29 @@ def test_the_counts_are_found_within_seconds_and_no_rounding_is_left(counts: int
 
 
 def test_the_hosts_jitter_bends_nothing_once_they_are_known() -> None:
-    snapping, dice = known(), np.random.default_rng(1)
+    recovery, dice = known(), np.random.default_rng(1)
     late = dice.uniform(0, 0.006, 3001)
     rows, lines = speeds(400), []
     for i, row in enumerate(rows):
-        lines += look(snapping, row[None], PERIOD + late[i + 1] - late[i])
+        lines += look(recovery, row[None], PERIOD + late[i + 1] - late[i])
     turned = np.sum(whole(400), axis=0) * math.tau / 400
     assert total(lines) == pytest.approx(turned, abs=1e-9)
 
 
 def test_four_wheels_may_have_four_encoders_one_of_them_filtered() -> None:
-    each, snapping = [20, 400, 96, 1000], Snapping()
+    each, recovery = [20, 400, 96, 1000], CountRecovery()
     rows = speeds(each)
     rows[:, 3] = np.round(np.convolve(rows[:, 3], 0.5 ** np.arange(1, 12))[:3000], 2)
-    lines = look(snapping, rows)
-    assert snapping.counts == (20, 400, 96, 0)
+    lines = look(recovery, rows)
+    assert recovery.counts == (20, 400, 96, 0)
     turned = np.sum(whole(each), axis=0) * math.tau / np.array(each)
     assert total(lines)[:3] == pytest.approx(turned[:3], abs=1e-9)
     assert total(lines)[3] == pytest.approx(rows[:, 3].sum() * PERIOD, abs=1e-9)
 
 
 def test_wheels_that_turn_backwards_count_backwards() -> None:
-    snapping = known(96)
-    lines = look(snapping, -speeds(96))
+    recovery = known(96)
+    lines = look(recovery, -speeds(96))
     assert total(lines) == pytest.approx(-np.sum(whole(96), axis=0) * math.tau / 96, abs=1e-9)
 
 
@@ -123,106 +123,106 @@ def test_no_firmware_that_filters_is_taken_for_one_that_counts(streams: int) -> 
     dice, taken = np.random.default_rng(1), 0
     for seed in range(streams):
         counts = int(dice.choice([16, 20, 40, 96, 400, 1000, 4000]))
-        snapping = Snapping()
-        look(snapping, filtered(counts, dice.uniform(0.05, 0.9), seed))
-        taken += any(snapping.counts)
+        recovery = CountRecovery()
+        look(recovery, filtered(counts, dice.uniform(0.05, 0.9), seed))
+        taken += any(recovery.counts)
     print(f"\n{taken} of {streams} filtered streams taken for counts")
     assert taken == 0
 
 
 def test_a_firmware_that_divides_by_the_time_it_measured_shows_no_counts() -> None:
-    snapping, dice = Snapping(), np.random.default_rng(2)
+    recovery, dice = CountRecovery(), np.random.default_rng(2)
     measured = PERIOD + dice.uniform(-0.0008, 0.0008, (3000, 1))
-    look(snapping, np.round(whole(400) * math.tau / 400 / measured, 2))
-    assert snapping.counts == (0,) * 4
+    look(recovery, np.round(whole(400) * math.tau / 400 / measured, 2))
+    assert recovery.counts == (0,) * 4
 
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("share", [0.995, 1.0002, 1.005])
 def test_an_oscillator_that_is_off_makes_no_other_angle(share: float) -> None:
-    snapping, rows = Snapping(), speeds(400)
-    look(snapping, rows, PERIOD * share)
-    assert snapping.counts == (400,) * 4
+    recovery, rows = CountRecovery(), speeds(400)
+    look(recovery, rows, PERIOD * share)
+    assert recovery.counts == (400,) * 4
     turned = np.sum(whole(400), axis=0) * math.tau / 400
-    assert total(look(snapping, rows, PERIOD * share)) == pytest.approx(turned, abs=1e-9)
+    assert total(look(recovery, rows, PERIOD * share)) == pytest.approx(turned, abs=1e-9)
 
 
 @pytest.mark.variations(3)
 @pytest.mark.parametrize("period", [0.005, 0.02, 0.1, 1 / 60])
 def test_any_round_period_will_do(period: float) -> None:
     wheels = drive()[:: max(1, round(period / PERIOD))]
-    snapping = Snapping()
-    look(snapping, speeds(96, wheels, period), period)
-    assert snapping.counts == (96,) * 4
+    recovery = CountRecovery()
+    look(recovery, speeds(96, wheels, period), period)
+    assert recovery.counts == (96,) * 4
 
 
 def test_a_period_that_makes_no_whole_counts_is_refused() -> None:
-    snapping = Snapping()
-    lines = look(snapping, speeds(400, period=PERIOD * 0.9965))
-    assert snapping.counts == (0,) * 4
+    recovery = CountRecovery()
+    lines = look(recovery, speeds(400, period=PERIOD * 0.9965))
+    assert recovery.counts == (0,) * 4
     assert all(line.counted is None for line in lines)
 
 
 def test_a_line_that_is_missing_is_made_up_for_by_its_neighbour() -> None:
-    snapping, rows = known(), speeds(400)
+    recovery, rows = known(), speeds(400)
     keep = np.arange(len(rows)) % 100 != 50
     lines = []
     for i in np.flatnonzero(keep):
-        lines += look(snapping, rows[i : i + 1], PERIOD if i == 0 or keep[i - 1] else 2 * PERIOD)
+        lines += look(recovery, rows[i : i + 1], PERIOD if i == 0 or keep[i - 1] else 2 * PERIOD)
     turned = np.sum(whole(400), axis=0) * math.tau / 400
-    assert snapping.counts == (400,) * 4
+    assert recovery.counts == (400,) * 4
     assert total(lines) == pytest.approx(turned, rel=0.002)
 
 
 def test_a_line_that_was_bridged_is_not_made_up_for_again() -> None:
-    snapping, rows = known(), speeds(400)
-    lines = look(snapping, rows, 2 * PERIOD, bridged=PERIOD)
+    recovery, rows = known(), speeds(400)
+    lines = look(recovery, rows, 2 * PERIOD, bridged=PERIOD)
     assert total(lines) == pytest.approx(np.sum(whole(400), axis=0) * math.tau / 400, abs=1e-9)
 
 
 @pytest.mark.parametrize("period", [0.005, 0.02])
 def test_another_period_is_found_out_and_learned(period: float) -> None:
-    snapping, wheels = known(), drive(60.0, 2)[:: max(1, round(period / PERIOD))]
-    lines = look(snapping, speeds(400, wheels, period), period)
-    assert snapping.counts == (400,) * 4
+    recovery, wheels = known(), drive(60.0, 2)[:: max(1, round(period / PERIOD))]
+    lines = look(recovery, speeds(400, wheels, period), period)
+    assert recovery.counts == (400,) * 4
     turned = np.sum(whole(400, wheels), axis=0) * math.tau / 400
     assert total(lines) == pytest.approx(turned, abs=2.0)  # the motion of an eighth of a second
 
 
 def test_another_encoder_is_found_out_and_learned() -> None:
-    snapping = known(400)
-    look(snapping, speeds(96))
-    assert snapping.counts == (96,) * 4
+    recovery = known(400)
+    look(recovery, speeds(96))
+    assert recovery.counts == (96,) * 4
 
 
 def test_damage_now_and_then_ends_nothing() -> None:
-    snapping, rows = known(), speeds(400)
+    recovery, rows = known(), speeds(400)
     rows[50::100] = 12.34
-    look(snapping, rows)
-    assert snapping.counts == (400,) * 4
+    look(recovery, rows)
+    assert recovery.counts == (400,) * 4
 
 
 def test_after_forgetting_nothing_is_known() -> None:
-    snapping = known()
-    snapping.forget()
-    assert snapping.counts == (0,) * 4
-    (line,) = look(snapping, speeds(400)[500:501])
+    recovery = known()
+    recovery.forget()
+    assert recovery.counts == (0,) * 4
+    (line,) = look(recovery, speeds(400)[500:501])
     assert line.counted is None
     assert line.steps == (math.inf,) * 4
 
 
 def test_where_the_line_has_counts_of_its_own_nothing_is_made_of_its_speeds() -> None:
-    snapping = Snapping()
+    recovery = CountRecovery()
     for row in speeds(20).tolist():
         line = Feedback(AT, WheelSpeeds(*row), PERIOD, turned=(0.0,) * 4)
-        seen = snapping.look(line)
+        seen = recovery.look(line)
         assert seen.counted is None
     assert max(seen.steps) == pytest.approx(math.tau / 20 / PERIOD, abs=0.01)
 
 
 def test_after_a_gap_a_line_says_nothing_of_how_far_it_went() -> None:
-    snapping = known()
-    line = snapping.look(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
+    recovery = known()
+    line = recovery.look(Feedback(AT, WheelSpeeds(*[15.71] * 4), 0.0, gap=0.5))
     assert line.counted is None
 
 
@@ -236,11 +236,11 @@ class Work:
         self.lines += event == "line"
         return self.trace
 
-    def of(self, snapping: Snapping, row: list[float]) -> int:
+    def of(self, recovery: CountRecovery, row: list[float]) -> int:
         line, before, was = Feedback(AT, WheelSpeeds(*row), PERIOD), self.lines, sys.gettrace()
         sys.settrace(self.trace)
         try:
-            snapping.look(line)
+            recovery.look(line)
         finally:
             sys.settrace(was)
         return self.lines - before
@@ -248,8 +248,8 @@ class Work:
 
 @pytest.mark.parametrize("counts", [20, 4000, 20_000])
 def test_no_single_line_has_to_wait_for_the_search(counts: int) -> None:
-    snapping, work = Snapping(), Work()
-    each = [work.of(snapping, row) for row in speeds(counts)[:1500].tolist()]
+    recovery, work = CountRecovery(), Work()
+    each = [work.of(recovery, row) for row in speeds(counts)[:1500].tolist()]
     print(f"\n{counts}: {np.median(each):.0f} lines of Python a report, {max(each)} at most")
     assert np.median(each) < 250
     assert max(each) < 3000
@@ -260,16 +260,16 @@ def test_counts_are_found_whenever_the_wheels_begin_to_turn() -> None:
     whole_block = LOOK * LONG
     toggling = np.array([[0.0] * 4, [31.42] * 4] * 150)
     for standing in range(whole_block - 120, whole_block - 95):
-        snapping = Snapping()
-        look(snapping, np.zeros((standing, 4)))
-        look(snapping, toggling)
-        assert snapping.counts == (20,) * 4
+        recovery = CountRecovery()
+        look(recovery, np.zeros((standing, 4)))
+        look(recovery, toggling)
+        assert recovery.counts == (20,) * 4
 
 
 def test_a_wheel_that_jumps_at_random_is_no_coarse_encoder_beside_three_fine_ones() -> None:
-    dice, snapping = random.Random(1), Snapping()
+    dice, recovery = random.Random(1), CountRecovery()
     for _ in range(1000):
         fine = [round(5.0 + dice.uniform(-0.1, 0.1), 2) for _ in range(3)]
         speeds = WheelSpeeds(round(dice.uniform(-70.0, 70.0), 2), *fine)
-        line = snapping.look(Feedback(Instant(0, 0), speeds, 0.01))
+        line = recovery.look(Feedback(Instant(0, 0), speeds, 0.01))
     assert max(line.steps) < 1.0

@@ -446,7 +446,7 @@ def test_good_lines_are_counted_and_bad_ones_by_reason() -> None:
         "malformed": 2,
         "too_long": 2,
         "over_range": 1,
-        "wheel_twice": 3,
+        "duplicate_wheel": 3,
     }
 
 
@@ -525,9 +525,9 @@ def test_an_mcu_without_the_check_is_driven_plainly() -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        (GOOD, "unchecked"),
+        (GOOD, "without_crc"),
         (seal(GOOD, 200), "stale_sequence"),
-        (seal(GOOD, 1).replace(b"12.50", b"12.51"), "wrong_check"),
+        (seal(GOOD, 1).replace(b"12.50", b"12.51"), "crc_error"),
         (seal(b"ap12.50\r\n", 1), "malformed"),
         (b"x" * 200 + b"\n", "too_long"),
     ],
@@ -691,7 +691,7 @@ def counts_after(bench: Bench, counts: int) -> tuple[int, ...]:
     for i in range(400):
         line = ",".join(f"{motor}p{speed * (i % 2):05.2f}" for motor in "abcd")
         bench.wait(10, line.encode() + b"\r\n")
-    return bench.session.snapping.counts
+    return bench.session.count_recovery.counts
 
 
 def test_the_counts_of_an_encoder_are_found_in_its_lines() -> None:
@@ -704,7 +704,7 @@ def test_behind_a_port_opened_again_the_encoders_are_unknown(counts: int) -> Non
     counts_after(bench, 20)
     bench.close().wait(10)
     bench.open().wait(10)
-    assert bench.session.snapping.counts == (0,) * 4
+    assert bench.session.count_recovery.counts == (0,) * 4
     assert counts_after(bench, counts) == (counts,) * 4
 
 
@@ -712,7 +712,7 @@ def test_an_mcu_that_has_started_again_may_be_another() -> None:
     bench = Bench().up()
     counts_after(bench, 20)
     bench.wait(10, BOOTED)
-    assert bench.session.snapping.counts == (0,) * 4
+    assert bench.session.count_recovery.counts == (0,) * 4
 
 
 @pytest.mark.parametrize("reads", [1, 4])

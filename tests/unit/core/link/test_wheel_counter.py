@@ -1,4 +1,4 @@
-"""Each wheel's counts are learned from its speeds, and are then used."""
+"""Each wheel's counts, and the step of its speed, are learned from its speeds and then used."""
 
 from __future__ import annotations
 
@@ -7,9 +7,17 @@ import random
 
 import pytest
 
-from acsard.core.link import wheel_counter
+from acsard.core.link import quantization
+from acsard.core.link.quantization import (
+    BLOCK,
+    FIRST,
+    LEARNED_FROM,
+    MOST_TOLD,
+    OWED_FOR,
+    Steps,
+    WheelCounter,
+)
 from acsard.core.link.quantization_step import STEEP, Search
-from acsard.core.link.wheel_counter import LEARNED_FROM, MOST_TOLD, OWED_FOR, WheelCounter
 
 PERIOD = 0.01
 
@@ -134,7 +142,7 @@ def test_a_stream_without_a_lattice_is_looked_at_less_and_less_often(
             searched.append(number)
             return super().go_on()
 
-    monkeypatch.setattr(wheel_counter, "Search", Watched)
+    monkeypatch.setattr(quantization, "Search", Watched)
     wheel, dice = WheelCounter(), random.Random(1)
     for number in range(30_000):  # noqa: B007
         wheel.learn(round(dice.uniform(0.1, 30.0), 2))
@@ -150,3 +158,61 @@ def test_its_quantum_is_its_count_once_that_is_known() -> None:
     wheel.show(PERIOD)
     assert wheel.quantum == pytest.approx(math.tau / 20 / PERIOD)
     assert wheel.quantum > STEEP
+
+
+def steps_after(speeds: list[float], steps: Steps | None = None) -> Steps:
+    steps = steps or Steps()
+    for speed in speeds:
+        steps.add(speed)
+    return steps
+
+
+def fine_speeds(count: int = 2 * BLOCK) -> list[float]:
+    dice = random.Random(1)
+    return [round(10 + dice.uniform(-0.2, 0.2) + 0.02 * i, 2) for i in range(count)]
+
+
+def test_nothing_is_known_until_enough_steps_were_seen() -> None:
+    speeds = [0.1 * (i % 2) for i in range(FIRST)]
+    steps = steps_after(speeds)
+    assert steps.size == math.inf
+    steps.add(0.2)
+    assert steps.size < 0.3
+
+
+def test_rest_and_flicker_teach_nothing() -> None:
+    steps = steps_after([0.0] * 1000 + [0.01 * (i % 2) for i in range(1000)])
+    assert steps.size == math.inf
+
+
+@pytest.mark.parametrize("counts", [16, 20, 96])
+def test_counts_step_by_a_count(counts: int) -> None:
+    quantum, dice = math.tau / counts / 0.01, random.Random(2)
+    steps = steps_after([quantum * dice.randint(0, 1) for _ in range(6 * BLOCK)])
+    assert steps.size == pytest.approx(quantum)
+
+
+def test_a_fine_encoder_hardly_steps() -> None:
+    assert steps_after(fine_speeds()).size < 0.5
+
+
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_a_filter_behind_coarse_counts_leaves_of_a_step_its_share(share: float) -> None:
+    speed, speeds, quantum = 0.0, [], 31.4
+    for i in range(400):
+        speed += share * ((0.0 if i % 9 else quantum) - speed)
+        speeds.append(round(speed, 2))
+    assert steps_after([0.0, *speeds]).size > 0.4 * share * quantum
+
+
+def test_one_damaged_line_is_no_step_of_an_encoder() -> None:
+    steps = steps_after(fine_speeds(2 * BLOCK + 8))
+    steps_after([40.0, 12.0], steps)
+    assert steps.size < 0.5
+
+
+def test_what_does_not_recur_is_forgotten() -> None:
+    steps = steps_after([0.0, 30.0] * BLOCK)
+    assert steps.size == 30.0
+    steps_after(fine_speeds(3 * BLOCK), steps)
+    assert steps.size < 0.5

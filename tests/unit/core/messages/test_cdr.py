@@ -141,7 +141,7 @@ def odometry(frame: str, child: str) -> Odometry:
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("message", "golden"),
     [
         (Twist(Vector3(0.5), Vector3(z=0.25)), HALF + "00" * 32 + QUARTER),
@@ -170,14 +170,13 @@ def odometry(frame: str, child: str) -> Odometry:
             "01000000 02000000 6b00 0000 02000000 7600",
         ),
     ],
-    ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_a_message_is_exactly_these_bytes(message: Struct, golden: str) -> None:
     assert encoded(message) == LITTLE + bytes.fromhex(golden)
     assert Cdr(type(message)).decode(LITTLE + bytes.fromhex(golden)) == message
 
 
-@pytest.mark.parametrize(
+@each(
     ("message", "size"),
     [
         (Twist(Vector3(), Vector3()), 52),
@@ -281,13 +280,13 @@ def test_a_request_without_fields_is_read_whatever_it_has_for_a_body(size: int) 
     assert Cdr(Empty).decode((LITTLE + bytes(4))[:size]) == Empty()
 
 
-@pytest.mark.parametrize("size", range(4))
+@each("size", range(4))
 def test_a_request_without_fields_needs_its_whole_header_all_the_same(size: int) -> None:
     with pytest.raises(CdrError):
         Cdr(Empty).decode(LITTLE[:size])
 
 
-@pytest.mark.parametrize("count", [0, 1, 100, 1000])
+@each("count", [0, 1, 100, 1000])
 def test_long_lists_are_what_ros_writes_too(count: int) -> None:
     moved = Transform(Vector3(1.0), Quaternion())
     transforms = [
@@ -300,7 +299,7 @@ def test_long_lists_are_what_ros_writes_too(count: int) -> None:
         assert Cdr(type(message)).decode(encoded(message)) == message
 
 
-@pytest.mark.parametrize("level", [0, 127, 128, 255])
+@each("level", [0, 127, 128, 255])
 def test_a_level_is_one_unsigned_byte(level: int) -> None:
     message = DiagnosticArray(Header(), [DiagnosticStatus(level, "", "", "", [])])
     assert encoded(message)[24] == level
@@ -314,7 +313,7 @@ def test_a_very_long_text_is_what_ros_writes_too(length: int) -> None:
     assert Cdr(ServiceReply).decode(encoded(message)) == message
 
 
-@pytest.mark.parametrize("value", [math.inf, -math.inf, -0.0, 5e-324, 1.7976931348623157e308])
+@each("value", [math.inf, -math.inf, -0.0, 5e-324, 1.7976931348623157e308])
 def test_odd_numbers_come_through_bit_for_bit(value: float) -> None:
     message = Twist(Vector3(value), Vector3(z=value))
     got = Cdr(Twist).decode(oracle_bytes(message))
@@ -341,8 +340,8 @@ class TextThenNumbers(Struct, frozen=True):
     last: I32
 
 
-@pytest.mark.parametrize("length", range(10))
-@pytest.mark.parametrize("head", [LITTLE, BIG])
+@each("length", range(10))
+@each("head", [LITTLE, BIG])
 def test_a_number_after_a_text_of_any_length_stands_at_a_multiple_of_its_size(
     length: int, head: bytes
 ) -> None:
@@ -373,7 +372,7 @@ def test_a_sequence_after_a_text_of_any_length_is_padded_only_before_its_items(
     assert encoded(message) == LITTLE + body.replace(b"\xaa", b"\0")
 
 
-@pytest.mark.parametrize("frame", range(10))
+@each("frame", range(10))
 def test_padding_is_never_read(frame: int) -> None:
     message = odometry("f" * frame, "child")
     payload = bytearray(oracle_bytes(message))
@@ -386,7 +385,7 @@ def test_padding_is_never_read(frame: int) -> None:
     assert Cdr(Odometry).decode(bytes(payload)) == message
 
 
-@pytest.mark.parametrize("surplus", [1, 3, 4, 7, 1000])
+@each("surplus", [1, 3, 4, 7, 1000])
 def test_bytes_after_the_message_are_padding(surplus: int) -> None:
     for payload, message in valid():
         assert Cdr(type(message)).decode(payload + b"\xff" * surplus) == message
@@ -398,7 +397,7 @@ def test_the_options_of_the_header_do_not_matter(options: bytes) -> None:
         assert Cdr(type(message)).decode(payload[:2] + options + payload[4:]) == message
 
 
-@pytest.mark.parametrize(
+@each(
     "head",
     [b"", b"\0", b"\0\1", b"\0\1\0", b"\0\2\0\0", b"\0\3\0\0", b"\0\6\0\0", b"\0\7\0\0",
      b"\1\0\0\0", b"\1\1\0\0", b"\xff" * 4, b"{}\0\0"],
@@ -454,7 +453,7 @@ def test_a_run_of_numbers_is_aligned_field_by_field() -> None:
     assert Cdr(Mixed).decode(LITTLE + bytes.fromhex(golden)) == MIXED
 
 
-@pytest.mark.parametrize("length", range(9))
+@each("length", range(9))
 def test_a_run_is_aligned_wherever_it_begins(length: int) -> None:
     class After(Struct, frozen=True):
         text: str
@@ -592,11 +591,10 @@ class ListOfWholes(Struct):
     field: list[int]
 
 
-@pytest.mark.parametrize(
+@each(
     "cls",
     [MaybeNumber, NumberOrText, Map, Raw, Whole, Moment, Anything, ListOfMaps, ListOfLists,
      ListOfWholes, RobotState, int, dict, str, list[float]],
-    ids=str,
 )  # fmt: skip
 def test_a_type_that_cdr_cannot_tell_is_a_type_error(cls: Any) -> None:
     with pytest.raises(TypeError):
@@ -640,7 +638,7 @@ def reply_saying(length: int, raw: bytes) -> bytes:
     return LITTLE + struct.pack("<?3xI", True, length) + raw
 
 
-@pytest.mark.parametrize(
+@each(
     ("length", "raw"),
     [
         (1, b"a"),
@@ -664,7 +662,7 @@ def test_a_string_of_no_bytes_at_all_is_empty() -> None:
     assert Cdr(ServiceReply).decode(reply_saying(0, b"")) == ServiceReply(True, "")
 
 
-@pytest.mark.parametrize("length", [2**32 - 1, 2**31, 2**31 - 1, 10**6, 4])
+@each("length", [2**32 - 1, 2**31, 2**31 - 1, 10**6, 4])
 def test_a_string_longer_than_what_there_is_is_refused(length: int) -> None:
     with pytest.raises(CdrError, match=str(length)):
         Cdr(ServiceReply).decode(reply_saying(length, b"ok\0"))
@@ -728,8 +726,8 @@ class Bounded(Struct, frozen=True):
     nodes: Annotated[list[Node], Meta(max_length=3)] = []
 
 
-@pytest.mark.parametrize("count", range(6))
-@pytest.mark.parametrize("name", ["numbers", "texts", "nodes"])
+@each("count", range(6))
+@each("name", ["numbers", "texts", "nodes"])
 def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
     name: str, count: int
 ) -> None:
@@ -744,8 +742,8 @@ def test_a_bounded_sequence_holds_as_many_items_as_it_may_and_no_more(
         Cdr(Bounded).decode(payload)
 
 
-@pytest.mark.parametrize("order", "<>")
-@pytest.mark.parametrize(
+@each("order", "<>")
+@each(
     ("cls", "before", "most"),
     [
         (JointState, struct.pack("<iIIB3x", 0, 0, 1, 0), 64),
@@ -778,7 +776,7 @@ def test_as_many_names_as_there_may_be_are_read(cls: type[Struct], most: int) ->
     assert Cdr(cls).decode(encoded(made[cls])) == made[cls]
 
 
-@pytest.mark.parametrize("field", ["name", "position", "velocity", "effort"])
+@each("field", ["name", "position", "velocity", "effort"])
 def test_each_list_of_a_joint_state_is_bounded(field: str) -> None:
     items = ["j"] * 65 if field == "name" else [0.5] * 65
     payload = oracle_bytes(JointState(**cast(dict[str, Any], {field: items})))

@@ -8,6 +8,7 @@ import pytest
 from msgspec import Meta, Struct, inspect
 
 from acsard.core.messages.cdr_types import builder, leaves, limit, number_code, plain, struct_info
+from tests.each import each
 
 
 class Inner(Struct, frozen=True):
@@ -42,13 +43,13 @@ def test_a_builder_makes_the_struct_of_its_leaves() -> None:
     assert built == Outer(Inner(1.0, [True]), "a", 3, Inner(2.0, []))
 
 
-@pytest.mark.parametrize("kind", [dict, list[int], float, int])
+@each("kind", [dict, list[int], float, int])
 def test_what_is_no_struct_is_a_type_error(kind: object) -> None:
     with pytest.raises(TypeError, match="not a struct"):
         struct_info(kind)
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "code"),
     [
         (float, "d"),
@@ -69,7 +70,7 @@ def test_an_int_without_a_width_is_a_type_error(kind: object) -> None:
         number_code(field(kind))
 
 
-@pytest.mark.parametrize(
+@each(
     ("meta", "bounds"),
     [
         (Meta(), None),

@@ -11,6 +11,7 @@ from acsard.core.config.settings import BusConfig, Config, ControlConfig, McuCon
 from acsard.core.messages.diagnostics import ERROR, OK, REFUSED_S, WARN, diagnostics
 from acsard.core.messages.schema import DiagnosticStatus
 from acsard.core.values import GyroStatus, Measured, Outputs, RoutersStatus, Snapshot, Spread
+from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT
 
 CONFIG = Config(robot=RobotConfig("r7"), mcu=McuConfig(port="/dev/x"))
@@ -45,8 +46,8 @@ def test_every_status_names_the_robot_it_is_of() -> None:
     assert len({one.name for one in found}) == len(found)
 
 
-@pytest.mark.parametrize("mode", ["inactive", "waiting", "stopped", "fault", "leaving"])
-@pytest.mark.parametrize("link", ["up", "stale", "booting", "down"])
+@each("mode", ["inactive", "waiting", "stopped", "fault", "shutdown"])
+@each("link", ["up", "stale", "booting", "down"])
 def test_no_row_comes_or_goes_while_the_robot_lives(mode: str, link: str) -> None:
     outputs = replace(OUTPUTS, mode=mode, link=link, source="", reason="words")
     snapshot = seen(figures={}, counters={}, sources=(), refused_age_s=0.0, missed_last_minute=9)
@@ -54,7 +55,7 @@ def test_no_row_comes_or_goes_while_the_robot_lives(mode: str, link: str) -> Non
     assert [(one.name, one.hardware_id) for one in rows(CONFIG, outputs, snapshot)] == names
 
 
-@pytest.mark.parametrize("does", ["waiting for rest", "used", "silent", "dead", "not believed"])
+@each("does", ["waiting for rest", "used", "silent", "dead", "not believed"])
 def test_a_gyro_once_configured_has_its_row_whatever_it_does(does: Any) -> None:
     assert [one.name for one in rows(snapshot=seen(gyro=GyroStatus(does)))] == [
         *(one.name for one in rows()),
@@ -78,14 +79,14 @@ def test_a_router_has_its_row_before_anybody_has_looked_whether_it_is_there() ->
 # mode
 
 
-@pytest.mark.parametrize(
+@each(
     ("mode", "level"),
     [
         ("driving", OK),
         ("ready", OK),
         ("waiting", OK),
         ("inactive", OK),
-        ("leaving", OK),
+        ("shutdown", OK),
         ("stopped", WARN),
         ("fault", ERROR),
     ],
@@ -99,9 +100,7 @@ def test_what_is_latched_is_no_ok_and_its_reason_the_message(mode: str, level: i
 # link
 
 
-@pytest.mark.parametrize(
-    ("link", "level"), [("up", OK), ("stale", ERROR), ("booting", ERROR), ("down", ERROR)]
-)
+@each(("link", "level"), [("up", OK), ("stale", ERROR), ("booting", ERROR), ("down", ERROR)])
 def test_a_link_that_is_not_up_is_an_error(link: str, level: int) -> None:
     one = row("serial link", outputs=replace(OUTPUTS, link=link))
     assert (one.level, one.message) == (level, link)

@@ -57,7 +57,7 @@ def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
     assert encode(TWIST, "cdr") == AS_CDR
 
 
-@pytest.mark.parametrize(
+@each(
     "value",
     [
         {"x": 0.5},
@@ -67,7 +67,6 @@ def test_cdr_is_the_fields_alone_behind_four_bytes() -> None:
         Info("r7", "1.2.3", 42, "/dev/x", True, 100.0, [], []),
         RobotState(Time(), "", "", 0, 0, 0, 0, 0, [], "", "", [], "", {}),
     ],
-    ids=lambda value: type(value).__name__,
 )
 def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
     with pytest.raises(DecodeError, match=f"{type(value).__name__} is not a ROS message") as caught:
@@ -75,8 +74,8 @@ def test_what_is_no_ros_message_has_no_cdr_form(value: object) -> None:
     assert caught.value.reason == "unknown_format"
 
 
-@pytest.mark.parametrize("cls", [dict, Info, RobotState])
-@pytest.mark.parametrize("encoding", ["", "application/cdr"])
+@each("cls", [dict, Info, RobotState])
+@each("encoding", ["", "application/cdr"])
 def test_what_is_no_ros_message_is_not_read_from_cdr_either(
     cls: type[object], encoding: str
 ) -> None:
@@ -85,14 +84,14 @@ def test_what_is_no_ros_message_is_not_read_from_cdr_either(
     assert caught.value.reason == "unknown_format"
 
 
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("named", [True, False])
+@each("form", FORMATS)
+@each("named", [True, False])
 def test_a_message_comes_back_with_and_without_its_encoding(form: Format, named: bool) -> None:
     encoding = encoding_name(form, "Twist") if named else ""
     assert twists.decode(encoding, encode(TWIST, form)) == TWIST
 
 
-@pytest.mark.parametrize(
+@each(
     ("encoding", "form"),
     [
         ("application/json", "json"),
@@ -105,7 +104,7 @@ def test_a_message_comes_back_with_and_without_its_encoding(form: Format, named:
         ("application/cdr;whatever", "cdr"),
     ],
 )
-@pytest.mark.parametrize("payload", [AS_JSON, encode(TWIST, "msgpack"), AS_CDR, b"", b"\xff"])
+@each("payload", [AS_JSON, encode(TWIST, "msgpack"), AS_CDR, b"", b"\xff"])
 def test_an_encoding_that_says_so_is_believed(encoding: str, form: str, payload: bytes) -> None:
     assert detect(encoding, payload) == form
 
@@ -132,7 +131,7 @@ def test_without_one_the_first_bytes_decide(encoding: str, payload: bytes, form:
     assert detect(encoding, payload) == form
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [b"", b"   ", b"[1]", b'"stop"', b"1", b"null", b"\x90", b"\x93\x01", b"\x7f", b"\xa1x",
      b"\xc0", b"\xdc\x00\x00", b"\xdd", b"\x00", b"\x00\x02\x00\x00",
@@ -143,7 +142,7 @@ def test_what_is_no_json_object_no_msgpack_map_and_no_cdr_is_not_guessed(payload
     assert refusal("", payload) == "unknown_encoding"
 
 
-@pytest.mark.parametrize(
+@each(
     ("payload", "reason"),
     [
         (b'{"linear":{}}', "wrong_shape"),
@@ -165,7 +164,7 @@ def test_json_that_is_not_the_message_is_refused_by_reason(payload: bytes, reaso
     assert refusal("", payload) == reason
 
 
-@pytest.mark.parametrize(
+@each(
     ("payload", "reason"),
     [
         (b"\x80", "wrong_shape"),
@@ -185,7 +184,7 @@ def test_msgpack_that_is_not_the_message_is_refused_by_reason(payload: bytes, re
     assert refusal("application/msgpack", payload) == reason
 
 
-@pytest.mark.parametrize(
+@each(
     "payload",
     [
         b"",
@@ -203,7 +202,7 @@ def test_cdr_that_is_not_the_message_is_refused_as_malformed(payload: bytes) -> 
     assert refusal("application/cdr", payload) == "malformed"
 
 
-@pytest.mark.parametrize("surplus", [1, 3, 4, 7, 100])
+@each("surplus", [1, 3, 4, 7, 100])
 def test_surplus_bytes_after_cdr_are_padding(surplus: int) -> None:
     assert twists.decode("", AS_CDR + b"\xff" * surplus) == TWIST
 
@@ -223,8 +222,8 @@ def test_a_payload_of_the_other_format_than_it_says_is_refused() -> None:
     assert refusal("application/json", encode(TWIST, "msgpack")) == "malformed"
 
 
-@pytest.mark.parametrize("depth", [10, 1000, 100_000])
-@pytest.mark.parametrize(
+@each("depth", [10, 1000, 100_000])
+@each(
     ("start", "nested"),
     [
         (b"", b'{"linear":'),

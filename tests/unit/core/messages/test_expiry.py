@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
-
 from acsard.core.messages.expiry import DAY_NS, expiry
+from tests.each import each
 
 NOW_NS = 1_700_000_000_000_000_000
 
 
-@pytest.mark.parametrize(
+@each(
     ("days", "level", "words"),
     [
         (400, 0, "valid for 400 days"),

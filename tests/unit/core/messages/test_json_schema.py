@@ -23,11 +23,12 @@ from acsard.core.messages.topics import PUBLISHED, TOPICS
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.modes import Mode
 from acsard.core.values import GyroDoes, Role
+from tests.each import each
 from tests.unit.core.messages.examples import OUTPUTS, SNAPSHOT, START
 
 INCOMING = {
     "Twist", "TwistStampedIn", "JointStateIn", "ImuIn", "SetPose", "Release", "Settings",
-    "DoorState"
+    "GatewayState"
 }  # fmt: skip
 OUTGOING = set(SCHEMAS) - INCOMING
 
@@ -50,7 +51,7 @@ def as_json(message: Message) -> Any:
 # the form of the schemas
 
 
-@pytest.mark.parametrize("name", SCHEMAS)
+@each("name", SCHEMAS)
 def test_each_is_a_schema_of_the_dialect_it_names_and_has_an_id_of_its_own(name: str) -> None:
     schema = SCHEMAS[name]
     assert schema["$schema"] == Draft202012Validator.META_SCHEMA["$id"]
@@ -58,7 +59,7 @@ def test_each_is_a_schema_of_the_dialect_it_names_and_has_an_id_of_its_own(name:
     Draft202012Validator.check_schema(schema)
 
 
-@pytest.mark.parametrize("name", sorted(OUTGOING))
+@each("name", sorted(OUTGOING))
 def test_what_goes_out_has_all_its_fields_and_may_get_more(name: str) -> None:
     assert parts(name)
     for part in parts(name):
@@ -66,7 +67,7 @@ def test_what_goes_out_has_all_its_fields_and_may_get_more(name: str) -> None:
         assert "additionalProperties" not in part
 
 
-@pytest.mark.parametrize("name", sorted(INCOMING))
+@each("name", sorted(INCOMING))
 def test_what_comes_in_may_leave_out_what_has_a_default_and_add_nothing(name: str) -> None:
     assert parts(name)
     for part in parts(name):
@@ -87,7 +88,7 @@ def test_the_table_says_what_comes_in_and_what_goes_out() -> None:
     assert out | {"Config"} == OUTGOING
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "part", "field", "values"),
     [
         ("RobotState", "", "mode", {str(mode) for mode in Mode}),
@@ -115,7 +116,7 @@ def test_a_pattern_is_one_of_ecmascript() -> None:
 # messages that the daemon publishes
 
 
-@pytest.mark.parametrize("topic", [t for t in PUBLISHED if not t.simulated], ids=lambda t: t.key)
+@each("topic", [t for t in PUBLISHED if not t.simulated])
 def test_what_is_published_is_as_its_schema_says_and_nothing_may_be_missing(topic: Any) -> None:
     report = Report(Config(), START)
     list(report.due(OUTPUTS, {topic.key}, lambda: SNAPSHOT))
@@ -128,7 +129,7 @@ def test_what_is_published_is_as_its_schema_says_and_nothing_may_be_missing(topi
         assert refused(topic.type, {key: one for key, one in value.items() if key != field})
 
 
-@pytest.mark.parametrize("mode", [*Mode])
+@each("mode", [*Mode])
 def test_each_mode_may_be_said_and_no_other(mode: str) -> None:
     report = Report(Config(), START)
     list(report.due(replace(OUTPUTS, mode=mode), {"state"}, lambda: SNAPSHOT))
@@ -193,7 +194,7 @@ def _decodes(call: Any) -> bool:
     return True
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "value", "good"),
     [
         ("Twist", ZERO, True),

@@ -21,6 +21,7 @@ from acsard.core.messages.schema import (
     TwistWithCovariance,
     Vector3,
 )
+from tests.each import each
 
 HEADER = Header(Time(), "odom")
 
@@ -50,7 +51,7 @@ def test_odometry_is_where_it_is_and_how_fast_each_with_its_unit() -> None:
     assert " ".join(line.split()) == told
 
 
-@pytest.mark.parametrize("yaw", [-3.1, -0.4, 0.0, 1.0, 3.1, 3.2, 6.0])
+@each("yaw", [-3.1, -0.4, 0.0, 1.0, 3.1, 3.2, 6.0])
 def test_the_heading_is_within_half_a_turn(yaw: float) -> None:
     told = figures(short(PoseStamped(HEADER, pose(0.0, 0.0, yaw))))[2]
     assert -180.0 <= told <= 180.0
@@ -67,7 +68,7 @@ def test_lines_of_a_robot_that_drives_stand_below_each_other() -> None:
     assert len({len(short(one)) for one in far}) == 1
 
 
-@pytest.mark.parametrize("value", [1e300, -1e12, math.inf, math.nan])
+@each("value", [1e300, -1e12, math.inf, math.nan])
 def test_no_figure_breaks_the_line(value: float) -> None:
     assert len("".join(place(value, value, 0.0) + speeds(value, value))) < 80
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from acsard.core.messages.recent_events import LAST, RecentEvents
 from acsard.core.messages.schema import Events, Time
-from acsard.core.motion.command_events import missed
+from acsard.core.motion.arbiter_text import missed
 from acsard.core.values import NS_PER_S, Event, Instant
 
 FAULT = Event("fault", "a wheel is dead; srv/clear releases it", "error")

@@ -28,9 +28,9 @@ from acsard.core.messages.schema import (
     DiagnosticArray,
     DiagnosticStatus,
     Events,
-    Figure,
-    Happening,
     JointState,
+    Latency,
+    LogEvent,
     Message,
     Odometry,
     Quaternion,
@@ -43,7 +43,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.topics import PUBLISHED
-from acsard.core.motion.command_events import missed
+from acsard.core.motion.arbiter_text import missed
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import (
     Estimate,
@@ -56,6 +56,7 @@ from acsard.core.values import (
     Snapshot,
     WheelsStatus,
 )
+from tests.each import each
 from tests.unit.core.messages.examples import ESTIMATE, OUTPUTS, SNAPSHOT, START, at, later
 
 ALL = {topic.key for topic in PUBLISHED if not topic.simulated}
@@ -242,13 +243,13 @@ def close(q: Quaternion, r: Quaternion) -> bool:
     )
 
 
-@pytest.mark.parametrize(("yaw", "turn"), YAWS)
+@each(("yaw", "turn"), YAWS)
 def test_a_yaw_is_its_quaternion(yaw: float, turn: Quaternion) -> None:
     assert close(from_yaw(yaw), turn)
     assert close(from_rpy(0.0, 0.0, yaw), turn)
 
 
-@pytest.mark.parametrize(("quarters", "turn"), RPYS)
+@each(("quarters", "turn"), RPYS)
 def test_quarter_turns_about_fixed_axes_are_their_quaternion(
     quarters: tuple[int, int, int], turn: Quaternion
 ) -> None:
@@ -317,8 +318,8 @@ def test_the_static_transforms_carry_the_time_of_the_start() -> None:
     assert stamps == {Time(1_700_000_000, 0)}
 
 
-@pytest.mark.parametrize("lidar", [True, False])
-@pytest.mark.parametrize("footprint", [True, False])
+@each("lidar", [True, False])
+@each("footprint", [True, False])
 def test_each_static_transform_has_its_own_switch(lidar: bool, footprint: bool) -> None:
     message = static(replace(LIDAR, publish_tf=lidar), replace(FOOTPRINT, publish_tf=footprint))
     names = [transform.child_frame_id for transform in message.transforms]
@@ -349,8 +350,8 @@ def test_state_is_the_summary_of_outputs_and_snapshot() -> None:
         sources=[SourceState("app", 50, 0.01, ""), SourceState("nav", 10, None, "a command")],
         refused="source nav: held up",
         counters={"lines": 100, "line_malformed": 2, "commands": 7, "command_stale": 3},
-        figures={
-            "period_lateness": Figure(
+        latencies={
+            "period_lateness": Latency(
                 Spread(1000, 50.0, 400.0, 900.0), Spread(100, 40.0, 80.0, 90.0)
             )
         },
@@ -371,7 +372,7 @@ def test_the_counts_that_the_lines_show_are_in_state_and_on_the_links_row() -> N
     state, array = report.current("state", seen), report.current("diagnostics", seen)
     assert isinstance(state, RobotState)
     assert isinstance(array, DiagnosticArray)
-    assert state.encoders == [20, 0, 0, 400]
+    assert state.encoder_counts == [20, 0, 0, 400]
     (row,) = (one for one in array.status if one.name == "acsard: serial link")
     shown = {key: value for key, value in values(row).items() if key.startswith("counts")}
     assert shown == {"counts_front_right": "20", "counts_rear_right": "400"}
@@ -413,7 +414,7 @@ def test_who_connects_to_nobody_has_no_row_of_routers() -> None:
 # keys without subscribers
 
 
-@pytest.mark.parametrize("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
+@each("wanted", [set(), *({key} for key in ALL), {"odom", "state"}, ALL])
 def test_only_what_is_wanted_is_published(wanted: set[str]) -> None:
     found = Report(CONFIG, START).due(OUTPUTS, wanted, look)
     assert sorted(key for key, _ in found) == sorted(wanted - {"tf_static"})
@@ -448,7 +449,7 @@ def test_events_are_kept_whoever_listens_and_told_with_those_before_them() -> No
     assert told.events[0].text == "the 6. takes over"
     assert told.events[0].count == 2
     assert told.events[0].stamp == Time.from_ns(OUTPUTS.now.wall_ns)
-    assert told.events[-1] == Happening(told.stamp, "stop", "info", "stopped", "phone", 1)
+    assert told.events[-1] == LogEvent(told.stamp, "stop", "info", "stopped", "phone", 1)
     assert told.stamp == Time.from_ns(quiet.now.wall_ns)
     assert report.current("events", never) == told
 
@@ -481,13 +482,13 @@ def test_a_step_woken_by_feedback_alone_says_nothing_of_commands() -> None:
 # publishing rates
 
 
-@pytest.mark.parametrize("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
+@each("key", ["odom", "tf", "wheel_states", "cmd_vel_out"])
 def test_a_rate_of_zero_is_every_sample(key: str) -> None:
     assert times_of(key, CONFIG) == list(range(1000))
 
 
-@pytest.mark.parametrize("key", ["odom", "wheel_states", "cmd_vel_out", "state", "diagnostics"])
-@pytest.mark.parametrize("hz", [1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0])
+@each("key", ["odom", "wheel_states", "cmd_vel_out", "state", "diagnostics"])
+@each("hz", [1.0, 3.0, 10.0, 30.0, 50.0, 80.0, 100.0])
 def test_the_average_rate_is_the_configured_one(key: str, hz: float) -> None:
     times = times_of(key, rates(**{key: hz}))
     assert abs(len(times) - hz * 10) <= 1
@@ -560,7 +561,7 @@ def test_a_pause_is_not_made_up_for_by_a_burst() -> None:
 # last values
 
 
-@pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
+@each("key", sorted(ALL - {"tf_static"}))
 def test_there_is_no_present_value_before_the_first_step(key: str) -> None:
     assert Report(CONFIG, START).current(key, never) is None
 
@@ -570,7 +571,7 @@ def test_the_static_transforms_are_there_from_the_start() -> None:
     assert report.current("tf_static", never) == report.tf_static()
 
 
-@pytest.mark.parametrize("key", sorted(ALL - {"tf_static"}))
+@each("key", sorted(ALL - {"tf_static"}))
 def test_the_present_value_is_what_was_or_would_have_been_published(key: str) -> None:
     report = Report(CONFIG, START)
     list(report.due(OUTPUTS, set(), never))
@@ -585,7 +586,7 @@ def test_the_last_sample_stays_the_present_value_while_none_comes() -> None:
     assert odom == published()["odom"]
 
 
-@pytest.mark.parametrize("key", ["", "alive", "cmd/app", "info", "nonsense"])
+@each("key", ["", "alive", "cmd/app", "info", "nonsense"])
 def test_what_is_not_published_has_no_present_value(key: str) -> None:
     report = Report(CONFIG, START)
     report.due(OUTPUTS, ALL, look)
@@ -623,7 +624,7 @@ def test_without_a_gyro_there_is_nothing_to_say_of_it() -> None:
     assert (state.gyro, rows) == ("off", [])
 
 
-@pytest.mark.parametrize(
+@each(
     ("does", "level"),
     [
         ("waiting for rest", 0),
@@ -653,12 +654,12 @@ def test_the_track_that_the_gyro_implies_stands_beside_the_configured_one() -> N
         "learned_multiplier_std": "0.090",
     }
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.500"}
-    assert state.track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
-    assert row.message == f"{WORDS['used']}; effective track: {state.track}"
+    assert state.effective_track == "learned 1.800 ± 0.090 (only shown), configured 1.500 in use"
+    assert row.message == f"{WORDS['used']}; effective track: {state.effective_track}"
     state, (row,) = with_gyro(replace(learned, track_use="used"))
     assert {pair.key: pair.value for pair in row.values} == shown | {"multiplier_in_use": "1.800"}
-    assert state.track == "learned 1.800 ± 0.090 in use, configured 1.500"
-    assert with_gyro(GyroStatus("used"))[0].track == ""
+    assert state.effective_track == "learned 1.800 ± 0.090 in use, configured 1.500"
+    assert with_gyro(GyroStatus("used"))[0].effective_track == ""
 
 
 # suspect wheels
@@ -674,7 +675,7 @@ def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
         assert isinstance(state, RobotState)
         assert isinstance(array, DiagnosticArray)
         (row,) = [one for one in array.status if one.name == "acsard: wheels"]
-        assert (state.doubt, row.level) == (said.text, level)
+        assert (state.wheel_fault, row.level) == (said.text, level)
         assert row.message == (said.text or "front and rear agree")
     assert {pair.key: pair.value for pair in row.values} == {
         "left_out": "rear_left",
@@ -689,7 +690,7 @@ def test_what_front_and_rear_say_of_each_other_is_shown() -> None:
 DAY_NS = 86400 * 10**9
 
 
-@pytest.mark.parametrize(
+@each(
     ("days", "level", "words"),
     [
         (400, 0, "valid for 400 days"),
@@ -704,11 +705,11 @@ def test_a_certificate_that_ends_is_said_in_time(days: int, level: int, words: s
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert state.certificate.startswith(words)
+    assert state.certificate_expiry.startswith(words)
     array = made.current("diagnostics", lambda: SNAPSHOT)
     assert isinstance(array, DiagnosticArray)
     (status,) = [one for one in array.status if one.name == "acsard: certificate"]
-    assert (status.level, status.message) == (level, state.certificate)
+    assert (status.level, status.message) == (level, state.certificate_expiry)
 
 
 def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
@@ -716,7 +717,7 @@ def test_a_certificate_that_nobody_can_read_is_a_warning() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert "`acsard doctor`" in state.certificate
+    assert "`acsard doctor`" in state.certificate_expiry
 
 
 def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
@@ -724,4 +725,4 @@ def test_without_tls_there_is_no_certificate_to_speak_of() -> None:
     made.due(OUTPUTS, set(), lambda: SNAPSHOT)
     state = made.current("state", lambda: SNAPSHOT)
     assert isinstance(state, RobotState)
-    assert state.certificate == ""
+    assert state.certificate_expiry == ""

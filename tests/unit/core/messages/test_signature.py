@@ -6,11 +6,11 @@ import hashlib
 import json
 
 import msgspec
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from acsard.core.messages.signature import DIGITS, MAX_NAME, Signature, public_name, unpack
+from tests.each import each
 
 WHOLE = {"sender": "joystick-7", "stamp": 1_795_154_884_365_624_370, "sequence": 12}
 
@@ -20,8 +20,8 @@ def test_what_is_packed_is_read() -> None:
     assert unpack(signature.pack()) == signature
 
 
-@pytest.mark.parametrize("form", [lambda told: json.dumps(told).encode(), msgspec.msgpack.encode])
-@pytest.mark.parametrize("left_out", [(), ("stamp",), ("sequence",), ("stamp", "sequence")])
+@each("form", [lambda told: json.dumps(told).encode(), msgspec.msgpack.encode])
+@each("left_out", [(), ("stamp",), ("sequence",), ("stamp", "sequence")])
 def test_a_map_in_json_or_msgpack_is_a_signature_and_only_the_sender_must_be_there(
     form: object, left_out: tuple[str, ...]
 ) -> None:
@@ -31,7 +31,7 @@ def test_a_map_in_json_or_msgpack_is_a_signature_and_only_the_sender_must_be_the
     assert signature == Signature("joystick-7", told.get("stamp"), told.get("sequence"))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
+@each(
     "attachment",
     [
         b"",
@@ -57,7 +57,7 @@ def test_no_bytes_raise_anything(attachment: bytes) -> None:
     unpack(b"{" + attachment)
 
 
-@pytest.mark.parametrize(
+@each(
     ("sender", "name"),
     [
         ("joystick/s3cret", "joystick"),
@@ -75,7 +75,7 @@ def test_a_public_name_is_the_name_before_the_secret_and_a_hash_of_both(
     assert public_name(sender) == f"{name}/{digits}"
 
 
-@pytest.mark.parametrize("sender", ["s3cret", "/s3cret", " /s3cret", "1f2e" * 8])
+@each("sender", ["s3cret", "/s3cret", " /s3cret", "1f2e" * 8])
 def test_a_sender_id_without_a_name_has_a_hash_alone(sender: str) -> None:
     assert public_name(sender) == hashlib.sha256(sender.encode()).hexdigest()[:16]
 

@@ -21,6 +21,7 @@ from acsard.core.messages.topics import (
     row_of,
     source_keys,
 )
+from tests.each import each
 
 PROMISED = [
     ("odom", "out", "Odometry"),
@@ -39,7 +40,7 @@ PROMISED = [
     ("wheel_cmd/<source>/<certificate>", "in", "JointState"),
     ("imu", "in", "Imu"),
     ("stop", "in", "anything"),
-    ("door", "in", "DoorState"),
+    ("gateway", "in", "GatewayState"),
     ("srv/stop", "service", "ServiceReply"),
     ("srv/clear", "service", "ServiceReply"),
     ("srv/activate", "service", "ServiceReply"),
@@ -106,7 +107,7 @@ def test_the_simulator_publishes_what_its_gyro_says() -> None:
     assert said - {topic.key for topic in PUBLISHED} == {"imu"}
 
 
-@pytest.mark.parametrize("service", SERVICES)
+@each("service", SERVICES)
 def test_every_service_has_a_row(service: str) -> None:
     row = by_key(f"srv/{service}")
     assert row is not None
@@ -118,7 +119,7 @@ def test_a_full_key_has_the_robot_in_it() -> None:
     assert full_key("r7", "cmd/teleop") == "acsard/r7/cmd/teleop"
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "pattern"),
     [("cmd/<source>", "cmd/*"), ("wheel_cmd/<source>", "wheel_cmd/*"),
      ("cmd/<source>/<certificate>", "cmd/*/*"),

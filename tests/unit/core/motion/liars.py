@@ -1,8 +1,8 @@
-"""Simulated drives as four encoders report them, of which one may fail, to judge `verdict.py`.
+"""Simulated drives as four encoders report them, of which one may fail, for `wheel_faults.py`.
 
 Each wheel has its own motor lag, tyre and load, and starts anywhere within one count of its
 encoder. A line reports counts over its period in two decimals. The module
-`core/motion/wheel_faults/verdict.py` is judged by these drives, so this one uses only numpy and
+`core/motion/wheel_faults.py` is judged by these drives, so this one uses only numpy and
 shares no code with it. The seed determines everything that a robot does.
 """
 

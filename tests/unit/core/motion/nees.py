@@ -1,9 +1,9 @@
 """Simulated drives and true end poses of robots with the declared errors: the truth for NEES.
 
 This module implements only the declared model (`acsard.toml`, the docstring of
-`core/motion/noise.py`), in numpy, for many robots at once. It shares no code with the module that
-it judges. The encoders report exactly the commanded speeds; the ground and the robot's true size
-change the actual motion.
+`core/motion/error_model.py`), in numpy, for many robots at once. It shares no code with the module
+that it judges. The encoders report exactly the commanded speeds; the ground and the robot's true
+size change the actual motion.
 
 NEES is e' P^-1 e, with e = log(estimate^-1 truth) and P the published covariance rotated by -yaw.
 If P is right, the mean of NEES over many runs is 3, and 95 % of its values are below 7.815.

@@ -1,4 +1,4 @@
-"""Tests of the sentences about the arbiter's decisions in `state` and `diagnostics`."""
+"""Tests of the sentences and events about modes, commanders and refused commands."""
 
 from __future__ import annotations
 
@@ -7,8 +7,17 @@ from typing import get_args, get_type_hints
 import pytest
 
 from acsard.core.motion.arbiter import Choice, Objection
-from acsard.core.motion.arbiter_text import REFUSED, chosen, waiting
-from acsard.core.values import REST, Wait
+from acsard.core.motion.arbiter_text import (
+    MAX_SENDER,
+    REFUSED,
+    CommandEvents,
+    chosen,
+    missed,
+    refused,
+    waiting,
+)
+from acsard.core.motion.modes import Mode
+from acsard.core.values import REST, Event, Refusal, Twist, Wait
 
 SENTENCES = [
     (Wait("nothing"), ""),
@@ -81,4 +90,111 @@ def test_whose_command_is_followed_or_why_nobody_s_is_a_sentence(choice: Choice,
 
 def test_whatever_a_command_is_refused_for_is_said_in_words() -> None:
     assert {"", *REFUSED} == {*get_args(Objection)}
-    assert REFUSED["crowded"] == "16 other senders of this source are active"
+    assert REFUSED["too_many_senders"] == "16 other senders of this source are active"
+
+
+NOBODY = Choice()
+
+
+def by(source: str, sender: str) -> Choice:
+    return Choice(source, REST, Wait("nothing"), 1, sender)
+
+
+def test_the_mode_it_starts_in_is_no_event() -> None:
+    assert CommandEvents(Mode.WAITING).changes(Mode.WAITING, NOBODY, "no link") == []
+
+
+def test_another_mode_is_told_once_with_why() -> None:
+    told = CommandEvents(Mode.WAITING)
+    assert told.changes(Mode.READY, NOBODY, "waiting for a command") == [
+        Event("mode", "waiting for a command", kind="waiting -> ready")
+    ]
+    assert told.changes(Mode.READY, NOBODY, "another reason") == []
+
+
+def test_who_begins_to_drive_is_told_with_the_mode_and_as_the_commander() -> None:
+    mode, commander = CommandEvents(Mode.READY).changes(
+        Mode.DRIVING, by("app", "joe"), "driving: by app"
+    )
+    assert mode == Event("mode", "commanded by app", by="app (joe)", kind="ready -> driving")
+    assert commander == Event("commander", "", by="app (joe)", kind="nobody -> app (joe)")
+
+
+def test_another_commander_is_told_with_the_one_before() -> None:
+    told = CommandEvents(Mode.READY)
+    told.changes(Mode.DRIVING, by("app", "joe"), "")
+    (source,) = told.changes(Mode.DRIVING, by("nav", "joe"), "")
+    (sender,) = told.changes(Mode.DRIVING, by("nav", "ann"), "")
+    assert (source.kind, source.by) == ("app (joe) -> nav (joe)", "nav (joe)")
+    assert sender.kind == "nav (joe) -> nav (ann)"
+
+
+def test_who_drives_on_after_a_rest_is_no_other_commander() -> None:
+    told = CommandEvents(Mode.READY)
+    told.changes(Mode.DRIVING, by("app", "joe"), "")
+    told.changes(Mode.READY, NOBODY, "waiting for a command")
+    (event,) = told.changes(Mode.DRIVING, by("app", "joe"), "")
+    assert event.name == "mode"
+
+
+def test_who_sends_to_a_stopped_robot_commands_nothing() -> None:
+    told = CommandEvents(Mode.STOPPED)
+    choice = Choice("app", Twist(1.0, 0.0), Wait("nothing"), 1, "joe")
+    assert told.changes(Mode.STOPPED, choice, "stopped") == []
+
+
+def test_who_sends_speeds_that_must_wait_is_told_once_it_lasts() -> None:
+    told = CommandEvents(Mode.READY)
+    early = Choice("nav", None, Wait("neutral", "nav", 1.0, ros=True), sender="joe")
+    assert told.changes(Mode.READY, early, "") == []
+    late = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0, ros=True), sender="joe")
+    (event,) = told.changes(Mode.READY, late, "")
+    assert (event.name, event.level, event.by) == (
+        "commands_without_effect",
+        "warning",
+        "nav (joe)",
+    )
+    assert "ros2 topic pub" in event.text
+    later = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=10.0, ros=True), sender="joe")
+    assert told.changes(Mode.READY, later, "") == []
+    told.changes(Mode.READY, NOBODY, "")
+    assert len(told.changes(Mode.READY, late, "")) == 1
+
+
+def test_who_is_held_up_by_zeros_is_told_once_however_often_he_pauses() -> None:
+    told = CommandEvents(Mode.READY)
+    told.changes(Mode.DRIVING, by("app", "joe"), "")
+
+    def zeros(kept: str) -> list[Event]:
+        choice = Choice("app", REST, Wait("zeros", "app", lasts=3.0, kept=kept), 1, "joe")
+        return told.changes(Mode.DRIVING, choice, "")
+
+    assert zeros("") == []
+    (event,) = zeros("nav")
+    assert (event.name, event.by, event.kind) == ("commands_without_effect", "app (joe)", "nav")
+    assert event.text.startswith("held by app, which sends only zeros for over 3 s; nav")
+    assert zeros("") + zeros("nav") == []
+    assert [event.kind for event in zeros("teleop")] == ["teleop"]
+
+
+def test_who_sends_to_a_stopped_robot_is_not_told_to_wait() -> None:
+    choice = Choice("nav", None, Wait("neutral", "nav", 1.0, lasts=3.0), sender="joe")
+    assert CommandEvents(Mode.STOPPED).changes(Mode.STOPPED, choice, "stopped") == []
+
+
+def test_a_refusal_is_its_reason_its_words_and_its_sender() -> None:
+    event = refused(Refusal("stale", "source app: late", "app", "joe" * 100))
+    assert event == Event(
+        "command_refused",
+        "source app: late",
+        "warning",
+        ("joe" * 100)[:MAX_SENDER],
+        "stale",
+        news=False,
+    )
+
+
+def test_missed_periods_are_counted_each() -> None:
+    assert missed(3) == Event(
+        "missed_periods", "3 in a row", "warning", kind="missed", count=3, news=False
+    )

@@ -25,12 +25,11 @@ KINEMATICS = Kinematics(DriveConfig())
 PERIOD_NS = NS_PER_S // 100
 
 
-class Listening:
+class Listening(Gyro):
     """A gyro that records the wheels' turn and never corrects it."""
 
-    owes = False
-
     def __init__(self) -> None:
+        super().__init__()
         self.turned = 0.0
         self.seconds: list[float] = []
 
@@ -83,11 +82,12 @@ LINES = st.lists(
 @given(LINES)
 def test_what_a_gyro_hears_of_the_wheels_is_what_the_heading_turned(lines: list[One]) -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS, 3200), Listening()
+    robot.checks.gyro = listening
     for one in lines:
         if one.skipped:
             robot.skip(said(one))
         else:
-            robot.fold(said(one), listening)
+            robot.fold(said(one))
     off = math.remainder(robot.pose.yaw - listening.turned, math.tau)
     assert off == pytest.approx(0.0, abs=1e-9)
 
@@ -102,8 +102,9 @@ def test_a_line_passed_over_leaves_the_gap_before_it_to_the_next() -> None:
 
 def test_over_a_way_that_is_unknown_there_is_nothing_to_compare() -> None:
     robot, listening = Odometry(OdometryConfig(), KINEMATICS), Listening()
+    robot.checks.gyro = listening
     for one in (One(9.0, 9.0), One(9.0, 9.0, bridged=0.3), One(9.0, 9.0, gap=0.5)):
-        robot.fold(said(one), listening)
+        robot.fold(said(one))
     assert listening.seconds == [0.01, pytest.approx(0.31), 0.0]
 
 
@@ -114,6 +115,7 @@ class Turning:
         """The gyro reports `scale` times the true turn."""
         self.scale = scale
         self.gyro, self.robot = Gyro(), Odometry(OdometryConfig(), KINEMATICS, 3200)
+        self.robot.checks.gyro = self.gyro
         self.now_ns, self.true, self.rate = NS_PER_S, 0.0, 0.0
         self.does: list[str] = []
         self.run(1.0, Twist())
@@ -141,7 +143,7 @@ class Turning:
                 continue
             at = Instant(self.now_ns, self.now_ns)
             line = Feedback(at, speeds, dt, bridged=bridged)
-            self.yaw_variance = self.robot.fold(line, self.gyro, told).covariance.yawyaw
+            self.yaw_variance = self.robot.fold(line, told).covariance.yawyaw
             self.does += [event.kind for event in self.gyro.events]
 
     @property
@@ -180,7 +182,7 @@ def test_a_lie_told_while_the_gyro_is_on_trial_is_put_right_once(
     bench.run(1.0, Twist(ahead, 0.0))
     bench.run(before, Twist(ahead, turning))
     bench.run(0.3, Twist(ahead, turning), dead=True)
-    assert bench.robot.doubt.left_out
+    assert bench.robot.checks.wheels.status.left_out
     bench.run(2.0, Twist(ahead, turning), dead=True)
     assert bench.gyro.status.does == "used"
     assert bench.off == pytest.approx(0.0, abs=2e-3)

@@ -37,7 +37,11 @@ def test_once_it_is_certain_the_learned_one_is_used_and_told_once() -> None:
     track.look(Track(1.2, CERTAIN))
     assert track.used == Track(1.2, CERTAIN)
     assert track.event is not None
-    assert (track.event.name, track.event.kind, track.event.level) == ("track", "used", "info")
+    assert (track.event.name, track.event.kind, track.event.level) == (
+        "learned_track",
+        "used",
+        "info",
+    )
     assert track.event.text.endswith(": learned 1.800 ± 0.180 in use, configured 1.500")
     track.look(Track(1.25, SURE))
     assert track.used == Track(1.25, SURE)

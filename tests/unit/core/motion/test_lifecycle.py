@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from copy import copy
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle
+from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
@@ -534,7 +537,7 @@ def test_a_stop_and_a_fault_during_the_shutdown_are_latched_for_the_next_start()
     life.leave()
     assert stop(life, 1.0) == "stopped and latched; the daemon is going down"
     assert life.fault("a wheel is dead", at(2.0))
-    assert mode(life) is Mode.LEAVING
+    assert mode(life) is Mode.SHUTDOWN
     assert life.latches.stop is not None
     assert life.latches.fault is not None
     with pytest.raises(RefusedError, match="going down"):
@@ -809,3 +812,23 @@ def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_da
             before = edge.before
             assert edge.refused == (before.leaving or before.fault or before.stopped)
             assert edge.refused or not (edge.after.inactive or edge.after.dormant)
+
+
+@pytest.mark.parametrize(
+    ("wall_ns", "text"),
+    [
+        (0, "1970-01-01 00:00:00 UTC"),
+        (-1, "1969-12-31 23:59:59 UTC"),
+        (1_795_352_707 * NS_PER_S + 999_999_999, "2026-11-22 13:05:07 UTC"),
+        (951_782_400 * NS_PER_S, "2000-02-29 00:00:00 UTC"),
+        (951_868_800 * NS_PER_S, "2000-03-01 00:00:00 UTC"),
+    ],
+)
+def test_a_time_is_written_as_date_and_time_in_utc(wall_ns: int, text: str) -> None:
+    assert utc(wall_ns) == text
+
+
+@given(st.datetimes(timezones=st.just(UTC)))
+def test_every_date_agrees_with_the_calendar(at: datetime) -> None:
+    seconds = int((at - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds() // 1)
+    assert utc(seconds * NS_PER_S) == f"{at:%Y-%m-%d %H:%M:%S} UTC".rjust(23, "0")

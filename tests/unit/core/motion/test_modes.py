@@ -15,7 +15,7 @@ FACTS = ("leaving", "fault", "stopped", "inactive", "linked", "commanded")
 ALL = [dict(zip(FACTS, values, strict=True)) for values in product((False, True), repeat=6)]
 
 DRAWN = """
-    1.....  leaving
+    1.....  shutdown
     01....  fault
     001...  stopped
     0001..  inactive
@@ -59,13 +59,13 @@ def test_a_refused_request_says_why(mode: Mode, verb: Verb) -> None:
 
 @pytest.mark.parametrize(("mode", "verb"), sorted(REFUSALS))
 def test_a_refusal_names_clear_only_where_clear_helps(mode: Mode, verb: Verb) -> None:
-    assert ("call srv/clear first" in REFUSALS[mode, verb]) == (mode is not Mode.LEAVING)
+    assert ("call srv/clear first" in REFUSALS[mode, verb]) == (mode is not Mode.SHUTDOWN)
 
 
 def test_every_other_request_is_allowed() -> None:
     cells = set(product(Mode, get_args(Verb)))
     for mode, verb in cells - set(REFUSALS):
         require_allowed(mode, verb)
-    held = (Mode.FAULT, Mode.STOPPED, Mode.LEAVING)
+    held = (Mode.FAULT, Mode.STOPPED, Mode.SHUTDOWN)
     refused = {(mode, verb) for mode in held for verb in ("activate", "deactivate")}
-    assert set(REFUSALS) == refused | {(Mode.LEAVING, "clear")}
+    assert set(REFUSALS) == refused | {(Mode.SHUTDOWN, "clear")}

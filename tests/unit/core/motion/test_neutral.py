@@ -126,6 +126,25 @@ def test_a_shared_zero_that_armed_is_not_forgotten_when_a_later_speed_proves_wro
         assert one.armed(1100 * MS)
 
 
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_speed_before_an_unproven_zero_that_arms_never_counts_by_it(shared: bool) -> None:
+    one = Sender(5000 * MS, 1000 * MS, neutral_first=True)
+    one.take(sent(GO, 0, shared), 0)
+    one.take(sent(REST, 10, shared), 0, "unproven")
+    at_ns = 1010 * MS if shared else 10 * MS
+    assert one.armed(at_ns)
+    assert not one.live(at_ns)
+
+
+def test_an_unproven_zero_of_an_armed_sender_leaves_its_last_command_in_force() -> None:
+    one = sender()
+    one.take(sent(REST, 0), 0)
+    one.take(sent(GO, 10), 0)
+    one.take(sent(REST, 20), 0, "unproven")
+    assert one.live(20 * MS)
+    assert one.twist == GO
+
+
 def test_a_shared_zero_that_armed_unproven_is_forgotten_when_its_clock_proves_wrong() -> None:
     one = sender()
     one.take(sent(REST, 0, shared=True), 0, "unproven")

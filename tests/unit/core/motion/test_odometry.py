@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import DriveConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
-from acsard.core.motion.gyro import Turn
+from acsard.core.motion.gyro import Gyro, Turn
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import Track
 from acsard.core.motion.odometry import Odometry
@@ -538,12 +538,11 @@ def test_what_no_line_reported_is_linear_from_one_report_to_the_next() -> None:
 # the turn of a gyro
 
 
-class Says:
+class Says(Gyro):
     """A gyro that always reports the same turn."""
 
-    owes = False
-
     def __init__(self, turn: Turn) -> None:
+        super().__init__()
         self._turn = turn
 
     def turn(self, at_ns: int, dt: float, wheels: float, still: bool) -> Turn:
@@ -564,7 +563,8 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
     speeds, kinematics = WheelSpeeds(20.0, 10.0, 10.0, 20.0), Kinematics(DriveConfig())
     wheels, gyro = (Odometry(OdometryConfig(), kinematics) for _ in range(2))
     by_wheels = wheels.fold(line(1.0, 0.01, speeds, turned=turned))
-    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned), Says(Turn(0.05, 1e-4, 4.0, 1e-3)))
+    gyro.checks.gyro = Says(Turn(0.05, 1e-4, 4.0, 1e-3))
+    by_gyro = gyro.fold(line(1.0, 0.01, speeds, turned=turned))
     assert by_gyro.pose.yaw == pytest.approx(0.05)
     assert by_gyro.pose.yaw != pytest.approx(by_wheels.pose.yaw, rel=0.1)
     assert by_gyro.twist == Twist(by_wheels.twist.linear, 4.0)
@@ -576,9 +576,8 @@ def test_where_a_gyro_tells_the_turn_the_wheels_tell_the_distance_only(
 
 def test_over_a_gap_the_gyro_knows_the_turn() -> None:
     odometry = Odometry(OdometryConfig(), Kinematics(DriveConfig()))
-    estimate = odometry.fold(
-        line(1.0, 0.0, WheelSpeeds(), gap=0.4), Says(Turn(0.3, 1e-4, 0.7, 1e-3))
-    )
+    odometry.checks.gyro = Says(Turn(0.3, 1e-4, 0.7, 1e-3))
+    estimate = odometry.fold(line(1.0, 0.0, WheelSpeeds(), gap=0.4))
     assert estimate.pose == Pose(0.0, 0.0, 0.3)
 
 
@@ -680,7 +679,7 @@ def test_gaps_and_bridges_are_counted_and_a_gap_at_rest_is_none() -> None:
     odometry.fold(Feedback(at, moving, 0.01))
     odometry.fold(Feedback(at, moving, 0.0, gap=0.25))
     odometry.fold(Feedback(at, moving, 0.04, bridged=0.03))
-    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "bridged_ms": 30}
+    assert odometry.missed() == {"gaps": 1, "gap_ms": 250, "gaps_filled_ms": 30}
 
 
 # whole counts of a single line
@@ -731,9 +730,9 @@ def test_rounding_made_good_to_one_wheel_is_no_lie_and_no_slip() -> None:
     steady, owing = (0.1,) * 4, (2.0, 0.1, 0.1, 0.1)
     for i in range(100):
         line = Feedback(AT, speeds, 0.01, counted=owing if i == 50 else steady)
-        robot.fold(line, None, speeds)
-        assert robot.doubt.text == ""
-        assert robot.events == []
+        robot.fold(line, speeds)
+        assert robot.checks.wheels.status.text == ""
+        assert robot.checks.events == []
 
 
 # a track that was learned
@@ -773,13 +772,13 @@ def test_what_is_taken_back_was_turned_by_the_track_of_its_time() -> None:
     told = Kinematics(DriveConfig()).wheel_speeds(Twist(0.5, 0.8))
     dead = WheelSpeeds(told.front_right, 0.0, told.rear_left, told.rear_right)
     for n in range(60):
-        honest.fold(Feedback(AT, told, 0.01), told=told)
-        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), told=told)
+        honest.fold(Feedback(AT, told, 0.01), commanded=told)
+        liar.fold(Feedback(AT, told if n < 50 else dead, 0.01), commanded=told)
         if n == 51:
-            assert not liar.doubt.left_out
+            assert not liar.checks.wheels.status.left_out
             for robot in (liar, honest):
                 robot.turn_by(Track(1.6, 0.02))
-    assert liar.doubt.left_out == ("front_left",)
+    assert liar.checks.wheels.status.left_out == ("front_left",)
     assert liar.pose.yaw == pytest.approx(honest.pose.yaw, abs=1e-4)
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from acsard.core.config.settings import FeedbackConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.motion.sanity import Sanity
-from acsard.core.values import STILL, WHEELS, Instant, WheelSpeeds
+from acsard.core.values import STILL, WHEELS, Event, Instant, WheelSpeeds
 
 DT = 0.01
 AT = Instant(0, 0)
@@ -561,3 +561,41 @@ def test_a_wheel_that_turns_back_while_it_should_slow_to_a_creep_is_reversed() -
     for step in range(12):
         fault = fault or sanity.watch(only(0, 0.03), only(0, -15.0 - step % 2 / 10), 0.05)
     assert "front_right wheel turns against its command" in fault
+
+
+WINDOW, MOST = 1000, 10
+"""Lines of a window, and the largest number of impossible ones in it without a warning."""
+
+
+def warned(sanity: Sanity, bad: int, lines: int = WINDOW) -> list[Event]:
+    """Return the warnings of a window whose first `bad` lines are impossible."""
+    warnings = []
+    for i in range(lines):
+        sanity.impossible(line(WheelSpeeds(*[200.0 if i < bad else 10.0] * 4)))
+        warnings.append(sanity.warning)
+    return [warning for warning in warnings if warning is not None]
+
+
+def test_one_impossible_line_in_a_hundred_causes_no_warning() -> None:
+    sanity = Sanity(FeedbackConfig())
+    assert [warned(sanity, MOST) for _ in range(5)] == [[]] * 5
+
+
+def test_more_impossible_lines_cause_one_warning_in_each_window() -> None:
+    sanity = Sanity(FeedbackConfig())
+    assert [len(warned(sanity, MOST + 1 + more)) for more in (0, 0, 500)] == [1, 1, 1]
+
+
+def test_the_warning_comes_with_the_first_line_too_many() -> None:
+    sanity = Sanity(FeedbackConfig())
+    assert sanity.warning is None
+    assert warned(sanity, MOST, MOST) == []
+    assert len(warned(sanity, 1, 1)) == 1
+
+
+def test_the_warning_says_what_was_dropped_and_what_to_do() -> None:
+    (event,) = warned(Sanity(FeedbackConfig()), WINDOW)
+    assert (event.name, event.level) == ("lines_implausible", "warning")
+    assert event.text.startswith(f"{MOST + 1} of {MOST + 1} lines were dropped")
+    assert "front_right 200.00 rad/s is over feedback.wheel_speed" in event.text
+    assert "mcu.link_check" in event.text

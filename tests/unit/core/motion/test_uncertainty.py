@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import DriveConfig, McuConfig, OdometryConfig
 from acsard.core.link.feedback import Feedback
 from acsard.core.link.session import McuSession
+from acsard.core.motion.error_model import ErrorModel
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.learned_track import CONFIGURED, Track
 from acsard.core.motion.odometry import Odometry
@@ -198,23 +199,20 @@ def test_a_straight_that_encoders_count_is_no_turn(counts: int) -> None:
 
 def uncertainty(model: Model = DEFAULT, **changes: float) -> PoseUncertainty:
     config = replace(model.config(), **changes)
-    return PoseUncertainty(config, Kinematics(DriveConfig()), 0)
+    return PoseUncertainty(ErrorModel(config, Kinematics(DriveConfig())), 0)
 
 
 def test_what_is_known_by_calibration_makes_the_pose_less_certain_by_its_deviation() -> None:
     # After 10 m straight with the right wheels' radius off by 0.2 %, 0.01 m of length and 20 mm /
     # 0.3 m of yaw are wrong.
-    one = PoseUncertainty(
-        OdometryConfig(
-            distance_variance_per_metre=0.0,
-            yaw_variance_per_metre=0.0,
-            yaw_variance_per_radian=0.0,
-            right_wheel_radius_multiplier_std=0.002,
-            pose_covariance_diagonal=(0.0,) * 6,
-        ),
-        Kinematics(DriveConfig()),
-        0,
+    odometry = OdometryConfig(
+        distance_variance_per_metre=0.0,
+        yaw_variance_per_metre=0.0,
+        yaw_variance_per_radian=0.0,
+        right_wheel_radius_multiplier_std=0.002,
+        pose_covariance_diagonal=(0.0,) * 6,
     )
+    one = PoseUncertainty(ErrorModel(odometry, Kinematics(DriveConfig())), 0)
     for _ in range(1000):
         one.advance(0.01, 0.0, 0.01, 0.0, 0.0)
     p = one.covariance
@@ -270,7 +268,7 @@ def test_trembling_within_a_count_is_no_turning() -> None:
 @pytest.mark.parametrize("counts", [16, 96, 400, 4000])
 def test_counts_that_the_lines_show_are_as_uncertain_as_configured_ones(counts: int) -> None:
     config, kinematics = OdometryConfig(), Kinematics(DriveConfig())
-    told, shown = (PoseUncertainty(config, kinematics, known) for known in (counts, 0))
+    told, shown = (PoseUncertainty(ErrorModel(config, kinematics), known) for known in (counts, 0))
     shown.show_count(math.tau / counts)
     for one in (told, shown):
         for _ in range(100):
@@ -283,7 +281,8 @@ def test_counts_that_the_lines_show_are_as_uncertain_as_configured_ones(counts: 
 
 def test_what_is_configured_counts_before_what_the_lines_show() -> None:
     told, plain_one = (
-        PoseUncertainty(OdometryConfig(), Kinematics(DriveConfig()), 400) for _ in range(2)
+        PoseUncertainty(ErrorModel(OdometryConfig(), Kinematics(DriveConfig())), 400)
+        for _ in range(2)
     )
     told.show_count(math.tau / 16)
     for one in (told, plain_one):
@@ -308,7 +307,7 @@ def test_of_a_firmware_that_reports_whole_counts_the_pose_is_as_uncertain_as_the
     before, after = variances[:-1], variances[1:]
     count = RADIUS * math.tau / counts
     leap = max(b - a for a, b in zip(before, after, strict=True))
-    assert session.snapping.counts == (counts,) * 4
+    assert session.count_recovery.counts == (counts,) * 4
     assert leap >= 2 * count**2 / 24 * 2 / TRACK**2, "of where it started, and of where it is"
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.ros.attachments import Attachment, unpack
+from tests.each import each
 
 GID = bytes.fromhex("ac170f31eadcd9ff0cd86d7a17907d1c")
 CAPTURED = bytes.fromhex("010000000000000015cd853dfe9c971710" + GID.hex())
@@ -49,12 +50,12 @@ def test_none_at_all_has_a_reason_of_its_own() -> None:
     assert reason(b"") == "no_attachment"
 
 
-@pytest.mark.parametrize("length", [1, 16, 20, 32, 34, 64])
+@each("length", [1, 16, 20, 32, 34, 64])
 def test_another_length_is_refused(length: int) -> None:
     assert reason((CAPTURED * 2)[:length]) == "bad_attachment"
 
 
-@pytest.mark.parametrize("length", [0, 15, 17, 255])
+@each("length", [0, 15, 17, 255])
 def test_another_length_of_the_gid_is_refused(length: int) -> None:
     assert reason(CAPTURED[:16] + bytes([length]) + CAPTURED[17:]) == "bad_attachment"
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import pytest
 from msgspec import Struct, inspect
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -32,6 +31,7 @@ from acsard.core.ros.names import TYPE_HASHES
 from acsard.core.ros.shapes import log
 from acsard.core.ros.transports import PUBLISHED
 from acsard.core.values import Event
+from tests.each import each
 from tests.unit.core.ros.test_names import rihs01
 from tests.unit.core.ros.test_shapes import STATE as ROBOT_STATE
 
@@ -69,7 +69,7 @@ def same(ours: Any, theirs: Any) -> bool:
     return bool(ours == theirs) or (isinstance(ours, float) and math.isnan(ours))
 
 
-@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.name)
+@each("channel", CHANNELS)
 def test_what_is_encoded_is_what_the_definition_says(channel: Channel) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(channel.schema, channel.schema_name))
@@ -106,12 +106,12 @@ def test_events_and_commands_have_a_channel_beside_the_keys() -> None:
 THEIRS = [name for name in DEFINITIONS if not name.startswith(OURS)]
 
 
-@pytest.mark.parametrize("name", DEFINITIONS)
+@each("name", DEFINITIONS)
 def test_the_text_alone_is_enough_for_another_program(name: str) -> None:
     assert {name, *nested(name)} == set(get_types_from_msg(schema_text(name), name))
 
 
-@pytest.mark.parametrize("name", THEIRS)
+@each("name", THEIRS)
 def test_another_program_makes_the_same_hash_of_the_text(name: str) -> None:
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(schema_text(name), name))

@@ -23,6 +23,7 @@ from acsard.core.ros.names import (
     rmw_key,
     rmw_qos,
 )
+from tests.each import each
 from tests.vectors import ros_types
 
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -32,7 +33,7 @@ TRIGGER = "std_srvs/srv/Trigger"
 # names
 
 
-@pytest.mark.parametrize(
+@each(
     ("namespace", "name", "full"),
     [
         ("", "odom", "/odom"),
@@ -45,7 +46,7 @@ def test_a_namespace_is_the_front_of_the_full_name(namespace: str, name: str, fu
     assert full_name(namespace, name) == full
 
 
-@pytest.mark.parametrize(
+@each(
     ("name", "key"),
     [
         ("/odom", "odom"),
@@ -71,7 +72,7 @@ def test_dds_has_its_own_way_to_write_a_type(type_name: str, dds: str) -> None:
     assert dds_type(type_name) == dds
 
 
-@pytest.mark.parametrize(
+@each(
     ("domain", "name", "type_name", "key"),
     [
         (0, "/odom", ODOMETRY,
@@ -195,7 +196,7 @@ def rihs01(name: str) -> str:
     return "RIHS01_" + hashlib.sha256(text.encode()).hexdigest()
 
 
-@pytest.mark.parametrize("type_name", TYPE_HASHES)
+@each("type_name", TYPE_HASHES)
 def test_a_hash_is_that_of_the_definition(type_name: str) -> None:
     assert rihs01(type_name) == TYPE_HASHES[type_name]
 
@@ -241,7 +242,7 @@ def test_the_gid_of_another_token_is_another() -> None:
     assert len(gid("")) == 16
 
 
-@pytest.mark.parametrize(
+@each(
     ("qos", "text"),
     [
         (Qos(10), "::,10:,:,:,,"),

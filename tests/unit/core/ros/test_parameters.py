@@ -24,6 +24,7 @@ from acsard.core.ros.parameters import (
     described,
 )
 from acsard.core.ros.transports import PARAMETER_SERVICES
+from tests.each import each
 
 TABLES: dict[str, object] = {
     "robot": {"id": "acsar"},
@@ -79,7 +80,7 @@ def test_every_key_is_listed_with_the_tables_it_is_in() -> None:
     ]
 
 
-@pytest.mark.parametrize(
+@each(
     ("prefixes", "depth", "expected"),
     [
         ([], 1, []),
@@ -138,13 +139,13 @@ WISHES: list[tuple[rcl.ParameterValue, object]] = [
 ]
 
 
-@pytest.mark.parametrize(("value", "expected"), WISHES)
+@each(("value", "expected"), WISHES)
 def test_a_wish_is_a_value_by_its_name(value: rcl.ParameterValue, expected: object) -> None:
     asked = rcl.SetRequest([rcl.Parameter("limits.linear_speed", value)])
     assert rcl.wished(Cdr(rcl.SetRequest).encode(asked)) == {"limits.linear_speed": expected}
 
 
-@pytest.mark.parametrize("kind", [rcl.NOT_SET, 5, 6, 10])
+@each("kind", [rcl.NOT_SET, 5, 6, 10])
 def test_a_parameter_cannot_be_unset_nor_made_of_bytes(kind: int) -> None:
     asked = rcl.SetRequest([rcl.Parameter("log.level", rcl.ParameterValue(kind))])
     with pytest.raises(CdrError, match=r"log\.level"):
@@ -161,7 +162,7 @@ def test_the_reply_has_a_result_for_each_or_one_for_all() -> None:
     assert Cdr(rcl.SetAtomicallyReply).decode(one) == rcl.SetAtomicallyReply(result)
 
 
-@pytest.mark.parametrize("service", PARAMETER_SERVICES)
+@each("service", PARAMETER_SERVICES)
 def test_a_request_cut_anywhere_is_refused(service: str) -> None:
     wish = rcl.Parameter("robot.id", rcl.ParameterValue(rcl.STRING, string_value="other"))
     request: Any = {
@@ -232,7 +233,7 @@ def test_a_choice_names_what_there_is() -> None:
     )
 
 
-@pytest.mark.parametrize("key", KEYS)
+@each("key", KEYS)
 def test_every_key_has_words_and_is_read_only_unless_it_can_be_set(key: str) -> None:
     found = described(key, DOUBLE)
     assert found.description

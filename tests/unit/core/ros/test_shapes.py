@@ -7,7 +7,7 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from acsard.core.messages.schema import Happening, RobotState, SourceState, Time
+from acsard.core.messages.schema import LogEvent, RobotState, SourceState, Time
 from acsard.core.ros.shapes import Counter, Log, Source, log, state
 from acsard.core.values import Event
 
@@ -44,7 +44,7 @@ def test_what_begins_with_its_numbers_is_not_counted_twice(text: str) -> None:
 
 
 def test_what_the_topic_says_of_an_event_is_the_same_line() -> None:
-    seen = Happening(Time(1), "fault", "error", "dead motor", "", 1)
+    seen = LogEvent(Time(1), "fault", "error", "dead motor", "", 1)
     assert log(seen, seen.stamp) == log(Event("fault", "dead motor", "error"), Time(1))
 
 
@@ -72,4 +72,4 @@ def test_state_is_the_same_field_by_field() -> None:
     assert all(getattr(told, name) == getattr(STATE, name) for name in plain)
     left_out = set(STATE.__struct_fields__) - set(told.__struct_fields__)
     # A ROS Trigger has no field for the number of a latch, and diagnostics report the latch file.
-    assert left_out == {"stamp", "figures", "encoders", "latch", "latch_file"}
+    assert left_out == {"stamp", "latencies", "encoder_counts", "latch", "latch_file_error"}

@@ -5,11 +5,10 @@ from __future__ import annotations
 from itertools import permutations
 from typing import get_args
 
-import pytest
-
 from acsard.core.config.settings import Baud, WheelMap
 from acsard.core.link.codec import Codec
 from acsard.core.simulator.baud_mismatch import garbled
+from tests.each import each
 
 LINE = Codec(WheelMap()).stop
 
@@ -19,7 +18,7 @@ def test_at_the_right_rate_nothing_happens() -> None:
     assert garbled(b"", 9600, 115200) == b""
 
 
-@pytest.mark.parametrize(("sent", "heard"), list(permutations(get_args(Baud), 2)))
+@each(("sent", "heard"), list(permutations(get_args(Baud), 2)))
 def test_at_a_wrong_rate_no_line_survives(sent: int, heard: int) -> None:
     got = garbled(LINE * 5, sent, heard)
     assert LINE[:-2] not in got

@@ -82,7 +82,7 @@ def test_it_answers_a_line_with_the_speeds_in_the_same_shape() -> None:
     assert [data for _, data in drive(mcu, 10 * MS, 5)] == [LINE] * 5
 
 
-@pytest.mark.parametrize(
+@each(
     ("sent", "answered"),
     [
         (b"ap00.00,bp00.00,cp00.00,dp00.00\r\n", ZERO),
@@ -241,7 +241,7 @@ def test_line_end_and_trailing_comma_are_free(line: bytes) -> None:
     assert mcu.valid_lines == 1
 
 
-@pytest.mark.parametrize("cut", range(1, 33))
+@each("cut", range(1, 33))
 def test_a_line_in_two_pieces_is_one_line(cut: int) -> None:
     mcu = FakeMcu(TRUE)
     mcu.receive(0, LINE[:cut])
@@ -334,7 +334,7 @@ def test_without_watchdog_the_motors_run_on() -> None:
 def test_a_watchdog_that_anything_feeds_runs_on_with_broken_lines_and_not_in_silence() -> None:
     for fed in (False, True):
         mcu = FakeMcu(TRUE)
-        with mcu.fed_by_anything() if fed else nullcontext():
+        with mcu.watchdog_fed_by_bad_lines() if fed else nullcontext():
             mcu.receive(0, LINE)
             for n in range(1, 10):
                 mcu.receive(n * 100 * MS, LINE[:12] + b"\r\n")
@@ -422,14 +422,14 @@ def story(mcu: FakeMcu, start_ns: int) -> tuple[Heard, list[float], list[float]]
     return at, list(mcu.vehicle.angles), list(mcu.vehicle.set_points)
 
 
-@pytest.mark.parametrize("fault", NAMED.values(), ids=NAMED)
+@each("fault", NAMED.values())
 def test_a_fault_makes_a_difference(fault: Fault) -> None:
     faulty = FakeMcu(TRUE)
     with fault(faulty):
         assert story(faulty, 0) != story(FakeMcu(TRUE), 0)
 
 
-@pytest.mark.parametrize("fault", NAMED.values(), ids=NAMED)
+@each("fault", NAMED.values())
 def test_after_its_block_a_fault_is_gone(fault: Fault) -> None:
     mended = FakeMcu(TRUE)
     with fault(mended):
@@ -441,7 +441,7 @@ def test_after_its_block_a_fault_is_gone(fault: Fault) -> None:
     assert story(mended, 250 * MS) == story(sound, 250 * MS)
 
 
-@pytest.mark.parametrize("fault", NAMED.values(), ids=NAMED)
+@each("fault", NAMED.values())
 def test_a_fault_is_gone_also_when_its_block_ends_with_an_error(fault: Fault) -> None:
     mended = FakeMcu(TRUE)
     with pytest.raises(KeyError), fault(mended):
@@ -503,9 +503,7 @@ def test_a_trailing_comma_ends_the_answer() -> None:
         assert drive(mcu, 0, 5)[-1][1] == LINE[:-2] + b",\r\n"
 
 
-@pytest.mark.parametrize(
-    ("motor", "token"), [(0, b"ap18.75"), (1, b"bn13.12"), (2, b"cp22.50"), (3, b"dn15.38")]
-)
+@each(("motor", "token"), [(0, b"ap18.75"), (1, b"bn13.12"), (2, b"cp22.50"), (3, b"dn15.38")])
 def test_a_bias_is_on_one_motors_report_and_on_nothing_real(motor: int, token: bytes) -> None:
     mcu, sound = FakeMcu(TRUE), FakeMcu(TRUE)
     with mcu.bias(motor, 1.5):
@@ -526,7 +524,7 @@ def test_two_biases_hold_at_once() -> None:
     assert drive(mcu, 50 * MS, 1)[-1][1] == LINE
 
 
-@pytest.mark.parametrize("motor", range(4))
+@each("motor", range(4))
 def test_a_stuck_encoder_reports_zero_while_its_wheel_turns(motor: int) -> None:
     mcu = FakeMcu(TRUE)
     with mcu.stuck_encoder(motor):
@@ -546,7 +544,7 @@ def test_a_stuck_encoder_slows_nothing_down() -> None:
     assert stuck.vehicle.angles == sound.vehicle.angles
 
 
-@pytest.mark.parametrize("motor", range(4))
+@each("motor", range(4))
 def test_a_frozen_encoder_says_the_speed_it_had_whatever_its_wheel_does(motor: int) -> None:
     mcu = FakeMcu(TRUE)
     before = drive(mcu, 0, 5)[-1][1][:-2].split(b",")
@@ -580,7 +578,7 @@ def test_a_comma_latched_mcu_takes_the_wheels_of_a_damaged_line_one_by_one() -> 
 
 def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         found = drive(mcu, 0, 40, b"ap02.50,bn08.75,cp15.00,dp00.00\r\n")
     expected = b"ap2.50,bn8.75,cp15.00,dp0.00,\r\n"
     assert len(found) == 3
@@ -592,7 +590,7 @@ def test_an_unprompted_mcu_reports_by_its_own_clock_unpadded_and_with_a_comma() 
 
 def test_an_unprompted_mcu_reports_also_when_nothing_is_said_to_it() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.05):
+    with mcu.free_running(0.05):
         found = replies(mcu, 1000 * MS)
     assert len(found) == 19
 
@@ -617,7 +615,7 @@ def test_after_the_block_without_watchdog_a_silent_host_is_noticed_again() -> No
 
 def test_an_unprompted_mcu_reports_again_after_its_reset() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         mcu.reset(0)
         mcu.advance(RESET_NS)
         assert b"ap0.00" in mcu.advance(RESET_NS + 1000 * MS)
@@ -625,16 +623,16 @@ def test_an_unprompted_mcu_reports_again_after_its_reset() -> None:
 
 def test_entering_unprompted_twice_does_not_double_its_rate() -> None:
     mcu = FakeMcu(TRUE)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         mcu.advance(50 * MS)
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         out = mcu.advance(1050 * MS)
     assert out.count(b"\n") <= 10
 
 
 def test_an_unprompted_mcu_says_nothing_while_it_boots() -> None:
     mcu = FakeMcu(replace(TRUE, sim=SimConfig(boot_time=1.0)))
-    with mcu.unprompted(0.1):
+    with mcu.free_running(0.1):
         assert mcu.advance(900 * MS) == b""
 
 

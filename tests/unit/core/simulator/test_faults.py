@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import inspect
 
-import pytest
-
 from acsard.core.config.named_faults import ARGUMENTS, FAULTS, named
 from acsard.core.config.settings import Config, SimConfig
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.faults import Faults
+from tests.each import each
 
 
 def switches(faults: Faults) -> dict[str, object]:
@@ -31,7 +30,7 @@ def test_every_fault_that_needs_no_argument_is_offered_by_its_name() -> None:
     assert sorted(FAULTS) == sorted(free)
 
 
-@pytest.mark.parametrize("name", [name for name in FAULTS if name != "unprompted"])
+@each("name", [name for name in FAULTS if name != "free_running"])
 def test_a_fault_turns_its_switch_and_turns_it_back(name: str) -> None:
     faults = Faults()
     before = switches(faults)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import binascii
 
-import pytest
-
 from acsard.core.simulator import protocol
 from acsard.core.simulator.protocol import Command, latched, plain_only, prefix, whole
+from tests.each import each
 
 PLAIN = b"ap12.50,bn08.75,cp15.00,dn10.25"
 VALUES = {0: 12.5, 1: -8.75, 2: 15.0, 3: -10.25}
@@ -19,14 +18,14 @@ def closed(body: bytes) -> bytes:
     return b"%b*%04X\r\n" % (body, binascii.crc_hqx(body, 0))
 
 
-@pytest.mark.parametrize("end", [END, b"\n", b",\r\n", b",\n"])
+@each("end", [END, b"\n", b",\r\n", b",\n"])
 def test_a_plain_line_is_a_command_to_all_of_them(end: bytes) -> None:
     assert whole(PLAIN + end) == plain_only(PLAIN + end) == Command(VALUES)
     assert prefix(PLAIN + end) == Command(VALUES)
     assert latched(PLAIN + b",").values == VALUES
 
 
-@pytest.mark.parametrize(
+@each(
     ("suffix", "sequence", "sample"),
     [
         (b"#07", b"07", False),
@@ -41,7 +40,7 @@ def test_a_checked_line_has_a_sequence_and_requests(
     assert whole(closed(PLAIN + suffix)) == Command(VALUES, sequence, sample)
 
 
-@pytest.mark.parametrize(
+@each(
     "line",
     [
         PLAIN + b"#07" + END,
@@ -72,7 +71,7 @@ def test_the_old_firmwares_run_a_checked_line_as_the_plain_one() -> None:
     assert plain_only(closed(PLAIN + b"#07")) is None
 
 
-@pytest.mark.parametrize("line", [b"", b"\r\n", b"?", PLAIN[:30], PLAIN[1:], b"\xff" * 50])
+@each("line", [b"", b"\r\n", b"?", PLAIN[:30], PLAIN[1:], b"\xff" * 50])
 def test_what_is_no_line_is_none(line: bytes) -> None:
     assert whole(line) is plain_only(line) is prefix(line) is None
 

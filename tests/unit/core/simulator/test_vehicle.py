@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from acsard.core.config.settings import DriveConfig, SimConfig
 from acsard.core.simulator.vehicle import Vehicle
+from tests.each import each
 
 LAG = 0.1
 RADIUS, TRACK = 0.05, 0.30
@@ -39,7 +40,7 @@ def test_it_stands_still_until_it_is_asked_to_move() -> None:
     assert (made.pose.x, made.pose.y, made.pose.yaw) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("seconds", [0.001, 0.05, 0.1, 0.5, 3.0])
+@each("seconds", [0.001, 0.05, 0.1, 0.5, 3.0])
 def test_a_motor_approaches_its_set_point_exponentially(seconds: float) -> None:
     made = moved(seconds, 10.0, -5.0, 0.0, 2.0, lag=LAG)
     share = 1 - math.exp(-seconds / LAG)
@@ -211,8 +212,8 @@ def test_each_sides_true_radius_counts() -> None:
     assert made.angles == [20.0] * 4
 
 
-@pytest.mark.parametrize("direction", [1.0, -1.0])
-@pytest.mark.parametrize("dependence", [0.08, -0.3])
+@each("direction", [1.0, -1.0])
+@each("dependence", [0.08, -0.3])
 def test_the_track_grows_by_its_share_at_1_rad_per_s_either_way(
     direction: float, dependence: float
 ) -> None:

@@ -31,7 +31,7 @@ def test_a_wrong_rate_garbles() -> None:
     wire.send(LINE)
     assert wire.listen(50_000_000) == []
     assert mcu.valid_lines == 0
-    with mcu.other_baud(57600):
+    with mcu.wrong_baud(57600):
         wire.send(b"\r\n" + LINE)
         assert wire.listen(100_000_000)[0][1] == LINE
 

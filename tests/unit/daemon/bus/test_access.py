@@ -26,16 +26,12 @@ from acsard.core.config.settings import (
     RosConfig,
     Source,
 )
+from acsard.core.messages.permissions import SERVICE_ROLES, least_role
 from acsard.core.messages.topics import PUBLISHED, SERVICES, TOPICS, WHOAMI, full_key, whoami_key
 from acsard.core.ros.transports import PARAMETERS, claims, endpoints
 from acsard.core.values import Role
-from acsard.daemon.bus.access import (
-    GRANTS,
-    SERVICE_ROLES,
-    access_control,
-    door_access,
-    least_role,
-)
+from acsard.daemon.bus.access import GRANTS, access_control, gateway_access
+from tests.each import each
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "maintainer")
 EVERYBODY = ("local", *ROLES)
@@ -80,7 +76,7 @@ class Access:
         return {who for who in EVERYBODY if self.lets(who, message, key)}
 
 
-DEFAULT, DOOR = Access(), Access(door_access)
+DEFAULT, GATEWAY = Access(), Access(gateway_access)
 REAL, GYRO = McuConfig(port="/dev/ttyACM0"), OdometryConfig(gyro=True)
 SENSING = Access(mcu=REAL, odometry=GYRO)
 TRUSTING = Access(access=AccessConfig(wildcards=True))
@@ -140,7 +136,7 @@ def test_every_policy_names_rules_and_subjects_that_exist() -> None:
 TOLD = [key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")]
 
 
-@pytest.mark.parametrize("told", TOLD)
+@each("told", TOLD)
 def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) -> None:
     key = DEFAULT.key(told)
     assert DEFAULT.who("declare_subscriber", key) == FROM["viewer"]
@@ -150,7 +146,7 @@ def test_everybody_admitted_may_follow_and_ask_for_what_is_published(told: str) 
         assert DEFAULT.lets(who, "reply", key, "egress")
 
 
-@pytest.mark.parametrize("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
+@each("below", ["*", "**", "cmd_v$*", "json/*", "json/**"])
 def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: str) -> None:
     assert DEFAULT.who("declare_subscriber", DEFAULT.key(below)) == {"local"}
     assert TRUSTING.who("declare_subscriber", TRUSTING.key(below)) == FROM["viewer"]
@@ -158,7 +154,7 @@ def test_wildcards_are_for_who_is_at_the_machine_unless_all_are_trusted(below: s
 
 @pytest.mark.parametrize("role", ROLES)
 def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
-    heard = [rule for rule in DOOR.rules_of(role) if "ingress" in rule["flows"]]
+    heard = [rule for rule in GATEWAY.rules_of(role) if "ingress" in rule["flows"]]
     named = [key for rule in heard for key in rule["key_exprs"]]
     assert named
     assert not [key for key in named if "*" in key]
@@ -166,13 +162,13 @@ def test_what_comes_by_tls_names_exact_keys_only(role: Role) -> None:
 
 def test_by_tls_each_certificate_commands_on_its_own_keys_and_no_other() -> None:
     people = AccessConfig(viewers=("wall",), operators=("anna", "ben"), maintainers=("chief",))
-    door = Access(door_access, access=people)
+    gateway = Access(gateway_access, access=people)
     for kind in ("cmd", "wheel_cmd"):
         for who in ("wall", "anna", "ben", "chief", "viewer", "operator", "maintainer"):
             for name in ("anna", "ben", "chief", "wall", "*", "ann$*"):
                 own = who == name and who != "wall"
-                assert door.lets(who, "put", door.key(f"{kind}/app/{name}")) == own
-            assert not door.lets(who, "put", door.key(f"{kind}/app"))
+                assert gateway.lets(who, "put", gateway.key(f"{kind}/app/{name}")) == own
+            assert not gateway.lets(who, "put", gateway.key(f"{kind}/app"))
 
 
 def test_a_router_hands_on_the_commands_of_any_certificate_and_has_none_without() -> None:
@@ -204,9 +200,7 @@ LEAST: dict[str, Role] = {
 }
 
 
-@pytest.mark.parametrize(
-    "topic", [t for t in TOPICS if t.direction != "out"], ids=lambda topic: topic.key
-)
+@each("topic", [t for t in TOPICS if t.direction != "out"])
 def test_every_other_key_of_the_table_is_for_the_role_that_owns_it_and_up(topic: Any) -> None:
     access = SENSING if topic.gyro else DEFAULT
     key = access.key(written(topic.key))
@@ -322,8 +316,8 @@ def test_not_even_a_maintainer_asks_beyond_the_robots_own_keys() -> None:
         assert DEFAULT.who("query", key) == TRUSTING.who("query", key) == set()
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize(
+@each("role", ROLES)
+@each(
     "key", ["acsard/other/stop", "acsard/other/cmd/app", "acsard/acsard/stop", "other/cmd_vel", "x"]
 )
 def test_nothing_outside_the_robots_own_keys_is_granted(role: Role, key: str) -> None:
@@ -353,7 +347,7 @@ def test_two_robots_give_each_others_people_nothing(one: str, other: str) -> Non
 @given(st.lists(IDS, min_size=1, max_size=5, unique=True))
 def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
     sources = tuple(Source(name, priority=1, timeout=0.25) for name in names)
-    access = Access(door_access, commands=CommandsConfig(sources=sources), ros=RosConfig())
+    access = Access(gateway_access, commands=CommandsConfig(sources=sources), ros=RosConfig())
     for kind in ("cmd", "wheel_cmd"):
         for name in names:
             assert access.lets("operator", "put", access.key(f"{kind}/{name}/operator"))
@@ -367,15 +361,15 @@ def test_commands_count_from_the_listed_sources_alone(names: list[str]) -> None:
 
 
 def test_without_sources_nobody_commands_by_certificate_but_everybody_stops() -> None:
-    for rules in (access_control, door_access):
+    for rules in (access_control, gateway_access):
         access = Access(rules, commands=CommandsConfig(sources=()))
         assert not access.lets("maintainer", "put", access.key("cmd/app/maintainer"))
         assert access.lets("viewer", "put", access.key("stop"))
         zenoh.Config().insert_json5("access_control", json.dumps(access.value))
 
 
-@pytest.mark.parametrize("namespace", ["", "robot1"])
-@pytest.mark.parametrize("transport", ["bridge", "rmw"])
+@each("namespace", ["", "robot1"])
+@each("transport", ["bridge", "rmw"])
 def test_every_ros_name_is_for_the_role_that_owns_it_and_up(transport: str, namespace: str) -> None:
     other = "rmw" if transport == "bridge" else "bridge"
     ros = RosConfig(**{other: False}, namespace=namespace)  # type: ignore[arg-type]
@@ -427,7 +421,7 @@ def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
     assert not any(role in policy["subjects"] for policy in access.value["policies"])
 
 
-@pytest.mark.parametrize(
+@each(
     "tables",
     [
         {},
@@ -436,9 +430,8 @@ def test_an_empty_list_of_certificates_gives_no_subject(role: Role) -> None:
         {"access": AccessConfig(viewers=(), operators=(), maintainers=())},
         {"robot": RobotConfig(id="x" * 32)},
     ],
-    ids=["defaults", "no ROS", "ROS elsewhere", "no certificates", "long id"],
 )
-@pytest.mark.parametrize("rules", [access_control, door_access])
+@each("rules", [access_control, gateway_access])
 def test_zenoh_accepts_the_rules(
     tables: dict[str, Any], rules: Callable[[Config], dict[str, object]]
 ) -> None:
@@ -451,22 +444,22 @@ def test_zenoh_accepts_the_rules(
         assert len(set(rule["key_exprs"])) == len(rule["key_exprs"])
 
 
-def test_at_the_door_each_role_may_what_it_may_and_the_daemon_all() -> None:
-    door = DOOR
+def test_at_the_gateway_each_role_may_what_it_may_and_the_daemon_all() -> None:
+    gateway = GATEWAY
     for role in ROLES:
         there, here = (
             [rule for rule in access.rules_of(role) if "/cmd/" not in rule["key_exprs"][0]]
-            for access in (door, DEFAULT)
+            for access in (gateway, DEFAULT)
         )
         assert there == here
     for flow in ("ingress", "egress"):
         for message in ("put", "delete", "query", "reply", "declare_subscriber"):
             for key in ("acsard/acsar/odom", "acsard/acsar/tf_static/@adv/x", "@ros2_lv/0/x", "**"):
-                assert door.lets("local", message, key, flow)
+                assert gateway.lets("local", message, key, flow)
 
 
-@pytest.mark.parametrize("page", ["web", "systemd", "zenoh"])
-@pytest.mark.parametrize("role", ROLES)
+@each("page", ["web", "systemd", "zenoh"])
+@each("role", ROLES)
 def test_each_page_names_the_services_of_a_role(page: str, role: Role) -> None:
     text = (Path(__file__).parents[4] / "deploy" / page / "README.md").read_text()
     (row,) = re.findall(rf"^\| {role} \| .*$", text, re.M)

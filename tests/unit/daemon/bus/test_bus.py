@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import pytest
-
 from acsard.daemon.bus.bus import unreached
+from tests.each import each
 
 A, B = "tcp/127.0.0.1:7447", "tcp/127.0.0.1:7450"
 
 
-@pytest.mark.parametrize(
+@each(
     ("mode", "endpoints", "ends", "missing"),
     [
         ("peer", (A,), {A}, ()),

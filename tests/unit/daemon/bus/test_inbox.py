@@ -1,37 +1,96 @@
-"""A step takes a bounded part of the inbox while another thread keeps adding to it."""
+"""A step takes a bounded part of the inbox, and the replies go out in their order."""
 
 from __future__ import annotations
 
 import threading
-from collections import deque
 from types import SimpleNamespace
 from typing import Any
 
 import zenoh
 
 from acsard.core.incoming.queries import Reply
-from acsard.daemon.bus.inbox import ARRIVALS, TICKETS, Replies, most_of, taken_of
+from acsard.core.messages.topics import IMU
+from acsard.daemon.bus.inbox import ARRIVALS, TICKETS, Inbox, Replies
 
 
-class Flooded(deque[int]):
-    """A queue that gains one item for each item that is taken out."""
+class Loop:
+    """A stand-in for the control loop that records what woke it."""
 
-    def popleft(self) -> int:
-        first = super().popleft()
-        self.append(first + 1)
-        return first
+    def __init__(self) -> None:
+        self.woken: list[str] = []
+
+    def command(self) -> None:
+        self.woken.append("command")
+
+    def stop(self) -> None:
+        self.woken.append("stop")
 
 
-def test_a_flood_that_goes_on_gives_a_step_no_more_than_is_held_of_it() -> None:
-    held = Flooded(range(5), maxlen=ARRIVALS)
-    assert len(taken_of(held, most_of(held))) == ARRIVALS
+def arrived(inbox: Inbox, *keys: str) -> None:
+    """Let a sample arrive on each of these keys, as a thread of Zenoh does."""
+    for key in keys:
+        sample: Any = SimpleNamespace(
+            key_expr=f"acsard/r7/{key}",
+            payload=None,
+            encoding="",
+            kind=zenoh.SampleKind.PUT,
+            timestamp=None,
+            attachment=None,
+        )
+        inbox.on_sample(sample)
 
 
-def test_what_is_taken_is_the_oldest_and_the_rest_stays() -> None:
-    held = deque([1, 2, 3])
-    assert taken_of(held, 2) == [1, 2]
-    assert list(held) == [3]
-    assert most_of(held) == 1
+def an_inbox() -> tuple[Inbox, Loop]:
+    loop = Loop()
+    return Inbox("acsard/r7/", Replies("acsard/r7/"), ("app", "nav"), loop), loop
+
+
+def keys_of(inbox: Inbox) -> list[str]:
+    return [arrival.key for arrival in inbox.take(8).arrivals]
+
+
+def test_a_step_gets_the_stops_first_and_the_rest_in_the_order_of_arrival() -> None:
+    inbox, _ = an_inbox()
+    arrived(inbox, "cmd/nav", IMU, "cmd/app", "stop", "cmd/nav")
+    assert keys_of(inbox) == ["stop", "cmd/nav", IMU, "cmd/app", "cmd/nav"]
+    assert keys_of(inbox) == []
+
+
+def test_commands_and_stops_wake_the_loop_and_a_gyro_sample_does_not() -> None:
+    inbox, loop = an_inbox()
+    arrived(inbox, IMU)
+    assert loop.woken == []
+    assert keys_of(inbox) == [IMU]
+    arrived(inbox, "cmd/app", "stop", "cmd/unlisted")
+    assert loop.woken == ["command", "stop", "command"]
+
+
+def test_the_loop_finds_what_it_was_woken_for() -> None:
+    found: list[list[str]] = []
+    inbox, loop = an_inbox()
+    loop.command = lambda: found.append(keys_of(inbox))  # type: ignore[method-assign]
+    loop.stop = loop.command  # type: ignore[method-assign]
+    arrived(inbox, "cmd/app", "stop")
+    assert found == [["cmd/app"], ["stop"]]
+
+
+def test_a_flood_on_one_key_pushes_out_only_its_own_and_is_counted() -> None:
+    inbox, _ = an_inbox()
+    arrived(inbox, "cmd/nav", "stop", *["cmd/app"] * (ARRIVALS + 5))
+    taken = inbox.take(8)
+    assert [one.key for one in taken.arrivals] == ["stop", "cmd/nav", *["cmd/app"] * ARRIVALS]
+    assert taken.overrun == 5
+    arrived(inbox, "cmd/app")
+    assert inbox.take(8).overrun == 0
+
+
+def test_a_loop_that_takes_when_it_is_woken_finds_the_loss_counted() -> None:
+    inbox, loop = an_inbox()
+    arrived(inbox, *["cmd/app"] * ARRIVALS)
+    found: list[int] = []
+    loop.command = lambda: found.append(inbox.take(8).overrun)  # type: ignore[method-assign]
+    arrived(inbox, "cmd/app")
+    assert found == [1]
 
 
 class Asked:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 from acsard.core.messages.topics import PUBLISHED
 from acsard.daemon.bus.quiet import MOST, Around, why
+from tests.each import each
 
 HERE, PLAIN, TLS = Around(linked=True, here=True), "tcp/127.0.0.1:7448", "tls/router:7447"
 
@@ -35,7 +34,7 @@ def test_a_daemon_that_is_gone_is_told_before_all_else() -> None:
     assert f"{PLAIN} has no connection any more" in told
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "words"),
     [
         ("oddom", "did you mean odom?"),
@@ -55,6 +54,6 @@ def test_of_a_robot_that_is_there_the_key_is_told(key: str, words: str) -> None:
     assert words in told
 
 
-@pytest.mark.parametrize("key", [one.key for one in PUBLISHED])
+@each("key", [one.key for one in PUBLISHED])
 def test_each_published_key_has_a_reason(key: str) -> None:
     assert "no such key" not in why(key, "acsar", PLAIN, HERE)

@@ -6,9 +6,10 @@ import pytest
 
 from acsard.daemon.bus.robot_discovery import named, nobody, robot_of
 from acsard.host.errors import UsageError
+from tests.each import each
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "ids"),
     [
         ("robot1", ()),
@@ -21,13 +22,13 @@ def test_an_id_names_one_robot_several_or_all(text: str, ids: tuple[str, ...]) -
     assert named(text) == ids
 
 
-@pytest.mark.parametrize("text", ["a,", ",", "a,*", "a,b/c", "a,$*"])
+@each("text", ["a,", ",", "a,*", "a,b/c", "a,$*"])
 def test_what_names_nobody_is_refused_with_the_way_to_write_it(text: str) -> None:
     with pytest.raises(UsageError, match="comma"):
         named(text)
 
 
-@pytest.mark.parametrize(
+@each(
     ("key", "robot"),
     [
         ("acsard/robot1/state", "robot1"),

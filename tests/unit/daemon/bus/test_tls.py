@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives import serialization
 
+from acsard.certificates.authority import Authority
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.tls import common_name, ends_ns, require_usable, trouble
 from acsard.host.errors import CertificateError, NotPermittedError
-from acsard.lan.authority import Authority
 
 DAY_NS = 86400 * NS_PER_S
 
@@ -69,7 +69,7 @@ def test_files_that_cannot_be_used_are_a_bad_configuration(tmp_path: Path, how: 
     with pytest.raises(CertificateError) as caught:
         require_usable(str(tmp_path))
     assert str(tmp_path) in str(caught.value)
-    assert "acsard lan" in str(caught.value)
+    assert "acsard tls" in str(caught.value)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")

@@ -9,7 +9,6 @@ from acsard.daemon.gateway.watch import (
     ALONE_NS,
     FIRST_NS,
     STUCK_NS,
-    TOLD_EVERY_NS,
     UNANSWERED,
     Look,
     Watch,
@@ -24,24 +23,24 @@ def look(at_ns: int, *holders: str, linked: bool = True) -> Look:
     return Look(at_ns, holders, linked)
 
 
-def test_a_door_with_room_has_nothing_to_tell() -> None:
+def test_a_gateway_with_room_has_nothing_to_tell() -> None:
     watch = Watch(MOST, 0)
     assert watch.tell(look(S, "ann", "ben", "ben")) is None
     assert watch.reopen(look(S), S // 4) is None
-    assert watch.crowded == 0
+    assert watch.full == 0
 
 
-def test_a_door_without_room_tells_who_has_it_once_a_minute_and_counts_every_look() -> None:
+def test_a_gateway_without_room_tells_who_has_it_once_a_minute_and_counts_every_look() -> None:
     watch, told = Watch(MOST, 0), []
     for number in range(2 * 60 * 4 + 1):
         event = watch.tell(look(number * S // 4, "ben", "ann", "ben", ""))
         if event is not None:
             told.append((number * S // 4, event))
-    assert [at for at, _ in told] == [0, TOLD_EVERY_NS, 2 * TOLD_EVERY_NS]
+    assert [at for at, _ in told] == [0, 60 * S, 120 * S]
     _, event = told[0]
-    assert (event.name, event.level) == ("door_crowded", "warning")
+    assert (event.name, event.level) == ("gateway_full", "warning")
     assert event.text.startswith("all 4 connections are taken, 2 by ben, 1 by ann, 1 by an unnamed")
-    assert watch.crowded == 2 * 60 * 4 + 1
+    assert watch.full == 2 * 60 * 4 + 1
 
 
 def test_only_those_who_have_most_are_named() -> None:
@@ -57,7 +56,7 @@ def test_a_look_that_takes_too_long_ends_it() -> None:
     assert [watch.reopen(stuck, MOMENT) for _ in range(STUCK_NS // MOMENT + 1)][-1] is None
     over = watch.reopen(stuck, MOMENT)
     assert over is not None
-    assert (over.name, over.level) == ("door_stuck", "error")
+    assert (over.name, over.level) == ("gateway_stuck", "error")
 
 
 def test_a_machine_that_stands_still_as_a_whole_is_nobody_s_fault() -> None:
@@ -73,7 +72,7 @@ def test_a_daemon_that_is_connected_and_answers_nothing_is_none() -> None:
         assert watch.reopen(Look(S, linked=True, unanswered=number), 0) is None
     over = watch.reopen(Look(S, linked=True, unanswered=UNANSWERED), 0)
     assert over is not None
-    assert (over.name, over.level) == ("door_alone", "warning")
+    assert (over.name, over.level) == ("gateway_lost_daemon", "warning")
     assert "4 queries unanswered" in over.text
 
 
@@ -83,7 +82,7 @@ def test_without_the_daemon_it_closes() -> None:
     assert watch.reopen(look(S + ALONE_NS, linked=False), MOMENT) is None, "it may come back"
     over = watch.reopen(look(S + ALONE_NS + 1, linked=False), MOMENT)
     assert over is not None
-    assert over.name == "door_alone"
+    assert over.name == "gateway_lost_daemon"
 
 
 def test_while_others_come_in_too_the_daemon_has_more_time() -> None:

@@ -19,6 +19,7 @@ from acsard.cli.exits import code_of
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, require, unsent
 from acsard.host import clock
 from acsard.host.errors import Exit, InUseError, NoPortError
+from tests.each import each
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def path() -> Iterator[str]:
         os.close(end)
 
 
-@pytest.mark.parametrize(
+@each(
     ("number", "code", "words"),
     [
         (errno.ENOENT, Exit.NO_PORT, "does not exist"),

@@ -1,0 +1,1 @@
+"""`acsard accuracy` shows the error budget of a running robot's odometry, cause by cause."""

@@ -1,0 +1,306 @@
+"""The error budget of a drive: how much each cause contributes to the present odometry error.
+
+Each cause is propagated alone through the odometry's own error model
+(`core/motion/uncertainty.py`). The recorded drive is repeated until 100 m are driven, which gives
+the position error, and until 360 deg are turned to one side, which gives the heading error. The
+size of a cause in each step is measured if the feedback lines show it. This holds for time,
+quantisation, gaps, wheels that contradict each other, and the gyro noise that odometry assumes. All
+other sizes come from the declarations in `[odometry]`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import cycle
+from typing import Literal
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+
+from acsard.calibration.error_budget.drive_log import Line, motion
+from acsard.calibration.error_budget.step_errors import Driving, Steps, rounding
+from acsard.core.config.settings import Config, OdometryConfig
+from acsard.core.motion.error_model import DECIMAL, ErrorModel, TwistUncertainty, columns
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.path import Path
+from acsard.core.motion.uncertainty import GYRO_SCALE, PoseUncertainty
+from acsard.core.values import REST, PoseCovariance
+
+Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
+
+Basis = Literal["measured", "settings", "unknown"]
+"""Source of a share: visible in the lines, declared in `[odometry]`, or unknown."""
+
+METRES = 100.0
+
+LEAST_M, LEAST_RAD = 0.2, 0.2
+"""Minimum distance (m) and minimum turn (rad) of a drive from which errors can be extrapolated."""
+
+LEAST_LINES = 20
+
+STEP_S = 0.1
+MOST_STEPS = 20_000
+"""Maximum number of steps until 100 m are driven. A slow drive gets longer steps."""
+
+STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
+SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
+"""Steps for which the declared errors are computed while the robot does not drive."""
+
+ZERO = (0.0,) * 6
+
+
+class Share(Struct, frozen=True):
+    """Contribution of one cause alone; None if this drive does not show it."""
+
+    cause: Cause
+    mm_per_100_m: float | None
+    """Standard deviation of the position after 100 m, mm."""
+    deg_per_turn: float | None
+    """Standard deviation of the heading after a turn of 360 deg, deg."""
+    basis: Basis
+
+
+class Budget(Struct, frozen=True):
+    """The contributions of all causes, and facts about the drive."""
+
+    seconds: float
+    metres: float
+    turned: float
+    """Sum of the turns to both sides, deg."""
+    lines: int
+    missing: int
+    """Number of missing lines."""
+    unseen: float
+    """Driving time without lines, s."""
+    lateness: float
+    """RMS error of the lines' time stamps, s."""
+    quantum: float
+    """Quantization step of the wheel speeds in the lines, rad/s."""
+    counts: int
+    """Encoder counts per wheel turn, from the lines or the configuration; 0 if unknown."""
+    gyro: bool
+    """True if the heading comes from a gyro."""
+    still: bool
+    """True if the robot hardly moved, so that only configured errors can be reported."""
+    at_rest: tuple[float, float]
+    """Standard deviations (m/s, rad/s) of each report's twist due to its two decimals."""
+    shares: tuple[Share, ...]
+    multiplier: float = 1.0
+    """Configured ratio of effective track to wheel separation."""
+    learned: float | None = None
+    """The same ratio as implied by the gyro, averaged over the drive so far; None if unknown."""
+    learned_std: float = 0.0
+    """Standard deviation of `learned`."""
+    learned_used: bool = False
+    """True if odometry uses `learned` when it has only the wheels to measure a turn."""
+
+    def largest(self, *bases: Basis) -> Share | None:
+        """Return the share with the largest position error among these bases, or else heading
+        error.
+
+        Returns None if no share with one of these bases is greater than 0.
+        """
+        known = [one for one in self.shares if one.basis in bases]
+        for size in (_millimetres, _degrees):
+            found = max(known, key=size, default=None)
+            if found is not None and size(found) > 0.0:
+                return found
+        return None
+
+    def total(self) -> tuple[float | None, float | None]:
+        """Return the combined error of all causes in mm and deg; the causes are independent."""
+        return _squares([one.mm_per_100_m for one in self.shares]), _squares(
+            [one.deg_per_turn for one in self.shares]
+        )
+
+
+class Heard(Struct, frozen=True):
+    """The data that was received from the bus."""
+
+    lines: list[Line]
+    sent: list[float]
+    """Times at which lines were sent to the microcontroller, s."""
+    whole: bool = True
+    """True if every line that the daemon received is included."""
+    counted: bool = False
+    """True if the lines carry encoder counts and the microcontroller's time."""
+    gyro: bool = False
+    """True if the heading comes from a gyro."""
+    learned: float | None = None
+    """Effective track that the gyro implies, relative to the configured one; None if unknown."""
+    deviation: float = 0.0
+    """Relative standard deviation of `learned`."""
+    used: bool = False
+    """True if odometry uses `learned` when it has only the wheels to measure a turn."""
+
+
+def budget(heard: Heard, config: Config, metres: float = METRES) -> Budget:
+    """Return the error budget of a daemon with this configuration; `metres` replaces the 100 m."""
+    model, lines = _Model(config, metres), heard.lines
+    still = _standing(heard, config, model)
+    if len(lines) < LEAST_LINES:
+        return still
+    moved = motion(lines, np.array(heard.sent), model.kinematics, heard.whole)
+    rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
+    if rolled < LEAST_M and turned < LEAST_RAD:
+        return still
+    found = rounding(np.array([one.speeds for one in lines]), moved.period)
+    counts = still.counts or (round(math.tau / found.count) if found.count else 0)
+    creeping = metres / max(rolled, LEAST_M) * moved.seconds / MOST_STEPS
+    driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), heard.gyro)
+    model.rolls, model.turns = rolled >= LEAST_M, turned >= LEAST_RAD
+    return replace(
+        still, metres=rolled, turned=math.degrees(turned), missing=moved.missing,
+        unseen=moved.unseen, lateness=moved.lateness, quantum=found.quantum, counts=counts,
+        still=False, shares=tuple(_causes(heard, model, driving, counts)),
+    )  # fmt: skip
+
+
+def _standing(heard: Heard, config: Config, model: _Model) -> Budget:
+    """Return the budget of a robot that stands, from the settings alone."""
+    lines, odometry, known = heard.lines, config.odometry, model.declares_parameters
+    shares = (
+        model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, noise=True)),
+        model.share(
+            "parameters", "settings" if known else "unknown", STRAIGHT, SPIN,
+            _only(odometry, parameters=True),
+        ),
+    )  # fmt: skip
+    spread = TwistUncertainty(ErrorModel(_only(odometry), model.kinematics), 0).of(REST, 0.0)
+    configured = model.kinematics.multipliers[2]
+    learned = None if heard.learned is None else heard.learned * configured
+    return Budget(
+        lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
+        config.mcu.encoder_counts if heard.counted else 0, heard.gyro, still=True,
+        at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=shares,
+        multiplier=configured, learned=learned, learned_std=(learned or 0.0) * heard.deviation,
+        learned_used=heard.used,
+    )  # fmt: skip
+
+
+def _causes(heard: Heard, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
+    """Yield the share of each cause alone."""
+    odometry, plain = model.odometry, driving.plain()
+
+    def share(
+        cause: Cause, basis: Basis, steps: Steps, only: OdometryConfig | None = None,
+        counts: int = 0, scale: float = 0.0,
+    ) -> Share:  # fmt: skip
+        left, only = steps.to_the_left(), only or _only(odometry)
+        return model.share(cause, basis, steps, left, only, counts, scale)
+
+    # Counts are cumulative, so late and missing lines cause no error.
+    counted = heard.counted
+    basis: Basis = "measured" if counted or heard.whole else "unknown"
+    yield share("time", basis, plain if counted else driving.late())
+    yield share("quantisation", basis, plain if counted else driving.rounded(), counts=counts)
+    yield share("gaps", basis, plain if counted else driving.missed())
+
+    declared = share("slip", "settings", plain, _only(odometry, noise=True))
+    seen = share("slip", "measured", driving.contradicted())
+    yield max(declared, seen, key=_millimetres)
+
+    kind = _only(odometry, parameters=True)
+    basis = "settings" if model.declares_parameters else "unknown"
+    if heard.learned is not None:
+        off = heard.deviation if heard.used else abs(heard.learned - 1.0)
+        off *= model.kinematics.multipliers[2]
+        kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
+    yield share("parameters", basis, plain, kind)
+
+    if heard.gyro:
+        known = odometry.covariance == "model" and driving.tells_gyro
+        basis = "measured" if known else "unknown"
+        yield share("gyro", basis, driving.turned_by_gyro(), scale=GYRO_SCALE)
+
+
+class _Model:
+    """The odometry's covariance model, which is asked for the error of one cause at a time."""
+
+    def __init__(self, config: Config, metres: float) -> None:
+        self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
+        self.rolls = self.turns = True
+        """Whether the drive is long enough to extrapolate the error of position or heading."""
+        self._metres = metres
+
+    @property
+    def declares_parameters(self) -> bool:
+        """Whether the settings declare an uncertainty of the wheels or of the track."""
+        return bool(columns(self.odometry, self.kinematics))
+
+    def share(
+        self, cause: Cause, basis: Basis, ahead: Steps, left: Steps, only: OdometryConfig,
+        counts: int = 0, scale: float = 0.0,
+    ) -> Share:  # fmt: skip
+        """Return the error of one cause.
+
+        Args:
+            ahead: the steps that are repeated until the distance is driven.
+            left: the steps that are repeated until a turn is made.
+            only: the settings, without the errors of other causes.
+            counts: the encoders' counts per wheel turn; 0 if their resolution is not the cause.
+            scale: the relative standard deviation of the gyro's scale.
+        """
+        if basis == "unknown":
+            return Share(cause, None, None, basis)
+        millimetres = degrees = None
+        if self.rolls:
+            error = self._error(ahead, only, counts, scale, self._metres, math.inf)
+            millimetres = 1e3 * math.sqrt(error.xx + error.yy)
+        if self.turns:
+            error = self._error(left, only, counts, scale, math.inf, math.tau)
+            degrees = math.degrees(math.sqrt(error.yawyaw))
+        return Share(cause, millimetres, degrees, basis)
+
+    def _error(
+        self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
+        angle: float,
+    ) -> PoseCovariance:  # fmt: skip
+        """Return the covariance after `metres` m or `angle` rad of these steps, repeated."""
+        pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
+        rolled = turned = 0.0
+        for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
+            dx, dy, heading = path.advance(distance, turn)
+            variance = by_gyro if steps.by_gyro else None
+            pose.advance(distance, turn, dx, dy, heading, variance, scale=scale)
+            if along or yaw:
+                pose.doubt(along, yaw)
+            if any(missed):
+                pose.stand(*missed)
+            rolled, turned = rolled + abs(distance), turned + abs(turn)
+            if rolled >= metres or turned >= angle:
+                break
+        return pose.covariance
+
+
+def _only(
+    odometry: OdometryConfig, *, noise: bool = False, parameters: bool = False
+) -> OdometryConfig:
+    """Return the odometry's model with a single kind of error."""
+    made = replace(odometry, pose_covariance_diagonal=ZERO)
+    if not noise:
+        made = replace(
+            made, distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0,
+            yaw_variance_per_radian=0.0,
+        )  # fmt: skip
+    if not parameters:
+        made = replace(
+            made, wheel_separation_multiplier_std=0.0, left_wheel_radius_multiplier_std=0.0,
+            right_wheel_radius_multiplier_std=0.0, distance_scale_std=0.0,
+        )  # fmt: skip
+    return made
+
+
+def _millimetres(share: Share) -> float:
+    return share.mm_per_100_m or 0.0
+
+
+def _degrees(share: Share) -> float:
+    return share.deg_per_turn or 0.0
+
+
+def _squares(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return math.hypot(*known) if known else None

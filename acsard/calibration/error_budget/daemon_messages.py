@@ -1,0 +1,124 @@
+"""Converts messages of a running daemon to the input of the error budget."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from acsard.calibration.error_budget.budget import Heard
+from acsard.calibration.error_budget.drive_log import Line
+from acsard.core.config.settings import Config
+from acsard.core.messages.schema import (
+    DiagnosticArray,
+    JointState,
+    Message,
+    Odometry,
+    RobotState,
+    TwistStamped,
+)
+from acsard.core.values import NS_PER_S
+
+KEYS = ("odom", "wheel_states", "cmd_vel_out")
+"""Keys to subscribe to."""
+
+MOST = 60_000
+"""Maximum number of kept lines: ten minutes at 100 Hz."""
+
+LEAST_LOST, SHARE_LOST = 3, 0.01
+"""Lines of the daemon that may be missing here, as a number and as a share, the larger counts.
+Fewer are explained by the boundaries of the observed time."""
+
+SAMPLED = "checked with samples"
+"""Name of the link check whose lines carry the encoder counts, as in `diagnostics`."""
+
+
+class Feed:
+    """Collects a daemon's messages: `add` each one, then call `heard`."""
+
+    def __init__(self, config: Config, first: RobotState) -> None:
+        """Start the collection; `first` is the state just before the first message."""
+        self._config, self._first = config, first
+        self._start_ns = first.stamp.to_ns()
+        self._odom: dict[int, Odometry] = {}
+        self._lines: deque[tuple[int, Line]] = deque(maxlen=MOST)
+        self._sent: deque[int] = deque(maxlen=MOST)
+        self._wheels: dict[int, JointState] = {}
+        self._count = 0
+
+    def add(self, message: Message) -> None:
+        """Add a message of one of `KEYS`; the messages of each key must be in order."""
+        if isinstance(message, TwistStamped):
+            self._sent.append(message.header.stamp.to_ns())
+        elif isinstance(message, Odometry):
+            self._odom[message.header.stamp.to_ns()] = message
+            self._join(message.header.stamp.to_ns())
+        elif isinstance(message, JointState):
+            self._wheels[message.header.stamp.to_ns()] = message
+            self._join(message.header.stamp.to_ns())
+
+    def heard(self, last: RobotState, diagnostics: DiagnosticArray) -> Heard:
+        """Return all data so far; both arguments must be current."""
+        lines, zero = [line for _, line in self._lines], self._start_ns
+        learned, deviation, used = _learned(diagnostics)
+        return Heard(
+            lines,
+            [(at - zero) / NS_PER_S for at in self._sent],
+            whole=self._whole(last),
+            counted=self._config.mcu.wants_samples and _value(diagnostics, "check") == SAMPLED,
+            gyro=last.gyro in ("used", "disagrees"),
+            learned=learned,
+            deviation=deviation,
+            used=used,
+        )
+
+    def _join(self, stamp_ns: int) -> None:
+        """Combine the two messages of a line, matched by stamp.
+
+        Messages with the same stamp pair in order.
+        """
+        odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
+        if odom is None or wheels is None:
+            for waiting in (self._odom, self._wheels):
+                if len(waiting) > 100:  # the other message was lost
+                    del waiting[next(iter(waiting))]
+            return
+        del self._odom[stamp_ns], self._wheels[stamp_ns]
+        q, covariance = odom.pose.pose.orientation, odom.pose.covariance
+        a, b, c, d = wheels.velocity
+        e, f, g, h = wheels.position
+        at = (stamp_ns - self._start_ns) / NS_PER_S
+        yaw = 2 * math.atan2(q.z, q.w)
+        self._lines.append((stamp_ns, Line(at, (a, b, c, d), (e, f, g, h), yaw, covariance[35])))
+        self._count += 1
+
+    def _whole(self, last: RobotState) -> bool:
+        rates, before = self._config.rates, self._first.counters
+        if rates.odom or rates.wheel_states:
+            return False
+        lines, impossible = (
+            last.counters.get(name, 0) - before.get(name, 0)
+            for name in ("lines", "line_implausible")
+        )
+        lost = lines - impossible - self._count
+        return lost <= max(LEAST_LOST, SHARE_LOST * lines)
+
+
+def _value(diagnostics: DiagnosticArray, key: str) -> str:
+    """Return the first value with this key in any row, or ""."""
+    rows = (value for status in diagnostics.status for value in status.values)
+    return next((value.value for value in rows if value.key == key), "")
+
+
+def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
+    """Return the track implied by the gyro, its deviation, and whether it is used.
+
+    The track is relative to the configured one, and its standard deviation is relative to itself.
+    The track is None if unknown.
+    """
+    names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
+    learned, configured, std = (_value(diagnostics, name) for name in names)
+    used = _value(diagnostics, "multiplier_in_use") == learned != configured
+    try:
+        return float(learned) / float(configured), float(std) / float(learned), used
+    except (ValueError, ZeroDivisionError):
+        return None, 0.0, False

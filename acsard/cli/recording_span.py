@@ -1,0 +1,124 @@
+"""`--from` and `--to` of `acsard recording`: a part of one, in seconds or by the time of day.
+
+A recording may cross midnight, and its clock may be set in the middle of it. The time of day is
+therefore looked up in every stretch between two clock steps. The result is in seconds from the
+beginning of the recording.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import time
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+from acsard.core.values import NS_PER_S, Instant
+
+if TYPE_CHECKING:
+    from acsard.recording.file import Recording
+
+FILE_HELP = "a recording, or its number in the list of `acsard recording` (default: the newest)"
+"""The help text of the recording that most actions of `acsard recording` take."""
+
+SET_NS = 5 * NS_PER_S
+"""Difference between wall clock and monotonic clock that counts as a clock step, ns."""
+
+
+class Stretch(NamedTuple):
+    """A part of the recording in which the wall clock was not set."""
+
+    at: float
+    """Start of the stretch, s after the beginning of the recording."""
+    begin: float
+    end: float
+    """End of the stretch, s since 1970, as is `begin`."""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Add `--from` and `--to`."""
+    when = "seconds after the beginning of the recording, or the time of day: HH:MM, HH:MM:SS"
+    parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
+    parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
+
+
+def _when(text: str) -> str:
+    if not re.fullmatch(r"\d+(\.\d+)?|\d\d:\d\d(:\d\d(\.\d+)?)?", text):
+        raise argparse.ArgumentTypeError(f"{text} is neither seconds nor HH:MM:SS")
+    return text
+
+
+def span(args: argparse.Namespace, recording: Recording) -> tuple[float, float]:
+    """Return the begin and the end of the part, s after the beginning of the recording.
+
+    An end that was not given is infinite.
+    """
+    texts = (args.begin, args.end)
+    found = stretches(recording) if any(":" in text for text in texts if text) else []
+    begin, end = (None if text is None else _seconds(text, found) for text in texts)
+    return -math.inf if begin is None else begin, math.inf if end is None else end
+
+
+def _seconds(text: str, found: list[Stretch]) -> float:
+    if ":" not in text:
+        return float(text)
+    hours, minutes, seconds = [*text.split(":"), "0"][:3]
+    clock = int(hours), int(minutes), float(seconds)
+    away, at = math.inf, 0.0
+    for number, one in enumerate(found):
+        least = one.at if number else -math.inf
+        most = found[number + 1].at if number + 1 < len(found) else math.inf
+        for day in (-1, 0, 1):
+            moment = _on(one.begin, day, *clock)
+            far = max(one.begin - moment, moment - one.end, 0.0)
+            if far < away:
+                away, at = far, min(max(one.at + moment - one.begin, least), most)
+    return at
+
+
+def _on(near: float, day: int, hours: int, minutes: int, seconds: float) -> float:
+    """Return a time of day, s since 1970, `day` days after the date of `near`."""
+    told = time.localtime(near)
+    whole = (told.tm_year, told.tm_mon, told.tm_mday + day, hours, minutes, 0, 0, 0, -1)
+    return time.mktime(whole) + seconds
+
+
+def stretches(recording: Recording) -> list[Stretch]:
+    """Return the stretches between clock steps, in order.
+
+    There is one if the clock was never set.
+    """
+    found: list[Stretch] = []
+    last_ns, before = 0, b""
+    for topic, wall_ns, data in recording.messages():
+        if topic != "steps":
+            continue
+        if found and 0 <= wall_ns - last_ns < SET_NS:
+            found[-1] = found[-1]._replace(end=wall_ns / NS_PER_S)
+        else:
+            times = [*_instants(before), *_instants(data)]
+            if not found and times:
+                found.append(_from(recording, times[0]))
+            for one, other in pairwise(times):
+                ahead_ns = other.wall_ns - other.mono_ns - one.wall_ns + one.mono_ns
+                if abs(ahead_ns) >= SET_NS:
+                    found[-1] = found[-1]._replace(end=one.wall_ns / NS_PER_S)
+                    found.append(_from(recording, other))
+        last_ns, before = wall_ns, data
+    return found
+
+
+def _from(recording: Recording, now: Instant) -> Stretch:
+    at = (now.mono_ns - recording.about.mono_ns) / NS_PER_S
+    return Stretch(at, now.wall_ns / NS_PER_S, now.wall_ns / NS_PER_S)
+
+
+def _instants(data: bytes) -> list[Instant]:
+    """Return the time of each step in a message."""
+    from acsard.recording.rows import BatchError, decode
+
+    try:
+        return [step.inputs.now for step in decode(data)]
+    except BatchError:
+        return []

@@ -1,0 +1,284 @@
+"""`acsard tls init | add | renew | router`: make certificates for a bus that leaves the machine."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+from acsard.certificates import identities
+from acsard.cli.common import add_config, load
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import write
+from acsard.core.values import ROLES
+from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
+from acsard.host.errors import UsageError
+from acsard.host.service_installation import TLS
+
+MOST_DAYS = 3650
+
+NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
+
+
+def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the verb, its actions and their options."""
+    parser = verbs.add_parser(
+        "tls",
+        help="make the certificates with which other machines connect",
+        description="Make certificates for a bus that other machines can reach. Needs the "
+        "library cryptography; if it is missing, a message gives the command that "
+        "installs it.",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    init = actions.add_parser(
+        "init",
+        help="make a certificate authority, the robot's certificate and one for each role",
+        description="Make a certificate authority, the robot's certificate, and one certificate "
+        "each for viewer, operator and maintainer. Print the lines of acsard.toml "
+        "that use them.",
+    )
+    init.add_argument("--force", action="store_true", help="overwrite existing files")
+    init.add_argument(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="also set bus.listen and bus.tls in this acsard.toml",
+    )
+    init.set_defaults(main=main_init)
+    more = actions.add_parser(
+        "add",
+        help="make one more certificate",
+        description="Make a certificate for one more person or program.",
+    )
+    more.add_argument("name", type=_name, metavar="NAME", help="its common name, e.g. laptop-anna")
+    more.add_argument(
+        "--role",
+        choices=ROLES,
+        help="role of the certificate; leave it out for a robot or a router",
+    )
+    more.add_argument(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="also add the name to the list of its role in this acsard.toml",
+    )
+    add_config(more)
+    more.set_defaults(main=main_add)
+    renew = actions.add_parser(
+        "renew",
+        help="make a new certificate for the robot by the same authority",
+        description="Make a new certificate for the robot before the old one expires. All other "
+        "certificates stay valid.",
+    )
+    renew.set_defaults(main=main_renew)
+    for action in (init, more, renew):
+        _add_common(action)
+    _add_router(actions)
+
+
+def _add_router(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    router = actions.add_parser(
+        "router",
+        help="print the configuration of a fleet's router",
+        description="Print router.json5 for `acsard router` or zenohd. It says what each robot "
+        "and the certificate of each person may do. The steps are in "
+        "deploy/zenoh/README.md.",
+    )
+    router.add_argument("robots", nargs="+", metavar="ROBOT", help="ids of the robots")
+    for role in ROLES:
+        router.add_argument(
+            f"--{role}",
+            action="append",
+            type=_name,
+            default=[],
+            metavar="NAME",
+            help=f"another certificate with the role {role}, besides the one named {role}; may "
+            "be repeated",
+        )
+    router.set_defaults(main=main_router)
+
+
+def _add_common(action: argparse.ArgumentParser) -> None:
+    """Add the options for the directory, the validity and the addresses of certificates."""
+    action.add_argument(
+        "--directory", type=Path, default=Path(TLS), metavar="DIR", help=f"default {TLS}"
+    )
+    action.add_argument(
+        "--days", type=_days, default=730, metavar="N", help="validity in days (default: 730)"
+    )
+    action.add_argument(
+        "--address",
+        action="append",
+        type=_address,
+        default=[],
+        metavar="NAME",
+        help="another host name or IP address of the robot, besides its own name; may be repeated",
+    )
+
+
+def main_init(args: argparse.Namespace) -> int:
+    """Make the authority, the robot's certificate and one client certificate per role."""
+    from acsard.host.config_file import require_changeable, require_tomlkit
+
+    directory = args.directory.resolve()
+
+    robots: list[str] = []
+
+    def keys(config: Config) -> dict[str, object]:
+        robots.append(config.robot.id)
+        return identities.keys(config, directory)
+
+    if args.write:
+        require_tomlkit()
+        require_changeable(args.write, keys, new=True)
+    else:
+        robots.append(load(None)[1].robot.id)
+    names = identities.init(args.directory, args.address, args.days, force=args.force)
+    if args.write:
+        _configure(args.write, keys)
+    _admit_service(directory)
+    host, robot = socket.gethostname(), robots[-1]
+    files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
+    lines = "" if args.write else _LINES.format(directory=directory, port=identities.PORT)
+    print(_certified(names))
+    where = f"tls/{host}.local:{identities.PORT}"
+    print(_NEXT.format(directory=directory, robot=robot, where=where, lines=lines, **files))
+    return 0
+
+
+def main_add(args: argparse.Namespace) -> int:
+    """Make one more client certificate."""
+    from acsard.host.config_file import change, require_changeable, require_tomlkit
+
+    listed = f"{args.role}s"
+
+    def keys(config: Config) -> dict[str, object]:
+        there = getattr(config.access, listed)
+        return {f"access.{listed}": list(dict.fromkeys([*there, args.name]))}
+
+    # Load the configuration before any file is written, so that an error leaves no files.
+    where, config = load(args.config)
+    if args.write:
+        if not args.role:
+            raise UsageError(
+                "--write adds the name to the list of a role: give the role, for "
+                "example --role operator"
+            )
+        require_tomlkit()
+        require_changeable(args.write, keys, new=True)
+    place = identities.add(args.directory, args.name, args.address, args.days)
+    if not args.role:
+        print(f"{place} is for {args.name}")
+        return 0
+    if args.write:
+        names = write(change(args.write, keys, new=True)[f"access.{listed}"])
+        print(f"{place} is for {args.name}; {args.write}: set access.{listed} = {names}")
+    else:
+        names = write(keys(config)[f"access.{listed}"])
+        print(
+            f"{place} is for {args.name}; add the name to its role in acsard.toml (keep the "
+            "names that"
+        )
+        print(f"{where} already has as {listed}; --write FILE does all this):\n")
+        print(f"[access]\n{listed} = {names}\n")
+    print("The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`")
+    return 0
+
+
+def main_renew(args: argparse.Namespace) -> int:
+    """Replace the robot's own certificate."""
+    names = identities.renew(args.directory, args.address, args.days)
+    print(_certified(names))
+    print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
+    return 0
+
+
+def main_router(args: argparse.Namespace) -> int:
+    """Print the configuration of a fleet's router."""
+    from acsard.daemon.bus.address import require_id
+    from acsard.daemon.gateway.fleet_router import router_file
+    from acsard.host.service_installation import source
+
+    for robot in args.robots:
+        require_id(robot)
+    template = (source() / "zenoh" / "router.json5").read_text()
+    people = {role: getattr(args, role) for role in ROLES}
+    print(router_file(template, args.robots, people), end="")
+    return 0
+
+
+def _certified(names: list[str]) -> str:
+    return f"Clients may reach the robot as {', '.join(names)} (add more with --address).\n"
+
+
+def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
+    """Set the keys of the bus in a configuration file and keep its comments."""
+    from acsard.host.config_file import change
+
+    changed = change(file, keys, new=True)
+    print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
+
+
+def _admit_service(directory: Path) -> None:
+    """Let the installed service's TLS gateway use these certificates.
+
+    It writes a systemd drop-in with the permitted networks and the certificates, and does nothing
+    without an installed service.
+    """
+    from acsard.host import service_installation as service
+
+    step = service.admitting(directory)
+    if step is None:
+        return
+    step.do()
+    print(f"{step}\nThis is for the service's TLS gateway. Check the networks in it, then run:")
+    print("systemctl daemon-reload && systemctl restart acsard\n")
+
+
+def _name(text: str) -> str:
+    # `access` has the same rule: the name becomes a part of keys, and a directory name here.
+    if not NAME.fullmatch(text) or text in (".", ".."):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a name for a certificate: 1 to 64 letters, digits, spaces and "
+            "_.:@+-, and no @ at the start"
+        )
+    return text
+
+
+def _address(text: str) -> str:
+    if not identities.ADDRESS.match(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a host name or an IP address")
+    return text
+
+
+def _days(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) <= MOST_DAYS:
+        raise argparse.ArgumentTypeError(f"{text} is not a number of days from 1 to {MOST_DAYS}")
+    return int(text)
+
+
+_LINES = """\
+On the robot, in acsard.toml (--write FILE does it):
+
+[bus]
+listen = ["tcp/127.0.0.1:7448", "tls/0.0.0.0:{port}"]
+tls = "{directory}"
+
+"""
+
+_NEXT = """\
+Wrote {directory}:
+  {ca}, {certificate}, {key}   the robot's
+  ca-key.pem                       the authority: a person who has it can admit anyone; keep it safe
+  clients/<role>/                  one directory each for viewer, operator, maintainer
+
+{lines}The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`.
+
+Copy clients/<role>/ to the machine of each person with that role, and run there:
+
+acsard echo state --id {robot} --connect {where} --tls <that directory>
+
+From Python: connect("{where}", robot_id="{robot}", tls="<that directory>")
+"""

@@ -1,0 +1,76 @@
+"""The permissions of each role, derived from the table of keys in `topics.py`.
+
+The access rules of the daemon and of the TLS gateway, the rules of a fleet's router, the
+permissions of the page and the tables of roles on the pages are made from these functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Literal, get_args
+
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import JSON_TREE, VERBS, Topic, json_key, row_of
+from acsard.core.values import ROLES, Role, Verb
+
+Use = Literal["publish", "subscribe", "query"]
+"""A client's use of a key. A call of a service is a query."""
+
+USES: tuple[Use, ...] = get_args(Use)
+
+MAY: dict[Role, str] = {
+    "viewer": "it may follow and stop, not drive",
+    "operator": "it may drive by the listed sources, stop and clear",
+    "maintainer": "it has every permission",
+}
+"""The permissions of each role in words, for the message of a tool that was refused."""
+
+
+def has(role: str, least: Role) -> bool:
+    """Return whether a role has the permissions of `least`. "" is a client without a role."""
+    return role in ROLES and ROLES.index(role) >= ROLES.index(least)
+
+
+def keys_for(role: Role, use: Use, rows: Iterable[Topic]) -> list[str]:
+    """Return the exact keys of these rows for which `role` is the least role.
+
+    Keys of commands are left out, because their sources and certificates depend on the
+    configuration: `source_keys` makes them, and `COMMAND_ROLE` is their role.
+    """
+    exact = (pair for row in rows if not row.local for pair in _exact(row, use))
+    return [key for key, least in exact if least == role and "<" not in key]
+
+
+def _exact(row: Topic, use: Use) -> Iterator[tuple[str, Role]]:
+    """Yield each key that a row stands for, with the least role that may use it so."""
+    least = {"publish": row.publish, "subscribe": row.subscribe, "query": row.query}[use]
+    if least == "<role>":
+        yield from ((row.key.replace("<role>", role), role) for role in ROLES)
+        return
+    if least is None:
+        return
+    for name in SCHEMAS if "<Type>" in row.key else ("",):
+        yield row.key.replace("<Type>", name), least
+    if use != "publish" and row.subscribe and row.query:
+        yield json_key(row.key), least
+
+
+def least_role(key: str) -> Role:
+    """Return the least role that may follow, query, call or put on a key below the robot's id.
+
+    A key that clients put on has the role for putting. An unknown key has the lowest role: no rule
+    grants it, and this function only chooses the words for a client that received nothing.
+    """
+    row = row_of(key.removeprefix(JSON_TREE))
+    if row is None:
+        return "viewer"
+    if row.query == "<role>":
+        return next((role for role in ROLES if key.endswith(f"/{role}")), ROLES[0])
+    return row.publish or row.query or row.subscribe or ROLES[-1]
+
+
+SERVICE_ROLES: dict[Verb, Role] = {verb: least_role(key) for key, verb in VERBS.items()}
+"""The least role that may call each service."""
+
+COMMAND_ROLE = least_role("cmd/<source>/<certificate>")
+"""The least role that may command."""

@@ -1,0 +1,126 @@
+"""Holds the wheels against each other, against their commands and against a gyro.
+
+`ConsistencyChecks` is the one interface of these checks. For each line it tells odometry which
+wheels to believe, whether they slip, and by how far the gyro says that the robot turned:
+
+- `wheel_faults.py` compares the two wheels of each side, and ignores one that is proved faulty.
+- `gyro.py` takes the heading from a gyro, and compares the gyro with the believed wheels.
+- `learned_track.py` chooses the effective track by which the wheels turn the robot; a gyro that is
+  compared with them teaches it.
+
+Each check uses the findings of another one, and only this module knows their order. `sanity.py`
+judges feedback too, but it stops the robot, while these checks decide what its pose is made of.
+"""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.core.config.settings import OdometryConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gap_filling import NOWHERE, Rolled, plus
+from acsard.core.motion.gyro import Gyro, Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.learned_track import LearnedTrack, Track
+from acsard.core.motion.wheel_faults import WheelFaults
+from acsard.core.values import Event, GyroSample, GyroStatus, WheelSpeeds
+
+
+class ConsistencyChecks:
+    """All checks of one robot. For each line call `look`, and then `learn`."""
+
+    def __init__(
+        self,
+        odometry: OdometryConfig,
+        kinematics: Kinematics,
+        encoder_counts: int,
+        response_time: float,
+    ) -> None:
+        """Start.
+
+        Args:
+            odometry: The table `[odometry]`, which says whether there is a gyro and whether it
+                teaches the track.
+            kinematics: The kinematics of the base.
+            encoder_counts: Counts per wheel turn, 0 if unknown.
+            response_time: Response time of a slow wheel, s.
+        """
+        self._kinematics = kinematics
+        self.wheels = WheelFaults(kinematics, encoder_counts, response_time)
+        self.gyro = Gyro() if odometry.gyro else None
+        multiplier = kinematics.multipliers[2]
+        self._track = LearnedTrack(multiplier) if odometry.learned_track else None
+        self._by_wheels = 0.0
+        """Turn of the last line by the wheels, rad."""
+        self.turn: Turn | None = None
+        """Turn of the last line by the gyro, None if the wheels provide it."""
+        self.on_trial = False
+        """Whether the gyro corrects the wheels' turn of the last line when it is proved."""
+        self.slips = False
+        """Whether the wheels slip, by each other or by the gyro."""
+        self.events: list[Event] = []
+        """Events of the last line, for the log."""
+
+    @property
+    def gyro_status(self) -> GyroStatus:
+        """The state of the gyro, and the use of the track that it teaches."""
+        status = GyroStatus() if self.gyro is None else self.gyro.status
+        return status if self._track is None else replace(status, track_use=self._track.use)
+
+    def hear(self, samples: tuple[GyroSample, ...]) -> None:
+        """Take the gyro's samples since the last step, in order."""
+        if self.gyro is not None:
+            self.gyro.hear(samples)
+
+    def forgive(self) -> None:
+        """Drop the corrections that are due to the pose, because it was set."""
+        if self.gyro is not None:
+            self.gyro.forgive()
+
+    def look(self, line: Feedback, rolled: Rolled, commanded: WheelSpeeds | None) -> bool:
+        """Take a line and the wheel angles since the line before.
+
+        `commanded` is the commanded wheel speeds. Return whether a wheel has proved faulty, so that
+        the lines before must be recomputed without it.
+        """
+        wheels, gyro, turn, by_gyro = self.wheels, self.gyro, None, None
+        if gyro is not None:
+            turned = rolled.turned
+            for piece in rolled.pieces:
+                turned = plus(turned, piece)
+            self._by_wheels = self._kinematics.moved(wheels.believed(turned))[1]
+            still = wheels.believed(line.speeds.as_tuple()) == NOWHERE
+            turn = gyro.turn(line.at.mono_ns, rolled.known, self._by_wheels, still)
+            self.on_trial = gyro.owes
+            by_gyro = None if turn is None else turn.wheels
+        self.turn = turn
+        found = wheels.look(rolled.seen, line.speeds, rolled.seconds, commanded, by_gyro)
+        self.slips = wheels.slips or (turn is not None and turn.slips)
+        return found
+
+    def taken_back(self, turn: float) -> float:
+        """Note that the turn of lines during the gyro's trial has changed by `turn` rad.
+
+        Return the part of this change that the gyro has already corrected.
+        """
+        return 0.0 if self.gyro is None else self.gyro.taken_back(turn)
+
+    def learn(self, turned: float) -> Track | None:
+        """Note by how far the last line turned the pose, rad.
+
+        Return the track to use from now on, None if none is learned.
+        """
+        gyro, track, self.events = self.gyro, self._track, self.wheels.events
+        if gyro is None:
+            return None
+        if self.on_trial and turned != self._by_wheels:
+            gyro.taken_back(turned - self._by_wheels)
+        if track is None:
+            if gyro.events:
+                self.events = gyro.events + self.events
+            return None
+        track.look(gyro.learned)
+        if gyro.events or track.event is not None:
+            of_track = [] if track.event is None else [track.event]
+            self.events = gyro.events + of_track + self.events
+        return track.used

@@ -1,1 +1,0 @@
-"""`acsard odom` shows the error budget of a running robot's odometry, cause by cause."""

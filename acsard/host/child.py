@@ -1,0 +1,237 @@
+"""Processes that this program starts: how they start, are limited, show that they live, and end.
+
+Each child gets a session of its own, so that a Ctrl-C at the terminal reaches the parent alone,
+which then ends its children in its own way. A child does not outlive its parent.
+
+A `Child` and a `Parent` are the two ends of one socket, the child's standard input. The child
+writes a sign of life to it again and again, and ends when its parent closes it. The parent kills a
+child that falls silent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import os
+import resource
+import select
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from asyncio.subprocess import DEVNULL, Process
+from collections.abc import AsyncIterator, Collection, Sequence
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+
+from msgspec import Struct
+
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.host.silence import Silence
+
+OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
+"""Variables that systemd sets for the parent. A child must not answer in the parent's name."""
+
+BEAT_S = 0.5
+"""Longest time between two looks for a sign of life, and between two signs, s."""
+
+SILENT_NS = 3 * NS_PER_S
+"""Silence after which a child is killed. The gateway ends itself after a second without progress
+(`daemon/gateway/watch.py`); this limit is for a process that cannot even do that."""
+
+START_NS = 15 * NS_PER_S
+"""Time for the first sign of life: the start of Python on a busy machine."""
+
+SILENT = "no longer reported that it is alive (stopped or hung), and was ended"
+
+LINE_BYTES = 65536
+"""Length of the longest line of output that a child may send."""
+
+FIRST_TO_GO = b"1000"
+"""Value for `oom_score_adj`: when the computer runs out of memory, the kernel kills such a child
+before any other process."""
+
+
+# The parent's side: start, limit and end
+
+
+def acsard(*words: str) -> list[str]:
+    """Return the command that runs this program with these arguments."""
+    # With -P Python ignores the working directory, so it runs the installed package.
+    return [sys.executable, "-P", "-m", "acsard", *words]
+
+
+def environment(hidden: Collection[str] = ()) -> dict[str, str]:
+    """Return the environment of a child, without the variables `hidden` and those of our unit."""
+    return {key: value for key, value in os.environ.items() if key not in (*OUR_UNIT, *hidden)}
+
+
+class Limits(Struct, frozen=True):
+    """Limits of a child whose work is less important than the robot's."""
+
+    nice: int
+    memory_bytes: int
+
+
+def limit(pid: int, limits: Limits) -> None:
+    """Set the priority and the data memory of a child; it is the first to go without memory."""
+    try:
+        with suppress(OSError):
+            Path(f"/proc/{pid}/oom_score_adj").write_bytes(FIRST_TO_GO)
+        os.setpriority(os.PRIO_PROCESS, pid, limits.nice)
+        memory = limits.memory_bytes
+        resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
+    except ProcessLookupError:
+        pass  # it has ended already, and its output says why
+
+
+def how_it_ended(code: int) -> str:
+    """Return the end of a process in words."""
+    return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
+
+
+def end(process: subprocess.Popen[bytes], patience_s: float) -> None:
+    """End a child by SIGTERM, and by SIGKILL if it still runs after `patience_s`."""
+    process.terminate()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@asynccontextmanager
+async def running(
+    command: Sequence[str],
+    limits: Limits | None = None,
+    *,
+    stdin: int = DEVNULL,
+    stdout: int | None = None,
+    stderr: int | None = None,
+) -> AsyncIterator[Process]:
+    """Start a child in the event loop; kill it if it still runs at the end of the block.
+
+    Raises `OSError`.
+    """
+    child = await asyncio.create_subprocess_exec(
+        *command,
+        stdin=stdin,
+        stdout=stdout,
+        stderr=stderr,
+        limit=LINE_BYTES,
+        start_new_session=True,
+        env=environment(),
+    )
+    try:
+        if limits is not None:
+            limit(child.pid, limits)
+        yield child
+    finally:
+        if child.returncode is None:
+            child.kill()
+            # asyncio sees the end of a child only after the end of its output, and it stops
+            # reading a pipe whose reader is behind.
+            for output in (child.stdout, child.stderr):
+                with suppress(RuntimeError):  # somebody else reads this one
+                    await output.read() if output else b""
+            await child.wait()
+
+
+class Child:
+    """One run of a child that ends with its standard input and is killed if it falls silent."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+        self._ours: socket.socket | None = None
+        self._over = False
+        self.silent = ""
+        """Why the child was killed, "" if it was not."""
+
+    def run(self) -> int:
+        """Start the child, wait for its end and return its exit code; raise `OSError`.
+
+        All of this runs in one thread, so the thread ends together with the child.
+        """
+        ours, its = socket.socketpair()
+        with ours:
+            with its:
+                process: subprocess.Popen[bytes] = subprocess.Popen(
+                    self._command,
+                    stdin=its.fileno(),
+                    stdout=2,
+                    start_new_session=True,
+                    env=environment(),
+                )
+            self._ours = ours
+            if self._over:  # released while it was being started
+                self.release()
+            if self._falls_silent(ours):
+                process.kill()
+            return process.wait()
+
+    def _falls_silent(self, ours: socket.socket) -> bool:
+        """Wait for signs of life; return False when the child has ended or was released."""
+        silence, before_ns, alive = Silence(START_NS), clock.mono_ns(), False
+        while True:
+            beat = ours.recv(4096) if select.select([ours], [], [], BEAT_S)[0] else None
+            if beat == b"":
+                return False
+            if beat and not alive:
+                alive, silence = True, Silence(SILENT_NS)
+            now_ns = clock.mono_ns()
+            if silence.too_long(bool(beat), now_ns - before_ns):
+                self.silent = SILENT
+                return True
+            before_ns = now_ns
+
+    def release(self) -> None:
+        """Close the child's standard input, which makes it end. Any thread may call this."""
+        self._over = True
+        if self._ours is not None:
+            try:
+                self._ours.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                pass  # it has ended, or its end of the socket is closed
+
+
+# The child's side
+
+
+class Parent:
+    """The process at the other end of this one's standard input."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+        # A person may have given a pipe or a terminal, which takes no signs of life.
+        self._listens = stat.S_ISSOCK(os.fstat(fd).st_mode)
+        if self._listens:
+            os.set_blocking(fd, False)
+
+    def beat(self) -> None:
+        """Send a sign of life, without waiting."""
+        if self._listens:
+            with suppress(OSError):
+                os.write(self.fd, b".")  # fails if the buffer is full or the parent has gone
+
+    def gone(self) -> bool:
+        """Read from the descriptor, which must be readable; return whether the parent closed it."""
+        try:
+            return not os.read(self.fd, 64)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True  # the parent went before it had read all signs of life
+
+
+# From linux/prctl.h.
+PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent(number: signal.Signals) -> None:
+    """Ask the kernel for this signal when the thread that started this process ends.
+
+    The child calls it. It then ends with its parent even if the parent crashes.
+    """
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)

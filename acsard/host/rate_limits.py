@@ -1,0 +1,108 @@
+"""Limits how often something may happen, and how many of a kind there may be. This module is pure.
+
+The rates are token buckets: per name (an address, a token, a text), and for all names together. A
+bucket for one unit at a time sets a shortest interval. The places are counted per name and in all.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from acsard.core.values import NS_PER_S
+
+
+class Rate(NamedTuple):
+    """A sustained rate with a burst allowance."""
+
+    hz: float
+    most: float = 1.0
+    """Number of units that may be taken at once after a rest."""
+
+
+class Bucket:
+    """A token bucket, full at first."""
+
+    def __init__(self, rate: Rate) -> None:
+        self._unit_ns = round(NS_PER_S / rate.hz)
+        self._burst_ns = round((rate.most - 1.0) * self._unit_ns)
+        self._paid_ns = 0
+        """Time until which the units taken so far are paid for, at `_unit_ns` each."""
+
+    def room(self, now_ns: int) -> bool:
+        """Return whether a unit is left."""
+        return self._paid_ns <= now_ns + self._burst_ns
+
+    def full(self, now_ns: int) -> bool:
+        """Return whether all units are back."""
+        return self._paid_ns <= now_ns
+
+    def take(self, now_ns: int) -> bool:
+        """Consume one unit; return False if the bucket is empty."""
+        if not self.room(now_ns):
+            return False
+        self._paid_ns = max(self._paid_ns, now_ns) + self._unit_ns
+        return True
+
+
+class Buckets:
+    """A token bucket for each name, and one for all names together."""
+
+    def __init__(self, of_one: Rate, in_all: Rate | None = None) -> None:
+        """Set the rate of each name; `in_all` is None if their sum is not limited."""
+        self._of_one = of_one
+        self._shared = None if in_all is None else Bucket(in_all)
+        self._buckets: dict[str, Bucket] = {}
+
+    def take(self, name: str, now_ns: int) -> bool:
+        """Consume one unit of this name; return False if it, or all together, have none left."""
+        if name not in self._buckets:
+            # A full bucket equals a new one. Without it, names cannot fill the memory.
+            self._buckets = {k: one for k, one in self._buckets.items() if not one.full(now_ns)}
+        own = self._buckets.setdefault(name, Bucket(self._of_one))
+        if self._shared is None:
+            return own.take(now_ns)
+        # A name without units of its own must not consume those of the others.
+        return own.room(now_ns) and self._shared.take(now_ns) and own.take(now_ns)
+
+
+class Places:
+    """Places that are limited in all and per name."""
+
+    def __init__(self, most: int, of_one: int) -> None:
+        self._most, self._of_one = most, of_one
+        self._taken: Counter[str] = Counter()
+
+    @property
+    def taken(self) -> int:
+        """Number of taken places."""
+        return self._taken.total()
+
+    def room(self, name: str) -> bool:
+        """Return whether a place is free for this name."""
+        return self._taken[name] < self._of_one and self.taken < self._most
+
+    def enter(self, name: str) -> bool:
+        """Take a place; return False if none is free."""
+        if not self.room(name):
+            return False
+        self._taken[name] += 1
+        return True
+
+    def leave(self, name: str) -> None:
+        """Give one place back."""
+        self._taken[name] -= 1
+        if not self._taken[name]:
+            del self._taken[name]
+
+    @contextmanager
+    def held(self, name: str = "") -> Iterator[bool]:
+        """Hold a place for the time of the block, if one is free; yield whether it is."""
+        free = self.enter(name)
+        try:
+            yield free
+        finally:
+            if free:
+                self.leave(name)

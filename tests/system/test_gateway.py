@@ -1,0 +1,198 @@
+"""The TLS gateway's process restarts whenever it ends, and ends with the daemon."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from acsard.daemon.gateway.watch import UNANSWERED
+from tests.system.harness import (
+    Bus,
+    Daemon,
+    Program,
+    acsard,
+    children,
+    finish,
+    free_endpoint,
+    until,
+    write_config,
+)
+from tests.system.identities import Certificates, free_tls_endpoint
+
+pytestmark = pytest.mark.network
+
+
+class Open:
+    """A daemon with a TLS gateway, and clients that come through it."""
+
+    def __init__(self, where: Path, certificates: Certificates) -> None:
+        self._certificates = certificates
+        self._plain, self.tls = free_endpoint(), free_tls_endpoint()
+        bus = {"listen": [self._plain, self.tls], "tls": str(certificates.robot)}
+        self.daemon = Daemon(where, config={"bus": bus}, endpoint=self._plain)
+
+    def gateway(self) -> int:
+        """The gateway's process."""
+        (pid,) = until(lambda: children(self.daemon.pid, "acsard gateway"), 5.0, "a gateway")
+        return pid
+
+    def lets_in(self) -> bool:
+        try:
+            config = self._certificates.config("viewer", self._plain, self.tls)
+            with zenoh.open(config) as session:
+                return any(r.ok for r in session.get("acsard/acsar/state", timeout=1.0))
+        except zenoh.ZError:
+            return False
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
+    return Certificates(tmp_path_factory.mktemp("certificates"))
+
+
+@pytest.fixture
+def robot(tmp_path: Path, certificates: Certificates) -> Iterator[Open]:
+    robot = Open(tmp_path, certificates)
+    with robot.daemon:
+        yield robot
+
+
+def gone(pid: int) -> bool:
+    """Return whether the process has ended, even if nobody has reaped it."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except FileNotFoundError:
+        return True
+
+
+def test_a_gateway_that_is_killed_is_opened_anew_and_counted(robot: Open) -> None:
+    assert robot.lets_in()
+    first = robot.gateway()
+    with Bus(robot.daemon.endpoint) as bus:
+        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
+    os.kill(first, signal.SIGKILL)
+    robot.daemon.gateway_opens(times=2)
+    assert robot.lets_in()
+    assert robot.gateway() != first
+    (line,) = robot.daemon.events("gateway_ended")
+    assert "ended by signal 9" in line["text"]
+    with Bus(robot.daemon.endpoint) as bus:
+        until(lambda: bus.count("gateway_opened") == 2, 5.0, "it is counted")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_the_gateway_closes_with_the_daemon(robot: Open, number: signal.Signals) -> None:
+    gateway = robot.gateway()
+    robot.daemon.signal(number)
+    robot.daemon.ended(5.0)
+    until(lambda: gone(gateway), 1.0, "it closes")
+    assert not robot.lets_in()
+
+
+def test_a_gateway_that_hangs_is_left_behind_by_no_daemon(robot: Open) -> None:
+    gateway = robot.gateway()
+    os.kill(gateway, signal.SIGSTOP)
+    robot.daemon.signal(signal.SIGTERM)
+    begun = time.monotonic()
+    assert robot.daemon.ended(2.0) == 0
+    until(lambda: gone(gateway), 1.0, f"gone, {time.monotonic() - begun:.1f} s after the signal")
+
+
+def test_a_gateway_that_is_stopped_is_ended_and_opened_anew(robot: Open) -> None:
+    first = robot.gateway()
+    os.kill(first, signal.SIGSTOP)
+    robot.daemon.gateway_opens(times=2)
+    assert robot.lets_in()
+    assert gone(first)
+    (line,) = robot.daemon.events("gateway_ended")
+    assert "stopped or hung" in line["text"]
+
+
+def test_a_machine_that_stood_still_opens_no_gateway_anew(robot: Open) -> None:
+    gateway = robot.gateway()
+    os.kill(gateway, signal.SIGSTOP)
+    end = time.monotonic() + 2.0
+    until(lambda: time.monotonic() > end, 5.0, "two seconds")
+    os.kill(gateway, signal.SIGCONT)
+    until(robot.lets_in, 5.0, "it goes on")
+    assert robot.gateway() == gateway
+
+
+def test_what_somebody_at_the_machine_puts_in_the_gateway_s_place_harms_nobody(robot: Open) -> None:
+    huge = b'{"opened": 1, "connections": 0, "full": 1' + b"0" * 400 + b"}"
+    with Bus(robot.daemon.endpoint) as bus:
+        until(lambda: bus.count("gateway_opened") == 1, 5.0, "it has told that it is open")
+        for payload in (b"", b"{}", b"\xff", huge):
+            bus.session.put("acsard/acsar/gateway", payload)
+        assert bus.ask("info")
+        assert bus.count("gateway_opened") == 1
+
+
+def test_without_a_tls_endpoint_there_is_no_gateway_to_open(tmp_path: Path) -> None:
+    config = write_config(tmp_path / "plain.toml", {"bus": {"listen": [free_endpoint()]}})
+    done = finish(acsard("gateway", "--config", str(config)), tmp_path)
+    assert done.code == 2
+    assert "no tls/ endpoint" in done.err
+    with Daemon(tmp_path) as daemon:
+        assert not children(daemon.pid, "acsard gateway")
+
+
+def listening(endpoint: str) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", f'["{endpoint}"]')
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
+    tmp_path: Path, certificates: Certificates, answers: bool
+) -> None:
+    """Zenoh has been seen to stop reading from a gateway on a machine with much other work."""
+    plain, tls = free_endpoint(), free_tls_endpoint()
+    bus = {"listen": [plain, tls], "tls": str(certificates.robot)}
+    config = write_config(tmp_path / "a.toml", {"bus": bus})
+    asked: list[zenoh.Query] = []
+
+    def on_query(query: zenoh.Query) -> None:
+        asked.append(query)
+        if answers:
+            query.drop()
+
+    with zenoh.open(listening(plain)) as daemon:
+        daemon.declare_queryable("acsard/acsar/info", on_query)
+        with Program(acsard("gateway", "--config", str(config)), tmp_path) as gateway:
+            until(lambda: len(asked) > UNANSWERED + 2 * answers, 30.0, f"questions\n{gateway}")
+            if answers:
+                assert gateway.process.poll() is None
+                return
+            assert gateway.ended(10.0) == 1
+            assert "gateway_lost_daemon" in gateway.stdout + gateway.stderr
+
+
+def test_a_gateway_whose_daemon_ended_without_reading_its_signs_of_life_ends_in_order(
+    tmp_path: Path, certificates: Certificates
+) -> None:
+    """The kernel then reports a reset connection in place of its end."""
+    bus = {"listen": [free_endpoint(), free_tls_endpoint()], "tls": str(certificates.robot)}
+    config = write_config(tmp_path / "gateway.toml", {"bus": bus})
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        gateway = subprocess.Popen(
+            acsard("gateway", "--supervised", "--config", str(config)),
+            stdin=theirs.fileno(), stderr=subprocess.PIPE, cwd=tmp_path, text=True,
+        )  # fmt: skip
+        theirs.close()
+        until(lambda: select.select([ours], [], [], 0)[0], 10.0, "a sign of life")
+        ours.close()
+        _, told = gateway.communicate(timeout=10.0)
+    assert (gateway.returncode, told) == (0, "")

@@ -1,0 +1,161 @@
+"""The parts of the pages and of the router's file that follow from the table of keys and roles.
+
+`python -m tests.tables` writes them, and `tests/test_tables.py` compares them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from acsard.core.config.settings import Config
+from acsard.core.messages.permissions import (
+    COMMAND_ROLE,
+    SERVICE_ROLES,
+    USES,
+    Use,
+    has,
+    keys_for,
+)
+from acsard.core.messages.topics import PUBLISHED, TOPICS, Topic, full_key, json_key, source_keys
+from acsard.core.values import ROLES, Role
+from acsard.daemon.gateway.fleet_router import EXAMPLE
+
+ROOT = Path(__file__).parent.parent
+
+
+# the tables of the pages
+
+
+def key_table() -> str:
+    return _table(
+        ("key", "direction", "least role", "type", "rate", "meaning"),
+        ((f"`{t.key}`", t.direction, _least(t), t.type, t.rate, t.note) for t in TOPICS),
+    )
+
+
+def _least(topic: Topic) -> str:
+    if topic.local:
+        return "on the robot"
+    if topic.query == "<role>":
+        return "that role"
+    return topic.publish or topic.query or topic.subscribe or ""
+
+
+def role_table(*, by_bus: bool) -> str:
+    """Return the permissions of each role; by the bus a client may also publish samples."""
+    rows = []
+    for role in ROLES:
+        verbs = [f"`{verb}`" for verb, least in SERVICE_ROLES.items() if least == role]
+        asked = [f"`{t.key}`" for t in TOPICS if t.direction == "query" and t.query == role]
+        if role == "viewer":
+            above = [t.key for t in TOPICS if t.direction == "query" and t.query in ROLES[1:]]
+            others = ", ".join(f"`{key}`" for key in above)
+            may = ["follow every published key", f"query every other key except {others}"]
+            assert verbs == ["`stop`"]
+            may.append("**stop** the robot")
+        else:
+            may = [f"all of {ROLES[ROLES.index(role) - 1]}"]
+            may += ["drive by the listed sources"] if role == COMMAND_ROLE else []
+            may += [f"call {', '.join(verbs)}", *(f"query {key}" for key in asked)]
+            put = [f"`{key}`" for key in keys_for(role, "publish", TOPICS)]
+            may += [f"publish {', '.join(put)}"] if put and by_bus else []
+        rows.append((role, "; ".join(may)))
+    return _table(("role", "permissions"), rows)
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [[cell.replace("|", "\\|") for cell in row] for row in (head, *rows)]
+    top, *below = (f"| {' | '.join(cells)} |\n" for cells in lines)
+    return "".join((top, "|---" * len(head) + "|\n", *below))
+
+
+# the router's file
+
+RULES: dict[tuple[Role, Use], str] = {
+    ("viewer", "subscribe"): "see",
+    ("viewer", "query"): "see",
+    ("viewer", "publish"): "stop",
+    ("operator", "query"): "operate",
+    ("maintainer", "query"): "keep",
+    ("maintainer", "publish"): "sense",
+}
+"""The rule of `router.json5` that grants the keys of a role for a use.
+
+A key of another role and use needs a new rule there and a row here.
+"""
+
+
+def router_file(text: str) -> str:
+    """Return the file with the keys of each rule, and the rules of each role, from the table."""
+    for rule, keys in _rule_keys().items():
+        lines = "".join(f'          "{key}",\n' for key in keys)
+        text = _replaced(
+            rf'(^ *id: "{rule}",\n(?:(?! *id: ).*\n)*? *key_exprs: \[\n(?: *// ROBOT\n)?)'
+            r'(?: *"[^"\n]*",\n)*',
+            lines,
+            text,
+        )
+    for role in ROLES:
+        held = [rule for (least, _), rule in RULES.items() if has(role, least)]
+        names = " ".join(f'"{rule}-{EXAMPLE}",' for rule in dict.fromkeys(held))
+        text = _replaced(
+            rf'(^ *subjects: \["{role}s"\],\n *rules: \[\n.*\n *// ROBOT\n).*\n',
+            f"          {names}\n",
+            text,
+        )
+    return text
+
+
+def _rule_keys() -> dict[str, list[str]]:
+    followed = [key for topic in PUBLISHED for key in (topic.key, json_key(topic.key))]
+    found = {"hear": [full_key("*", key) for key in followed]}
+    # The samples of a gyro go from a client to its robot only, never to other clients.
+    given = [row for row in TOPICS if row.direction != "in"]
+    for role in ROLES:
+        for use in USES:
+            keys = keys_for(role, use, TOPICS if use == "publish" else given)
+            if keys:
+                rule = found.setdefault(f"{RULES[role, use]}-{EXAMPLE}", [])
+                rule += [full_key(EXAMPLE, key) for key in keys]
+    own = [row.pattern for row in TOPICS if not row.local and "<key>" not in row.key]
+    own += [json_key(topic.key) for topic in PUBLISHED]
+    found[f"own-{EXAMPLE}"] = [full_key(EXAMPLE, key) for key in own]
+    sources = [source.name for source in Config().commands.sources]
+    for role in ROLES:
+        if has(role, COMMAND_ROLE):
+            keys = source_keys(sources, role)
+            found[f"commands of {role}"] = [full_key(EXAMPLE, key) for key in keys]
+    return {rule: list(dict.fromkeys(keys)) for rule, keys in found.items()}
+
+
+# all files
+
+
+def _marked(mark: str, table: str) -> Callable[[str], str]:
+    """Return a function that puts the table between the marks of a page."""
+    return lambda text: _replaced(rf"(^<!-- {mark}: .* -->\n)(?:\|.*\n)*", table, text)
+
+
+def _replaced(pattern: str, part: str, text: str) -> str:
+    """Return the text with `part` behind the first group of the only match."""
+    changed, count = re.subn(pattern, lambda found: found[1] + part, text, flags=re.M)
+    assert count == 1, f"{count} places match {pattern}"
+    return changed
+
+
+FILES: dict[str, Callable[[str], str]] = {
+    "README.md": _marked("keys", key_table()),
+    "deploy/systemd/README.md": _marked("roles", role_table(by_bus=True)),
+    "deploy/zenoh/README.md": _marked("roles", role_table(by_bus=True)),
+    "deploy/web/README.md": _marked("roles", role_table(by_bus=False)),
+    "deploy/zenoh/router.json5": router_file,
+}
+"""Maps each file to the function that writes its generated parts again."""
+
+
+if __name__ == "__main__":
+    for name, write in FILES.items():
+        file = ROOT / name
+        file.write_text(write(file.read_text()))

@@ -1,0 +1,14 @@
+"""The tables of the pages and the rules of the router's file equal the table of keys and roles."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.tables import FILES, ROOT
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_has_what_the_table_of_keys_and_roles_gives(name: str) -> None:
+    """`python -m tests.tables` writes the files again."""
+    text = (ROOT / name).read_text()
+    assert FILES[name](text) == text

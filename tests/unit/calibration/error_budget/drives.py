@@ -1,0 +1,165 @@
+"""Random drives, the lines made from them, and the error of odometry that uses those lines.
+
+The path is the truth. Lines are made from it with one cause of error switched on, and summed as
+odometry does, in numpy. This module shares no code with the budget that it judges.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Struct
+
+from acsard.calibration.error_budget.drive_log import Line
+
+Array = npt.NDArray[np.floating[Any]]
+
+GRID, PERIOD = 0.001, 0.01
+RADIUS, TRACK = 0.05, 0.30
+RIPPLE = 0.03
+"""Variation of each side's speed from report to report, rad/s.
+
+Real wheels do not turn more evenly.
+"""
+
+
+class Told(Struct, frozen=True):
+    """The lines of a drive and the distance between its true end and the end they give."""
+
+    lines: list[Line]
+    metres: float
+    off: float
+    """Error of the final position, m."""
+
+
+class Drive:
+    """Angles of both sides over time, of a drive with turns and stops."""
+
+    def __init__(self, seed: int, seconds: float) -> None:
+        self.rng = np.random.default_rng(seed)
+        count = int(seconds / GRID)
+        linear = _ramped(self.rng, count, -0.6, 1.0, 1.0)
+        angular = _ramped(self.rng, count, -1.0, 1.0, 4.0)
+        every = int(PERIOD / GRID)
+        angles = []
+        for way in (-1.0, 1.0):
+            speed = (linear + way * angular * TRACK / 2) / RADIUS
+            speed += np.repeat(self.rng.normal(0, RIPPLE, count // every + 1), every)[:count]
+            angles.append(np.concatenate([[0.0], np.cumsum(speed) * GRID])[::every])
+        self.left, self.right = angles
+        self.t: Array = np.arange(len(self.left)) * PERIOD
+
+    def told(
+        self,
+        at: Array,
+        left: Array,
+        right: Array,
+        dt: Array,
+        kept: npt.NDArray[np.bool_] | None = None,
+    ) -> Told:
+        """Sum speeds x dt of the lines with these stamps, as odometry does.
+
+        `kept` marks the lines that arrive.
+        """
+        x, y, _ = _path(np.diff(self.left), np.diff(self.right))
+        moved = left * dt, right * dt
+        ex, ey, eyaw = _path(*moved)
+        lines = []
+        positions = np.cumsum(moved, axis=1)
+        for k in range(len(at)):
+            one, other = float(left[k]), float(right[k])
+            a, b = float(positions[0, k]), float(positions[1, k])
+            lines.append(
+                Line(float(at[k]), (other, one, one, other), (b, a, a, b), float(eyaw[k]), 0.0)
+            )
+        metres = float(np.abs(np.diff(self.left) + np.diff(self.right)).sum()) * RADIUS / 2
+        return Told(lines, metres, float(np.hypot(x[-1] - ex[-1], y[-1] - ey[-1])))
+
+    def speeds(self) -> tuple[Array, Array]:
+        """Return the mean speeds of each period, rad/s."""
+        return np.diff(self.left) / PERIOD, np.diff(self.right) / PERIOD
+
+
+def late(seed: int, seconds: float, how: str) -> Told:
+    """Return a drive whose stamps are the times at which the host read the lines.
+
+    The lines pass a batching adapter, or the host is busy.
+    """
+    drive = Drive(seed, seconds)
+    left, right = drive.speeds()
+    true, rng = drive.t[1:], drive.rng
+    if how == "batches":
+        at = np.ceil(true / 0.016) * 0.016 + rng.exponential(0.0003, len(true))
+    elif how == "stalls":
+        at = true.copy()
+        for begin in np.arange(1.0, seconds, 3.0) + rng.uniform(
+            0, 1.0, len(np.arange(1.0, seconds, 3.0))
+        ):
+            held = (at >= begin) & (at < begin + 0.08)
+            at[held] = begin + 0.08
+    else:
+        at = true + rng.exponential(0.002, len(true))
+    at = np.maximum.accumulate(at)
+    return drive.told(at, left, right, np.diff(at, prepend=at[0] - PERIOD))
+
+
+def rounded(seed: int, seconds: float, counts: int = 0) -> Told:
+    """Return a drive with speeds in two decimals.
+
+    With `counts`, the firmware counts this many edges per turn in each period.
+    """
+    drive = Drive(seed, seconds)
+    left, right = drive.speeds()
+    if counts:
+        step = 2 * np.pi / counts
+        phases = drive.rng.uniform(0, step, 2)
+        left, right = (
+            np.diff(np.floor((angle + phase) / step)) * step / PERIOD
+            for angle, phase in zip((drive.left, drive.right), phases, strict=True)
+        )
+    left, right = np.round(left, 2), np.round(right, 2)
+    return drive.told(drive.t[1:], left, right, np.full(len(left), PERIOD))
+
+
+def lost(seed: int, seconds: float, share: float, longest: int, stands: bool = False) -> Told:
+    """Return a drive that loses this share of its lines, up to `longest` in a row.
+
+    After a loss the next line's speed covers all of the missing time, or the pose `stands`.
+    """
+    drive = Drive(seed, seconds)
+    left, right = drive.speeds()
+    kept = np.ones(len(left), dtype=bool)
+    for begin in drive.rng.integers(10, len(left) - 60, int(share * len(left) / longest * 2)):
+        kept[begin : begin + int(drive.rng.integers(1, longest + 1))] = False
+    at = drive.t[1:][kept]
+    dt = np.diff(at, prepend=at[0] - PERIOD)
+    if stands:
+        dt[dt > 0.1] = 0.0
+    return drive.told(at, left[kept], right[kept], dt)
+
+
+def _path(left: Array, right: Array) -> tuple[Array, Array, Array]:
+    turn = (right - left) * RADIUS / TRACK
+    yaw = np.cumsum(turn)
+    half = turn / 2
+    chord = (left + right) * RADIUS / 2 * np.sinc(half / np.pi)
+    heading = yaw - half
+    return np.cumsum(chord * np.cos(heading)), np.cumsum(chord * np.sin(heading)), yaw
+
+
+def _ramped(rng: np.random.Generator, count: int, lowest: float, most: float, rate: float) -> Array:
+    """Return a speed that moves at `rate` between random targets.
+
+    A sixth of the targets are zero.
+    """
+    targets: list[float] = []
+    while len(targets) < count:
+        target = 0.0 if rng.random() < 1 / 6 else float(rng.uniform(lowest, most))
+        targets += [target] * int(rng.uniform(0.8, 4.0) / GRID)
+    speeds, speed = np.empty(count), 0.0
+    for i, target in enumerate(targets[:count]):
+        speed += min(max(target - speed, -rate * GRID), rate * GRID)
+        speeds[i] = speed
+    return speeds

@@ -1,0 +1,208 @@
+"""Tests of the error budget against drives with exactly one cause of error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.calibration.error_budget.budget import Budget, Cause, Heard, Share, budget
+from acsard.calibration.error_budget.drive_log import Line
+from acsard.core.config.settings import Config, McuConfig, OdometryConfig
+from acsard.core.motion.uncertainty import GYRO_SCALE
+from tests.unit.calibration.error_budget import drives
+from tests.unit.calibration.error_budget.drives import Told
+
+CONFIG = Config()
+
+Make = Callable[[int, float], Told]
+
+CASES: dict[str, tuple[Cause, Make]] = {
+    "an adapter that holds lines for 16 ms": ("time", partial(drives.late, how="batches")),
+    "stalls of the host": ("time", partial(drives.late, how="stalls")),
+    "a busy host": ("time", partial(drives.late, how="jitter")),
+    "two decimals": ("quantisation", drives.rounded),
+    "40 counts a turn": ("quantisation", partial(drives.rounded, counts=40)),
+    "400 counts a turn": ("quantisation", partial(drives.rounded, counts=400)),
+    "4000 counts a turn": ("quantisation", partial(drives.rounded, counts=4000)),
+    "a line of ten lost": ("gaps", partial(drives.lost, share=0.1, longest=1)),
+    "up to five lines lost": ("gaps", partial(drives.lost, share=0.1, longest=5)),
+    "bursts lost in which the pose stands": (
+        "gaps",
+        partial(drives.lost, share=0.02, longest=40, stands=True),
+    ),
+}
+
+
+def share(found: Budget, cause: Cause) -> Share:
+    return next(one for one in found.shares if one.cause == cause)
+
+
+def as_predicted(case: str, seconds: float, seeds: int) -> float:
+    """Return the rms over drives of the final error divided by the error in the budget."""
+    cause, make = CASES[case]
+    ratios = []
+    for seed in range(seeds):
+        told = make(seed, seconds)
+        found = budget(Heard(told.lines, []), CONFIG, metres=told.metres * 0.999)
+        millimetres = share(found, cause).mm_per_100_m
+        assert millimetres
+        ratios.append(1e3 * told.off / millimetres)
+    return math.sqrt(sum(ratio**2 for ratio in ratios) / seeds)
+
+
+@pytest.mark.variations(4)
+@pytest.mark.parametrize("case", ["an adapter that holds lines for 16 ms", "two decimals",
+                                  "400 counts a turn", "up to five lines lost"])  # fmt: skip
+def test_the_share_of_a_cause_is_about_the_error_it_makes_on_a_short_drive(case: str) -> None:
+    assert 1 / 2 < as_predicted(case, 20.0, 10) < 2
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("case", CASES)
+def test_the_share_of_a_cause_is_within_half_of_the_error_it_makes_in_450_m(case: str) -> None:
+    ratio = as_predicted(case, 600.0, 20)
+    print(f"{case}: error / share {ratio:.2f}")
+    assert 1 / 1.5 < ratio < 1.5
+
+
+# robots that do not drive, causes that are not measured, and a gyro
+
+
+def driven() -> Told:
+    return drives.rounded(1, 10.0)
+
+
+def test_a_robot_that_stands_is_told_its_settings_and_no_more() -> None:
+    still = [Line(n / 100, (0.0,) * 4, (1.0,) * 4, 0.0, 0.0) for n in range(300)]
+    known = replace(CONFIG, odometry=OdometryConfig(wheel_separation_multiplier_std=0.02))
+    found = budget(Heard(still, []), known)
+    assert found.still
+    assert {one.cause: one.basis for one in found.shares} == {
+        "slip": "settings",
+        "parameters": "settings",
+    }
+    assert share(found, "parameters").deg_per_turn == pytest.approx(0.02 * 360, rel=0.01)
+    assert share(found, "parameters").mm_per_100_m == pytest.approx(0.0, abs=1e-6)
+    assert found.at_rest[1] > 0.0
+
+
+def test_without_lines_it_is_the_same() -> None:
+    assert budget(Heard([], []), CONFIG).still
+
+
+def test_parameters_that_nobody_measured_are_unknown_and_not_nothing() -> None:
+    found = share(budget(Heard(driven().lines, []), CONFIG), "parameters")
+    assert (found.basis, found.mm_per_100_m, found.deg_per_turn) == ("unknown", None, None)
+
+
+def test_the_track_that_a_gyro_implies_is_a_measured_error() -> None:
+    found = share(budget(Heard(driven().lines, [], learned=1.1), CONFIG), "parameters")
+    assert found.basis == "measured"
+    assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
+
+
+def test_a_learned_track_that_is_in_use_errs_by_its_own_deviation() -> None:
+    heard = Heard(driven().lines, [], learned=1.1, deviation=0.02, used=True)
+    found = share(budget(heard, CONFIG), "parameters")
+    assert found.basis == "measured"
+    assert found.deg_per_turn == pytest.approx(7.2, rel=0.02)
+
+
+def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -> None:
+    config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
+    found = budget(Heard(driven().lines, [], learned=1.1, deviation=0.02), config)
+    assert found.multiplier == 1.5
+    assert found.learned_std == pytest.approx(0.033)
+    assert found.learned == pytest.approx(1.65)
+    assert budget(Heard(driven().lines, []), config).learned is None
+
+
+def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
+    lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
+    found = budget(Heard(lines, [], gyro=True), CONFIG)
+    for cause in ("time", "quantisation", "gaps", "slip"):
+        assert share(found, cause).deg_per_turn == 0.0
+    turns = found.turned / 360
+    grown = math.degrees(math.sqrt(lines[-1].yaw_variance / turns + (GYRO_SCALE * math.tau) ** 2))
+    assert share(found, "gyro").deg_per_turn == pytest.approx(grown, rel=0.05)
+
+
+def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
+    """Return the gyro's share of the budget.
+
+    The gyro's noise is 1e-6 rad2 in each line that moves. Its scale error grows with all turns
+    since the pose was set; `before` of them precede these lines.
+    """
+    heading, noise, made = before * math.tau, 0.0, list[Line]()
+    for last, line in pairwise([lines[0], *lines]):
+        heading += math.remainder(line.yaw - last.yaw, math.tau)
+        noise += 1e-6 if any(line.speeds) else 0.0
+        made.append(replace(line, yaw_variance=noise + (GYRO_SCALE * heading) ** 2))
+    return share(budget(Heard(made, [], gyro=True), CONFIG), "gyro")
+
+
+@pytest.mark.parametrize("before", [-10, 10])
+def test_what_a_gyro_costs_a_turn_does_not_depend_on_what_was_turned_before(before: int) -> None:
+    found, fresh = (with_a_gyro(driven().lines, turns) for turns in (before, 0.0))
+    assert found.deg_per_turn == pytest.approx(fresh.deg_per_turn, rel=0.02)
+
+
+def test_at_rest_a_gyro_costs_nothing_and_says_nothing_of_a_drive() -> None:
+    lines = driven().lines
+    still = [
+        replace(lines[0], at=lines[0].at - 3.0 + n / 100, speeds=(0.0,) * 4) for n in range(300)
+    ]
+    found, rested = with_a_gyro(lines), with_a_gyro([*still, *lines])
+    assert rested.deg_per_turn == pytest.approx(found.deg_per_turn, rel=0.05)
+
+
+def test_of_one_long_spin_nobody_knows_what_is_noise_and_what_scale() -> None:
+    line = driven().lines[0]
+    spin = [
+        replace(line, at=n / 100, yaw=n / 100, positions=(0.01 * n, -0.01 * n, -0.01 * n, 0.01 * n),
+                speeds=(1.0, -1.0, -1.0, 1.0))
+        for n in range(3000)
+    ]  # fmt: skip
+    assert with_a_gyro(spin, 10.0).basis == "unknown"
+
+
+def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantisation() -> None:
+    counted = replace(CONFIG, mcu=McuConfig(link_check="require", encoder_counts=400))
+    found = budget(Heard(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
+    assert share(found, "time").mm_per_100_m == share(found, "gaps").mm_per_100_m == 0.0
+    assert (share(found, "quantisation").mm_per_100_m or 0.0) > 0.0
+    assert found.counts == 400
+
+
+def test_of_lines_that_did_not_all_come_here_nothing_is_told_of_time() -> None:
+    found = budget(Heard(driven().lines, [], whole=False), CONFIG)
+    assert {share(found, cause).basis for cause in ("time", "quantisation", "gaps")} == {"unknown"}
+
+
+def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
+    """The front right wheel reports nothing, so the mean of its side is half of the true value."""
+    lines = [
+        replace(line, positions=(0.0, *line.positions[1:]), speeds=(0.0, *line.speeds[1:]))
+        for line in driven().lines
+    ]
+    found = share(budget(Heard(lines, []), CONFIG), "slip")
+    assert found.basis == "measured"
+    assert (found.mm_per_100_m or 0.0) > 10_000
+
+
+def test_the_largest_is_of_the_place_and_else_of_the_heading() -> None:
+    found = budget(Heard(driven().lines, []), CONFIG)
+    quantisation, slip = found.largest("measured"), found.largest("measured", "settings")
+    assert quantisation is not None
+    assert slip is not None
+    assert (quantisation.cause, slip.cause) == ("quantisation", "slip")
+    assert found.largest() is None
+    millimetres, _ = found.total()
+    assert millimetres is not None
+    assert millimetres >= max(one.mm_per_100_m or 0.0 for one in found.shares)

@@ -1,0 +1,108 @@
+"""Tests of the error budget as text."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
+from acsard.calibration.error_budget.budget_report import advice, parts
+from acsard.terminal.output import SENTENCES, plain
+from tests.each import each
+
+DRIVEN = Budget(
+    10.0, 4.0, 400.0, 1000, 3, 0.25, 0.004, 0.01, 0, gyro=False, still=False,
+    at_rest=(1e-4, 5e-4), shares=(),
+)  # fmt: skip
+
+
+def of(*shares: tuple[Cause, float | None, Basis], **fields: Any) -> Budget:
+    """Return a budget with these shares by cause, error in mm and basis."""
+    made = tuple(Share(cause, mm, mm, basis) for cause, mm, basis in shares)
+    return replace(DRIVEN, shares=made, **fields)
+
+
+def text(budget: Budget) -> str:
+    return plain(*parts(budget), width=SENTENCES)
+
+
+KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
+
+
+@each(
+    ("cause", "says"),
+    [
+        ("time", "latency_timer"),
+        ("quantisation", "link_check"),
+        ("gaps", "3 lines were lost, so 0.25 s"),
+        ("slip", "gyro"),
+        ("gyro", "stand"),
+        ("parameters", "acsard calibrate"),
+    ],
+)
+def test_one_sentence_says_what_to_do_about_the_largest_that_was_measured(
+    cause: Cause, says: str
+) -> None:
+    told = advice(of((cause, 100.0, "measured"), KNOWN))
+    assert told.startswith(f"the largest is {cause}: ")
+    assert says in told
+
+
+def test_coarse_encoders_are_named() -> None:
+    assert "40 counts" in advice(of(("quantisation", 100.0, "measured"), KNOWN, counts=40))
+
+
+def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
+    told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
+    assert told.startswith("[odometry] declares slip the largest")
+    assert "of the measured causes the largest is time" in told
+
+
+def test_who_never_calibrated_is_told_so_first() -> None:
+    told = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
+    assert told.startswith("the error of wheel radii and track width is unknown")
+    assert "the largest is time" in told
+
+
+def test_without_an_error_it_says_so() -> None:
+    assert advice(of()) == "nothing here makes odometry wrong"
+
+
+def test_the_table_has_every_cause_and_their_sum() -> None:
+    rows = text(of(("time", 30.0, "measured"), ("slip", 40.0, "settings"))).splitlines()
+    assert next(row for row in rows if row.startswith("time")).split()[1:3] == ["30", "30.00"]
+    assert next(row for row in rows if row.startswith("slip")).endswith("[odometry]")
+    assert next(row for row in rows if row.startswith("all")).split()[1:3] == ["50", "50.00"]
+    assert max(map(len, rows)) <= SENTENCES
+
+
+def test_what_this_driving_does_not_tell_is_a_dash_and_what_is_tiny_no_zero() -> None:
+    rows = text(of(("time", 0.01, "measured"), ("gaps", None, "unknown"))).splitlines()
+    assert next(row for row in rows if row.startswith("time")).split()[1] == "<1"
+    assert next(row for row in rows if row.startswith("gaps")).split()[1:3] == ["-", "-"]
+
+
+@pytest.mark.parametrize("still", [False, True])
+def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: bool) -> None:
+    found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
+    told = " ".join(text(found).split())
+    assert (
+        "multiplier would be 1.700 (standard deviation 0.050); the configured value, which is used"
+        in told
+    )
+    assert "which is used, is 1.500. If both differ" in told
+    assert "would be" not in text(of(KNOWN, still=still))
+    told = " ".join(text(replace(found, learned_used=True)).split())
+    assert "multiplier is 1.700 (standard deviation 0.050). This value is used" in told
+    assert "the configured value is 1.500." in told
+
+
+def test_a_robot_that_stands_is_told_what_settings_tell_and_to_drive() -> None:
+    told = text(of(("parameters", 7.2, "settings"), still=True))
+    assert "stands still" in told
+    assert "0.10 mm/s" in told
+    assert "7.20 deg a turn" in told
+    assert "Drive the robot" in told
+    assert "never calibrated" in text(of(("parameters", None, "unknown"), still=True))

@@ -1,0 +1,258 @@
+"""Tests of one leg of a guided calibration: the commands it sends, and the events that end it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from acsard.calibration.guided.leg_driver import HELD_UP, LegDriver, Phase
+from acsard.calibration.guided.legs import Leg, Move
+from acsard.client.commander import OPENED_S
+from acsard.client.follower import QUIET_S
+from acsard.core.config.settings import DriveConfig
+from acsard.core.messages.schema import RobotState, SourceState, Time
+from acsard.core.values import REST, Twist
+from tests.each import each
+
+US, OTHER = "joe/1/aa", "joe/2/bb"
+LEG = Leg("", "", (Move(1.0, 0.3, 0.0), Move(2.0, 0.0, 0.5)))
+TURN = Leg("", "", (Move(5.0, 0.0, 0.5),), by_key=True)
+
+TICK = 0.02
+RADIUS, TRACK = 0.05, 0.30
+
+Late = Callable[[RobotState], RobotState]
+
+
+def telling(twist: Twist) -> RobotState:
+    """Return the state of a robot that follows this twist, sent by app."""
+    left, right = (
+        (twist.linear + side * twist.angular * TRACK / 2) / RADIUS for side in (-1.0, 1.0)
+    )
+    return RobotState(
+        stamp=Time(), mode="driving", reason="commanded by app", x=0.0, y=0.0, yaw=0.0,
+        linear=twist.linear, angular=twist.angular, wheels=[right, left, left, right], link="up",
+        source="app", sources=[SourceState("app", 50, 0.01, "")], refused="", counters={},
+        sender=US,
+    )  # fmt: skip
+
+
+class World:
+    """A daemon that publishes its state every tick, and a robot that follows its commands."""
+
+    def __init__(self, leg: Leg) -> None:
+        self.now = 100.0
+        self.driver = LegDriver(leg, "app", DriveConfig(), self.now, US)
+        self.said: list[Twist] = []
+        self.tells: Late = lambda state: state
+        self.speaks = True
+
+    def run(self, seconds: float) -> World:
+        for _ in range(round(seconds / TICK)):
+            self.now += TICK
+            done = self.said[-1] if self.said else REST
+            if self.speaks:
+                self.driver.state(self.tells(telling(done)), self.now)
+                self.driver.wheels(abs(done.linear) + abs(done.angular), self.now)
+            self.said.append(self.driver.step(self.now))
+        return self
+
+    def until_moving(self) -> World:
+        while self.said[-1:] in ([], [REST]):
+            self.run(TICK)
+        return self
+
+
+def changed(**fields: object) -> Late:
+    return lambda state: msgspec.structs.replace(state, **fields)
+
+
+def test_it_opens_with_zeros_drives_the_moves_and_ends_when_the_wheels_stand() -> None:
+    world = World(LEG).run(5.0)
+    times = {said: world.said.count(said) * TICK for said in world.said}
+    assert world.said[0] == REST
+    assert times[Twist(0.3, 0.0)] == pytest.approx(1.0, abs=2 * TICK)
+    assert times[Twist(0.0, 0.5)] == pytest.approx(2.0, abs=2 * TICK)
+    assert (world.driver.phase, world.said[-1]) == (Phase.DONE, REST)
+    assert world.driver.progress(world.now) == 1.0
+
+
+def test_nothing_moves_until_zeros_count() -> None:
+    world = World(LEG)
+    waiting = [SourceState("app", 50, 0.01, "send a zero first: app must send a zero")]
+    world.tells = changed(sources=waiting, mode="ready", source="", sender="")
+    world.run(OPENED_S + 0.5)
+    assert set(world.said) == {REST}
+    assert "send a zero first" in world.driver.halted
+
+
+STOPS: dict[str, Late] = {
+    "the robot is stopped": changed(mode="stopped", reason="stopped by top"),
+    "the robot is fault": changed(mode="fault"),
+    "the robot is waiting": changed(mode="waiting"),
+    "the robot is inactive": changed(mode="inactive"),
+    "the robot is shutdown": changed(mode="shutdown"),
+    "teleop commands the robot now": changed(source="teleop"),
+    "send a zero first": changed(
+        mode="ready", source="", sources=[SourceState("app", 50, 0.01, "send a zero first")]
+    ),
+    "the daemon hears no command of source app": changed(
+        sources=[SourceState("app", 50, 3.0, "a command")]
+    ),
+    "no command of source app has arrived for 0.4 s": changed(
+        sources=[SourceState("app", 50, 3.0, "")]
+    ),
+    "app is not one of commands.sources": changed(sources=[SourceState("nav", 50, 0.01, "")]),
+    "although 0.30 is commanded": changed(wheels=[0.0] * 4),
+    "sends no feedback": changed(wheels=[]),
+}
+
+
+@each("why", STOPS)
+def test_what_is_not_as_it_must_be_stops_it_for_good(why: str) -> None:
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
+    world.tells = STOPS[why]
+    world.run(3.0)
+    stopped = world.said.index(REST, world.said.index(Twist(0.3, 0.0)))
+    assert set(world.said[stopped:]) == {REST}
+    assert world.driver.phase is Phase.HALTED
+    assert why in world.driver.halted
+    world.tells = lambda state: state
+    assert set(world.run(3.0).said[stopped:]) == {REST}
+
+
+TWO = [SourceState("app", 50, 0.01, "1 more of its senders: wait until the first one is silent")]
+
+
+def of_two(leg: Leg, sender: str) -> World:
+    """Return a world whose daemon receives two calibrations and follows this one."""
+    world = World(leg)
+    world.tells = changed(sources=TWO, sender=sender)
+    return world
+
+
+def test_of_two_calibrations_the_one_that_is_followed_goes_on() -> None:
+    assert of_two(LEG, US).run(5.0).driver.phase is Phase.DONE
+
+
+def test_of_two_calibrations_the_other_says_who_drives_and_moves_nothing() -> None:
+    world = of_two(LEG, OTHER).run(OPENED_S + 0.5)
+    assert set(world.said) == {REST}
+    assert world.driver.halted.startswith(f"another program drives the robot as app, {OTHER}")
+    assert "end it, or wait" in world.driver.halted
+
+
+def test_one_whose_robot_another_takes_on_the_way_says_so_at_once() -> None:
+    world = of_two(LEG, US).until_moving()
+    world.tells = changed(sources=TWO, sender=OTHER)
+    world.run(TICK)
+    assert OTHER in world.driver.halted
+
+
+def test_a_program_that_leaves_while_zeros_go_out_is_waited_for() -> None:
+    world = of_two(LEG, OTHER).run(1.0)
+    world.tells = changed(sender=US)
+    assert world.run(5.0).driver.phase is Phase.DONE
+
+
+def test_a_daemon_that_falls_silent_stops_it() -> None:
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
+    world.speaks = False
+    world.run(QUIET_S + 2 * TICK)
+    assert world.said[-1] == REST
+    assert world.driver.halted == "nothing received from the daemon"
+
+
+def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
+    assert world.driver.step(world.now + QUIET_S + TICK) == REST
+    assert world.driver.halted == HELD_UP
+
+
+def test_one_that_stood_still_drives_on_by_nothing_that_has_waited_for_it() -> None:
+    """The process stands still after Ctrl-Z, after Ctrl-S, or when it gets no core.
+
+    It receives the messages of that time when it continues.
+    """
+    world = World(LEG).until_moving()
+    world.now += 1.5
+    world.run(TICK)
+    assert world.said[-1] == REST
+    assert world.driver.halted == HELD_UP
+    assert set(world.run(3.0).said[-100:]) == {REST}
+
+
+def test_a_key_pressed_while_it_stood_still_is_no_end_of_a_turn() -> None:
+    world = World(TURN).until_moving()
+    world.now += 1.5
+    world.driver.key(" ", world.now)
+    assert world.driver.halted == HELD_UP
+
+
+def test_a_daemon_that_waits_for_us_for_a_moment_goes_on() -> None:
+    world = World(Leg("", "", (Move(10.0, 0.3),))).until_moving()
+    world.tells = changed(sources=[SourceState("app", 50, 0.4, "")], wheels=[0.0] * 4)
+    world.run(0.3)
+    world.tells = lambda state: state
+    assert not world.run(3.0).driver.halted
+
+
+def test_progress_is_the_share_of_the_time() -> None:
+    world = World(LEG).until_moving()
+    told = [world.run(0.5).driver.progress(world.now) for _ in range(5)]
+    assert told == pytest.approx([share / 6 for share in range(1, 6)], abs=0.02)
+
+
+def test_a_key_stops_it_in_the_same_step() -> None:
+    world = World(LEG).until_moving()
+    world.driver.key(" ", world.now)
+    assert world.driver.step(world.now) == REST
+    assert world.driver.phase is Phase.HALTED
+
+
+def test_the_hand_that_lies_on_enter_while_zeros_go_out_stops_nothing() -> None:
+    world = World(LEG).run(0.1)
+    world.driver.key("\n", world.now)
+    world.until_moving()
+    assert not world.driver.halted
+
+
+@pytest.mark.parametrize("leg", [LEG, TURN], ids=["leg", "turn"])
+def test_any_other_key_meanwhile_keeps_it_from_moving_at_all(leg: Leg) -> None:
+    world = World(leg).run(0.1)
+    world.driver.key(" ", world.now)
+    world.run(3.0)
+    assert set(world.said) == {REST}
+    assert world.driver.phase is Phase.HALTED
+
+
+def test_a_turn_that_a_key_ends_ends_well_by_it() -> None:
+    world = World(TURN).until_moving()
+    world.run(1.0)
+    world.driver.key(" ", world.now)
+    assert world.driver.step(world.now) == REST
+    assert world.run(1.0).driver.phase is Phase.DONE
+
+
+def test_a_turn_that_nobody_ends_is_no_measurement() -> None:
+    world = World(TURN).run(8.0)
+    assert world.said[-1] == REST
+    assert "no key was pressed" in world.driver.halted
+
+
+def test_a_gyro_that_sees_less_than_the_wheels_do_is_no_disobedience() -> None:
+    world = World(LEG)
+    world.tells = changed(angular=0.2, linear=0.3)
+    assert world.run(5.0).driver.phase is Phase.DONE
+
+
+def test_wheels_that_never_come_to_rest_are_told() -> None:
+    world = World(Leg("", "", (Move(0.5, 0.3),))).until_moving()
+    for _ in range(500):
+        world.now += TICK
+        world.driver.state(telling(REST), world.now)
+        world.driver.wheels(1.0, world.now)
+        world.driver.step(world.now)
+    assert "come to rest" in world.driver.halted

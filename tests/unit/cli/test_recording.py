@@ -1,0 +1,436 @@
+"""Tests of `acsard recording`: the list, the timeline, the replay and the recovered file."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import shutil
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.cli import main
+from acsard.cli.recording import SERVICE
+from acsard.core.config.settings import Config, RecordConfig
+from acsard.core.values import Event
+from acsard.host.errors import Exit
+from acsard.recording.directory import Ring
+from acsard.recording.file import Recording, Writing
+from acsard.recording.recorded_steps import Taken, Unfinished
+from acsard.recording.recovery import recover
+from tests.scenarios.taped import Tape, chunks
+from tests.scenarios.world import START, World
+
+HARMED = 40
+"""Number of damaged files; every verb processes each of them."""
+
+NEW = {"show": "", "replay": "", "export": ".mcap", "report": ".html", "recover": ".new.mcap"}
+"""Maps each verb that takes a file to the suffix of the file that it makes."""
+
+
+@pytest.fixture(scope="module")
+def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with two recordings, of which the second is truncated."""
+    where = tmp_path_factory.mktemp("record")
+    for number, seconds in ((1, 2.0), (2, 4.0)):
+        tape = Tape()
+        world = World(recorder=tape)
+        world.drive(0.5, seconds=seconds)
+        world.call("stop")
+        world.run(0.5)
+        path = where / f"00000{number}-20270115T080000Z.mcap"
+        tape.write(path, Config())
+    path.rename(path.with_name(path.name + ".part"))
+    path = path.with_name(path.name + ".part")
+    path.write_bytes(path.read_bytes()[:-2000])
+    return where
+
+
+def log(capsys: pytest.CaptureFixture[str], where: Path, *words: str) -> tuple[int, str, str]:
+    code = main(["recording", *words, "--directory", str(where)])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+def test_the_list_has_a_line_each_and_says_what_happened(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = log(capsys, where)
+    first, second = out.splitlines()
+    assert code == 0
+    assert "000001-20270115T080000Z.mcap" in first
+    assert first.endswith("start, 1 change of commander, 1 stop (stopped by unnamed (native))")
+    assert second.endswith(
+        "start, 1 change of commander  [no end: cut off, or still being recorded]"
+    )
+
+
+def test_the_list_tells_a_start_from_a_file_that_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The files are whole, truncated, recovered into a second file, and recovered in place."""
+    tape = Tape(every=200)
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=4.0)
+    for number, first in enumerate((0, 200)):
+        whole = tmp_path / f"00000{number}-20270115T080000Z.mcap"
+        tape.write(whole, Config(), first)
+        data = whole.read_bytes()
+        for place, name in enumerate((".mcap.part", "a.mcap", "b.mcap"), start=1):
+            part = tmp_path / f"0000{place}{number}-20270115T080000Z{name}"
+            part.write_bytes(data[: chunks(data)[-2][1]])
+            if place > 1:
+                cut = part.rename(tmp_path / "cut")
+                assert recover(cut, part, "crash", room=place == 2) == ""
+    rows = log(capsys, tmp_path)[1].splitlines()
+    assert len(rows) == 8
+    for row in rows:
+        starts = row.partition("-")[0].endswith("0")
+        assert ("  start, 1 change of commander" in row) is starts
+        assert ("start" in row) is starts
+
+
+def test_where_nothing_was_ever_recorded_it_says_what_records(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = log(capsys, tmp_path / "never")
+    assert (code, out) == (1, "")
+    assert "nothing is recorded in" in err
+    assert "acsard run --record DIRECTORY" in err
+
+
+def test_a_story_is_told_in_order_as_sentences_or_json(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = log(capsys, where, "show", "1")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].endswith("start: the daemon starts")
+    assert any("drive: drove 0.85 m in 2.0 s (by app)" in line for line in lines)
+    _, out, _ = log(capsys, where, "show", "1", "--json")
+    told = [json.loads(line) for line in out.splitlines()]
+    assert len(told) == len(lines)
+    assert [one["seconds"] for one in told] == sorted(one["seconds"] for one in told)
+
+
+def test_a_part_of_a_story_by_seconds_and_by_the_time_of_day(
+    where: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def names(*words: str) -> set[str]:
+        _, out, _ = log(capsys, where, "show", "1", "--json", *words)
+        return {json.loads(line)["name"] for line in out.splitlines()}
+
+    assert "start" in names("--to", "1")
+    assert names("--from", "1.5", "--to", "2.5") == {"stop", "drive", "mode"}
+    first = log(capsys, where, "show", "1")[1].split(" ")[0]
+    hours, minutes, seconds = first.split(":")
+    after = f"{hours}:{minutes}:{float(seconds) + 1.5:09.6f}"
+    assert names("--from", after) == names("--from", "1.5")
+
+
+def starts_at(world: World, hours: int, minutes: int, seconds: float, days: int = 0) -> None:
+    """Set the world's clock to this time of day."""
+    day = time.localtime(START.wall_ns / 1e9)
+    begin = (day.tm_year, day.tm_mon, day.tm_mday + days, hours, minutes, 0, 0, 0, -1)
+    world.wall_offset_ns = int((time.mktime(begin) + seconds) * 1e9) - world.now_ns
+
+
+def taped(where: Path, set_to: tuple[int, int, float, int] | None) -> Tape:
+    """Record from two seconds before midnight to three seconds after it.
+
+    With `set_to`, the clock is set at midnight instead.
+
+    A stop happens in the first second of the new day.
+    """
+    tape = Tape()
+    world = World(recorder=tape)
+    starts_at(world, 23, 59, 58.0)
+    world.run(2.0)
+    if set_to:
+        starts_at(world, *set_to)
+    world.run(0.5)
+    world.call("stop")
+    world.run(2.5)
+    tape.write(where / "000001-20270115T235958Z.mcap", Config())
+    return tape
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(
+    ("set_to", "hour"),
+    [(None, "00:00"), ((14, 3, 0.0, 20), "14:03"), ((6, 0, 0.0, -3), "06:00")],
+)
+def test_a_time_of_day_is_found_over_midnight_and_where_the_clock_was_set(
+    set_to: tuple[int, int, float, int] | None,
+    hour: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    taped(tmp_path, set_to)
+
+    def names(*words: str) -> set[str]:
+        _, out, _ = log(capsys, tmp_path, "show", "1", "--json", *words)
+        return {json.loads(line)["name"] for line in out.splitlines()}
+
+    assert names("--to", "23:59:59") >= {"start"}
+    assert "stop" not in names("--to", "23:59:59")
+    assert "stop" in names("--from", f"{hour}:00")
+    assert "start" not in names("--from", f"{hour}:00")
+    assert "stop" in names("--to", f"{hour}:02")
+    assert names("--from", f"{hour}:02.5", "--to", f"{hour}:02.7") == set()
+    assert names("--from", "3.5") == set()
+    assert "stop" in names("--from", "2", "--to", "3.4")
+
+
+@pytest.mark.slow
+def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    taped(tmp_path, None)
+    rows = {}
+    for name, words in (("all", ()), ("new", ("--from", "00:00")), ("old", ("--to", "00:00"))):
+        assert log(capsys, tmp_path, "export", "1", f"{name}.csv", "--csv", *words)[0] == 0
+        rows[name] = len((tmp_path / f"{name}.csv").read_text().splitlines()) - 1
+    assert abs(rows["old"] + rows["new"] - rows["all"]) <= 1
+    assert 1.2 < rows["new"] / rows["old"] < 1.8  # 3 s and 2 s, and one start
+    assert log(capsys, tmp_path, "report", "1", "new.html", "--from", "00:00")[0] == 0
+    assert re.search(r"<dt>How long</dt><dd>(2\.9|3) s", (tmp_path / "new.html").read_text())
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_what_a_kill_has_cut_says_so_once_it_is_whole(
+    cut: bool, where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    part = tmp_path / "000002-20270115T080000Z.mcap.part"
+    (data,) = [path.read_bytes() for path in where.glob("000001*")]
+    shutil.copy(next(where.glob("*.part")), part)
+    if not cut:
+        part.unlink()
+        (tmp_path / part.stem).write_bytes(data)
+    Ring(RecordConfig(str(tmp_path))).close()
+    told = "cut: the daemon or the computer ended without notice"
+    _, out, _ = log(capsys, tmp_path)
+    assert (told in out) is cut
+    _, out, err = log(capsys, tmp_path, "show")
+    assert (out.splitlines()[-1].endswith(f"  ! {told}"), told in err) == (cut, cut)
+    _, out, _ = log(capsys, tmp_path, "show", "--json")
+    last = json.loads(out.splitlines()[-1])
+    assert (last["name"] == "cut", last["text"] == told.removeprefix("cut: ")) == (cut, cut)
+    if cut:
+        new = tmp_path / "new.html"
+        _, _, err = log(capsys, tmp_path, "report", "2", str(new))
+        assert (told in err, told in new.read_text()) == (True, True)
+    copy = tmp_path / "copy.mcap"
+    assert (
+        log(capsys, tmp_path, "recover", str(next(tmp_path.glob("*2-*.mcap"))), str(copy))[0] == 0
+    )
+    assert (told in log(capsys, tmp_path, "show", str(copy))[1]) is cut
+
+
+def test_what_a_stranger_recorded_moves_no_cursor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tape = Tape()
+    World(recorder=tape).run(0.3)
+    inputs, outputs, left = tape.taken[5]
+    event = Event("stop", "\x1b[2J\u202egone", by="\x1b]0;title\x07")
+    tape.taken[5] = Taken(inputs, replace(outputs, events=(event,)), left)
+    tape.write(tmp_path / "000001-20270115T080000Z.mcap", Config())
+    for words in ((), ("show", "1"), ("show", "1", "--json")):
+        code, out, _ = log(capsys, tmp_path, *words)
+        assert (code, "stop" in out) == (0, True)
+        assert all(line.isprintable() for line in out.splitlines())
+
+
+@pytest.mark.parametrize("when", ["late", "12:3", "-1", "12:00:00:00"])
+def test_a_time_that_is_none_is_refused(
+    where: Path, when: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        log(capsys, where, "show", "1", f"--from={when}")
+    assert "neither seconds nor HH:MM:SS" in capsys.readouterr().err
+
+
+def test_a_replay_says_that_all_is_the_same(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = log(capsys, where, "replay", "1")
+    assert (code, err) == (0, "")
+    same, _, rest = out.partition(" lines are the same, ")
+    now, _, then = same.partition(" of ")
+    assert now == then
+    assert " poses, " in rest
+
+
+def test_a_replay_says_what_it_has_compared(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, out, _ = log(capsys, where, "replay", "1")
+    _, told = out.splitlines()
+    for word in (
+        "every line to the board",
+        "every pose",
+        "the mode in every step",
+        "the recording",
+    ):
+        assert word in told
+
+
+def test_a_replay_of_what_was_cut_says_so(where: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = log(capsys, where, "replay")  # without a name it takes the newest
+    assert code == 0
+    assert "no end" in err
+
+
+def test_with_another_configuration_it_tells_what_would_have_been(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "slow.toml"
+    other.write_text("[limits]\nlinear_speed = 0.3\n")
+    code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
+    assert code == 0
+    assert "the first difference, in its line, left: step " in out
+    assert "  then  ap" in out
+    assert "the fastest wheel: 10.00 rad/s then, 6.00 rad/s now" in out
+
+
+def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "slow.toml"
+    other.write_text("[limits]\nlinear_speed = 0.1\nlinear_acceleration = 0.5\n")
+    code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
+    assert code == 0
+    (keys,) = [line for line in out.splitlines() if line.startswith("changed settings: ")]
+    assert "limits.linear_speed 1.0 then, 0.1 now" in keys
+    assert "limits.linear_acceleration 1.0 then, 0.5 now" in keys
+    (told,) = [line for line in out.splitlines() if line.startswith("there the fastest wheel")]
+    assert told.endswith(": by limits.linear_speed, limits.linear_acceleration")
+    then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
+    assert then > now
+    (fault,) = [line for line in out.splitlines() if "in fault from " in line]
+    assert "wheel" in fault
+    assert "a robot with this configuration need not have had that fault" in out
+
+
+def test_settings_that_change_no_line_are_told_all_the_same(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = tmp_path / "same.toml"
+    same.write_text("[rates]\nstate = 5.0\n")
+    code, out, _ = log(capsys, where, "replay", "1", "--config", str(same))
+    assert (code, "differs" in out) == (0, False)
+    assert "as that configuration computes them from the same inputs" in out
+    assert out.splitlines()[-1].startswith("changed settings: rates.state 10.0 then, 5.0 now")
+
+
+def test_what_was_cut_is_written_as_a_finished_file(
+    where: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new.mcap"
+    (cut,) = where.glob("*.part")
+    code, out, _ = log(capsys, where, "recover", str(cut), str(new))
+    assert code == 0
+    assert f"messages in {new}" in out
+    assert main(["recording", "replay", str(new)]) == 0
+    assert "cut, or still being recorded, when it was recovered" in capsys.readouterr().err
+    assert log(capsys, where, "recover", str(cut), str(tmp_path / "none" / "x"))[0] == 1
+
+
+def test_what_is_recovered_stands_there_whole_or_not_at_all_and_over_no_recording(
+    where: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "new.mcap"
+    (cut,) = where.glob("*.part")
+    seen: list[bool] = []
+    finish = Writing.finish
+
+    def looked(writing: Writing, *how: str) -> None:
+        seen.append(new.exists())
+        finish(writing, *how)
+
+    monkeypatch.setattr(Writing, "finish", looked)
+    assert log(capsys, where, "recover", str(cut), str(new))[0] == 0
+    assert seen == [False]
+    code, _, err = log(capsys, where, "recover", str(cut), str(new), "--force")
+    assert (code, "it is a recording; name another file" in err) == (1, True)
+    (mine := tmp_path / "mine").write_text("mine")
+    code, _, err = log(capsys, where, "recover", str(cut), str(mine))
+    assert (code, "--force" in err, mine.read_text()) == (1, True, "mine")
+    assert log(capsys, where, "recover", str(cut), str(mine), "--force")[0] == 0
+    assert sorted(one.name for one in tmp_path.iterdir() if one.is_file()) == ["mine", "new.mcap"]
+
+
+def harmed(data: bytes, dice: random.Random) -> bytes:
+    """Return the data with one kind of damage.
+
+    They are truncated before or after the first chunk, or damaged in one or many places.
+    """
+    begin = chunks(data)[0][0]
+    kind = dice.randrange(4)
+    if kind < 2:
+        return data[: dice.randrange(begin, len(data)) if kind else dice.randrange(begin)]
+    bad = bytearray(data)
+    for _ in range(1 if kind == 2 else dice.randint(2, 20)):
+        bad[dice.randrange(begin if kind == 2 else 8, len(bad))] ^= dice.randrange(1, 256)
+    return bytes(bad)
+
+
+@pytest.mark.slow
+def test_no_verb_has_more_than_words_for_what_was_cut_or_damaged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The recordings begin at a start, begin with a saved state, or end by an internal error."""
+    tape, dice, ends = Tape(every=200), random.Random(6), Counter[int]()
+    world = World(recorder=tape)
+    world.drive(0.5, seconds=2.0)
+    world.call("stop")
+    world.run(0.5)
+    sound = [tmp_path / "start", tmp_path / "state", tmp_path / "fault"]
+    for first, path in zip((0, 200), sound, strict=False):
+        tape.write(path, Config(), first)
+    begun, last = Recording(sound[0]), tape.taken[-1].inputs
+    ended = Writing(sound[2], begun.about)
+    for topic, wall_ns, data in begun.messages():
+        ended.add(topic, wall_ns, data)
+    ended.add("unfinished", last.now.wall_ns, Unfinished(len(tape.taken), last).encode())
+    ended.finish("bug", "a fault of our own")
+    where = tmp_path / "record"
+    where.mkdir()
+    for number in range(HARMED):
+        path = where / f"{number:06}-20270115T080000Z.mcap"
+        path.write_bytes(harmed(sound[number % len(sound)].read_bytes(), dice))
+        for verb, new in NEW.items():
+            words = [verb, str(path), *([str(tmp_path / f"{number}{new}")] if new else [])]
+            code, out, err = log(capsys, where, *words)
+            assert code in (Exit.OK, Exit.FAILURE), (words, out, err)
+            assert (bool(out or err), bool(err) or code == Exit.OK) == (True, True), words
+            assert "Traceback" not in err
+            ends[code] += 1
+    code, out, _ = log(capsys, where)
+    assert (code, len(out.splitlines())) == (Exit.OK, HARMED)
+    assert min(ends[Exit.OK], ends[Exit.FAILURE]) > HARMED / 2, ends
+
+
+def test_what_is_not_there_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert log(capsys, tmp_path)[:2] == (0, f"no recordings in {tmp_path}\n")
+    code, _, err = log(capsys, tmp_path, "show")
+    assert (code, "no recording in" in err) == (1, True)
+    code, _, err = log(capsys, tmp_path / "none")
+    assert (code, "--directory" in err) == (1, True)
+    (tmp_path / "x").write_bytes(b"x")
+    assert main(["recording", "replay", str(tmp_path / "x")]) == 1
+    assert "not a recording of acsard" in capsys.readouterr().err
+
+
+def test_it_looks_where_the_service_records() -> None:
+    unit = Path(__file__).parents[3] / "deploy/systemd/acsard.service"
+    says = dict(row.partition("=")[::2] for row in unit.read_text().splitlines() if "=" in row)
+    state = Path("/var/lib") / says["StateDirectory"]
+    assert says["Environment"] == f"ACSARD_RECORD=%S/{says['StateDirectory']}/record"
+    assert state / "record" == SERVICE

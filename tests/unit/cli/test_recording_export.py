@@ -1,0 +1,163 @@
+"""Tests of `acsard recording export`, and of `acsard calibrate --log` with a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from msgspec.structs import replace
+
+from acsard.cli import main
+from acsard.core.config.settings import Config
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+RECORDED = "000007-20270115T080000Z.kept.mcap"
+
+
+@pytest.fixture(scope="module")
+def where(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory with one recording."""
+    where = tmp_path_factory.mktemp("record")
+    tape = Tape()
+    World(recorder=tape).drive(0.5, seconds=1.5)
+    tape.write(where / RECORDED, Config())
+    return where
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def export(where: Path, *words: str) -> int:
+    return main(["recording", "export", *words, "--directory", str(where)])
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        ((), "000007-20270115T080000Z.ros2.mcap"),
+        (("--csv",), "000007-20270115T080000Z.csv"),
+        (("--rosbag2",), "000007-20270115T080000Z.rosbag2"),
+    ],
+)
+def test_the_newest_becomes_a_file_beside_you_with_a_name_of_its_own(
+    words: tuple[str, ...], name: str, where: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(where, *words) == 0
+    told = capsys.readouterr()
+    assert told.err == ""  # without a terminal there is no progress line
+    assert told.out.endswith(f" in {name}\n")
+    assert [path.name for path in here.iterdir()] == [name]
+
+
+def test_a_number_and_a_name_are_taken_and_what_is_there_stays(
+    where: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(where, "7", "mine.mcap") == 0
+    before = (here / "mine.mcap").read_bytes()
+    assert export(where, "7", "mine.mcap") == 1
+    assert capsys.readouterr().err == (
+        "acsard: cannot write mine.mcap: it exists; --force overwrites it\n"
+    )
+    assert (here / "mine.mcap").read_bytes() == before
+    assert export(where, "7", "mine.mcap", "--csv", "--force") == 0
+    assert (here / "mine.mcap").read_bytes().startswith(b"t [s],")
+
+
+def test_a_part_of_it_by_seconds(where: Path, here: Path) -> None:
+    assert export(where, "7", "a.csv", "--csv") == 0
+    assert export(where, "7", "b.csv", "--csv", "--from", "0.5", "--to", "1") == 0
+    whole, part = ((here / name).read_text().splitlines() for name in ("a.csv", "b.csv"))
+    assert whole[0] == part[0]
+    assert set(part) < set(whole)
+    assert 0.2 < len(part) / len(whole) < 0.5
+
+
+def test_another_configuration_computes_odometry_anew(where: Path, here: Path) -> None:
+    (here / "other.toml").write_text("[drive]\nwheel_radius = 0.1\n")
+    assert export(where, "7", "a.csv", "--csv") == 0
+    assert export(where, "7", "b.csv", "--csv", "--config", "other.toml") == 0
+    far, further = (
+        float((here / name).read_text().splitlines()[-1].split(",")[6])
+        for name in ("a.csv", "b.csv")
+    )
+    assert further == pytest.approx(2 * far, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("new", "words"),
+    [("nowhere/a.mcap", "No such file or directory"), ("/proc/a.mcap", "cannot write /proc/a")],
+)
+def test_where_nothing_can_be_written_it_says_so(
+    new: str, words: str, where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(where, "7", new) in (1, 77)
+    error = capsys.readouterr().err
+    assert error.startswith(f"acsard: cannot write {new}: ")
+    assert words in error
+
+
+def test_what_was_cut_is_written_as_far_as_it_is_whole(
+    where: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = here / "cut.mcap.part"
+    cut.write_bytes((where / RECORDED).read_bytes()[:-1500])
+    assert export(where, str(cut), "new.mcap") == 0
+    assert "no end" in capsys.readouterr().err
+    with (here / "new.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+
+
+def test_what_is_no_recording_is_refused(
+    where: Path, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert export(where, "7", "new.mcap") == 0
+    assert export(where, "new.mcap", "again.mcap") == 1
+    assert "new.mcap is not a recording of acsard" in capsys.readouterr().err
+    assert not (here / "again.mcap").exists()
+
+
+# calibrate
+
+
+def spin_and_curve(world: World) -> None:
+    """Drive the motions that calibration asks for: rest, straight both ways, turns both ways."""
+    world.run(3.0)
+    for linear, angular, seconds in (
+        (0.5, 0.0, 5.0), (-0.5, 0.0, 5.0), (0.0, 1.5, 8.0), (0.0, -1.5, 8.0),
+        (0.0, 0.7, 8.0), (0.0, -0.7, 8.0), (0.4, 0.8, 8.0), (0.4, -0.8, 8.0),
+    ):  # fmt: skip
+        world.drive(linear, angular, seconds)
+        world.run(1.0)
+
+
+@pytest.mark.slow
+def test_calibrate_takes_a_recording_of_a_robot_with_a_gyro_as_it_is(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = replace(Config(), odometry=replace(Config().odometry, gyro=True))
+    tape = Tape()
+    world = World(config, recorder=tape)
+    spin_and_curve(world)
+    # calibrate recognizes the format by its content, not by its name
+    tape.write(here / "drive.log", config)
+    (here / "acsard.toml").write_text("")
+    assert main(["calibrate", "--log", "drive.log", "--json"]) == 0
+    by_recording = capsys.readouterr().out
+    assert main(["recording", "export", "drive.log", "drive.csv", "--csv"]) == 0
+    capsys.readouterr()
+    assert main(["calibrate", "--log", "drive.csv", "--json"]) == 0
+    by_table = capsys.readouterr().out.replace("drive.csv", "drive.log")
+    assert by_recording.partition('"notes"')[0] == by_table.partition('"notes"')[0]
+
+
+def test_calibrate_says_what_a_recording_lacks(
+    where: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", "--log", str(where / RECORDED)]) == 1
+    assert "has no gyro samples" in capsys.readouterr().err

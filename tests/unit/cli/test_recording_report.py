@@ -1,0 +1,149 @@
+"""Tests of `acsard recording report`, which writes a recording as one HTML file."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acsard.cli import main
+from acsard.recording.file import Recording
+from acsard.recording.recorded_steps import MICRO
+from acsard.recording.replayed import steps
+from tests.scenarios.taped import chunks
+from tests.unit.report.seen import column
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+QUIET = RECORDINGS / "quiet.mcap"
+
+
+def report(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    code = main(["recording", "report", *map(str, words)])
+    told = capsys.readouterr()
+    return code, told.out, told.err
+
+
+def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """Return the traces of each plot in the file, by name."""
+    text = path.read_text(encoding="utf-8")
+    (data,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', text)
+    return {figure["name"]: figure["data"] for figure in json.loads(data)}
+
+
+@lru_cache
+def ends_at() -> tuple[float, float]:
+    """Return the robot's last recorded position, m."""
+    poses = [pose for step in steps(Recording(QUIET)) for pose in step.said.poses]
+    return poses[-1][0] / MICRO, poses[-1][1] / MICRO
+
+
+@pytest.mark.slow
+def test_the_numbers_of_the_file_are_those_of_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, err = report(capsys, QUIET)
+    assert (code, err) == (0, "")
+    path = tmp_path / "quiet.html"
+    assert out.startswith("quiet.html: ")
+    assert path.stat().st_size < 8e6
+    end = next(trace for trace in pictures(path)["path"] if trace["name"] == "end")
+    assert (column(end["x"])[0], column(end["y"])[0]) == ends_at()
+    text = path.read_text(encoding="utf-8")
+    assert "1 stop (by unnamed (native))" in text
+    assert "Plotly" in text
+
+
+def test_nothing_is_overwritten_without_force(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "here.html"
+    new.write_text("mine")
+    code, _, err = report(capsys, QUIET, new)
+    assert code == 1
+    assert f"cannot write {new}: it exists; --force overwrites it" in err
+    assert new.read_text() == "mine"
+    assert report(capsys, QUIET, new, "--force")[0] == 0
+    assert new.stat().st_size > 1e6
+
+
+def test_a_recording_never_goes_not_even_by_force(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "other.mcap"
+    shutil.copy(QUIET, new)
+    code, _, err = report(capsys, QUIET, new, "--force")
+    assert code == 1
+    assert f"cannot write {new}: it is a recording; name another file" in err
+    assert new.read_bytes() == QUIET.read_bytes()
+
+
+def test_what_was_there_goes_only_when_all_of_the_new_one_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "here.html"
+    new.write_text("mine")
+    assert report(capsys, QUIET, new, "--force", "--from", "9999")[0] == 1
+    assert new.read_text() == "mine"
+    before = new.stat().st_ino
+    assert report(capsys, QUIET, new, "--force")[0] == 0
+    # a new file replaces the old one; the old one is not overwritten
+    assert new.stat().st_ino != before
+    assert [*tmp_path.iterdir()] == [new]
+
+
+def test_a_part_of_the_time_and_what_was_cut(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut, new = tmp_path / "cut.mcap", tmp_path / "cut.html"
+    shutil.copy(QUIET, cut)
+    cut.write_bytes(cut.read_bytes()[:-4000])
+    code, _, err = report(capsys, cut, new, "--from", "1", "--to", "2")
+    assert code == 0
+    assert "no end: cut" in err
+    assert "no end: cut" in new.read_text(encoding="utf-8")
+    times = column(pictures(new)["speeds"][2]["x"])
+    assert times[-1] - times[0] == pytest.approx(1000, abs=30)
+
+
+def test_what_is_damaged_is_left_out_and_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad, new = tmp_path / "bad.mcap", tmp_path / "bad.html"
+    data = bytearray((RECORDINGS / "faults.mcap").read_bytes())
+    (begin, end), _ = chunks(data)
+    data[(begin + end) // 2 : (begin + end) // 2 + 20] = bytes(20)
+    bad.write_bytes(data)
+    code, _, err = report(capsys, bad, new)
+    assert code == 0
+    assert "1 damaged place is left out" in err
+    assert "steps are missing" in err
+    text = new.read_text(encoding="utf-8")
+    assert "1 damaged place is left out" in text
+    assert "steps are missing" in text
+
+
+def test_of_a_time_without_steps_there_is_no_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new = tmp_path / "none.html"
+    code, _, err = report(capsys, QUIET, new, "--from", "9999")
+    assert code == 1
+    assert "no step in that span of time" in err
+    assert not new.exists()
+
+
+def test_without_the_library_it_says_what_to_type(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    code, _, err = report(capsys, QUIET)
+    assert code == 1
+    assert "needs the library plotly; run: " in err
+    assert "[report]" in err

@@ -1,0 +1,611 @@
+"""Tests of `acsard tls`: the certificates it makes, their file permissions, and its output."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from acsard.cli import main
+from acsard.core.config.parsing import parse
+from acsard.host.errors import Exit
+from acsard.host.own_identity import own_addresses
+from tests.each import each
+
+ROLES = ("viewer", "operator", "maintainer")
+
+
+def tls(*words: str) -> int:
+    """Run `acsard tls` and return its exit code."""
+    try:
+        return main(["tls", *words])
+    except SystemExit as end:  # the parser exits this way
+        return int(end.code or 0)
+
+
+def certificate(directory: Path, name: str = "certificate.pem") -> x509.Certificate:
+    return x509.load_pem_x509_certificate((directory / name).read_bytes())
+
+
+def common_name(name: x509.Name) -> str:
+    (attribute,) = name.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(attribute.value)
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    """Return the content of every file below this directory, by relative path."""
+    found = (path for path in directory.rglob("*") if path.is_file())
+    return {str(path.relative_to(directory)): path.read_bytes() for path in found}
+
+
+def tables(printed: str) -> bytes:
+    """Return those printed lines that are a part of acsard.toml."""
+    lines = printed.splitlines()
+    keep, inside = [], False
+    for line in lines:
+        inside = line.startswith("[") or (inside and " = " in line)
+        keep += [line] if inside else []
+    return "\n".join(keep).encode()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the directory that `tls init` makes. Tests must not change it."""
+    directory = tmp_path_factory.mktemp("certificates") / "tls"
+    address = ("--address", "192.0.2.7", "--address", "robot.example", "--address", "2001:db8::7")
+    assert tls("init", "--directory", str(directory), *address, "--days", "30") == 0
+    return directory
+
+
+@pytest.fixture(name="own")
+def _own(made: Path, tmp_path: Path) -> Path:
+    """Return a copy of that directory that a test may change."""
+    return Path(shutil.copytree(made, tmp_path / "tls"))
+
+
+PLACES = (".", *(f"clients/{role}" for role in ROLES))
+
+
+# files of `tls init`
+
+
+def test_init_makes_an_authority_the_robots_certificate_and_one_for_each_role(made: Path) -> None:
+    each = ("ca.pem", "certificate.pem", "key.pem")
+    expected = {f"clients/{role}/{name}" for role in ROLES for name in each}
+    assert set(files(made)) == {*expected, *each, "ca-key.pem"}
+
+
+def test_only_the_owner_may_read_a_key_and_everybody_a_certificate(made: Path) -> None:
+    for name in files(made):
+        mode = stat.S_IMODE((made / name).stat().st_mode)
+        assert mode == (0o600 if "key" in name else 0o644), name
+
+
+def test_each_place_has_the_certificate_of_the_one_authority(made: Path) -> None:
+    authority = (made / "ca.pem").read_bytes()
+    for place in PLACES:
+        assert (made / place / "ca.pem").read_bytes() == authority
+
+
+@each("place", PLACES)
+def test_a_key_belongs_to_its_certificate(made: Path, place: str) -> None:
+    key = load_pem_private_key((made / place / "key.pem").read_bytes(), None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    assert key.curve.name == "secp256r1"
+    assert key.public_key() == certificate(made / place).public_key()
+
+
+@each(("place", "name"), [(".", "robot"), *((f"clients/{role}", role) for role in ROLES)])
+def test_the_common_name_is_whose_it_is(made: Path, place: str, name: str) -> None:
+    assert common_name(certificate(made / place).subject) == name
+
+
+def test_the_authority_signs_certificates_and_nothing_below_it_does(made: Path) -> None:
+    authority = certificate(made, "ca.pem")
+    authority.verify_directly_issued_by(authority)
+    basic = authority.extensions.get_extension_for_class(x509.BasicConstraints)
+    assert basic.critical
+    assert (basic.value.ca, basic.value.path_length) == (True, 0)
+    usage = authority.extensions.get_extension_for_class(x509.KeyUsage).value
+    assert (usage.key_cert_sign, usage.digital_signature) == (True, False)
+    for place in PLACES:
+        issued = certificate(made / place)
+        issued.verify_directly_issued_by(authority)
+        assert not issued.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        usage = issued.extensions.get_extension_for_class(x509.KeyUsage).value
+        assert (usage.key_cert_sign, usage.digital_signature) == (False, True)
+
+
+@each("place", PLACES)
+def test_a_certificate_serves_at_both_ends_of_a_link(made: Path, place: str) -> None:
+    usage = certificate(made / place).extensions.get_extension_for_class(x509.ExtendedKeyUsage)
+    assert set(usage.value) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+
+
+def test_the_robot_is_known_by_its_names_and_the_addresses_given(made: Path) -> None:
+    found = certificate(made).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    host = os.uname().nodename
+    assert {host, f"{host}.local", "localhost", "robot.example"} <= set(
+        found.get_values_for_type(x509.DNSName)
+    )
+    given = {ipaddress.ip_address(text) for text in ("127.0.0.1", "192.0.2.7", "2001:db8::7")}
+    assert given <= set(found.get_values_for_type(x509.IPAddress))
+
+
+@each("place", PLACES)
+def test_a_certificate_holds_from_a_little_before_now_for_the_days_asked(
+    made: Path, place: str
+) -> None:
+    now, issued = datetime.now(UTC), certificate(made / place)
+    assert now - timedelta(hours=2) < issued.not_valid_before_utc < now
+    assert abs(issued.not_valid_after_utc - now - timedelta(days=30)) < timedelta(minutes=10)
+    assert certificate(made, "ca.pem").not_valid_after_utc > issued.not_valid_after_utc
+
+
+def test_no_two_certificates_have_the_same_serial_number(made: Path) -> None:
+    numbers = [certificate(made / place).serial_number for place in PLACES]
+    assert len({*numbers, certificate(made, "ca.pem").serial_number}) == len(PLACES) + 1
+
+
+# no other user can read a key at any time
+
+
+WATCHED = """\
+import os, sys
+from acsard.cli import main
+def hook(event, arguments):
+    compiled = ".pyc" in str(arguments[:1])  # what Python keeps for itself
+    if event in ("os.chmod", "os.rename", "os.link") and not compiled:
+        print(event, arguments[0], file=sys.stderr)
+sys.addaudithook(hook)
+os.umask(0)
+sys.exit(main(["tls", *sys.argv[1:]]))
+"""
+"""A program without umask that reports every later change of a file's mode."""
+
+
+def test_a_key_is_never_readable_by_others_not_even_while_it_is_written(own: Path) -> None:
+    key = own / "key.pem"
+    key.chmod(0o666)
+    words = ["init", "--force", "--directory", str(own)]
+    done = subprocess.run(
+        [sys.executable, "-c", WATCHED, *words], capture_output=True, text=True, timeout=30.0
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    for name in files(own):
+        if "key" in name:
+            assert stat.S_IMODE((own / name).stat().st_mode) == 0o600, name
+
+
+def test_a_key_is_not_written_through_a_link_that_lies_in_its_place(
+    own: Path, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("untouched")
+    (own / "key.pem").unlink()
+    (own / "key.pem").symlink_to(elsewhere)
+    assert tls("init", "--force", "--directory", str(own)) == 0
+    assert elsewhere.read_text() == "untouched"
+    assert not (own / "key.pem").is_symlink()
+
+
+# files that already exist
+
+
+def test_init_overwrites_nothing_without_force(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = files(own)
+    assert tls("init", "--directory", str(own)) == Exit.FAILURE
+    assert files(own) == before
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "--force" in said.err
+    assert "acsard tls add" in said.err
+
+
+def test_init_with_force_makes_an_authority_that_the_old_certificates_are_not_of(own: Path) -> None:
+    old = certificate(own / "clients/operator")
+    assert tls("init", "--force", "--directory", str(own)) == 0
+    with pytest.raises(InvalidSignature):
+        old.verify_directly_issued_by(certificate(own, "ca.pem"))
+    certificate(own / "clients/operator").verify_directly_issued_by(certificate(own, "ca.pem"))
+
+
+def test_add_makes_one_more_by_the_same_authority_and_touches_nothing_else(own: Path) -> None:
+    before = files(own)
+    assert tls("add", "anna", "--role", "operator", "--directory", str(own), "--days", "7") == 0
+    after = files(own)
+    assert {name: after[name] for name in before} == before
+    new = own / "clients/anna"
+    assert {path.name for path in new.iterdir()} == {"ca.pem", "certificate.pem", "key.pem"}
+    assert stat.S_IMODE((new / "key.pem").stat().st_mode) == 0o600
+    issued = certificate(new)
+    assert common_name(issued.subject) == "anna"
+    issued.verify_directly_issued_by(certificate(own, "ca.pem"))
+    left = issued.not_valid_after_utc - datetime.now(UTC)
+    assert abs(left - timedelta(days=7)) < timedelta(minutes=10)
+
+
+def test_add_does_not_replace_a_certificate(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files(own)
+    assert tls("add", "viewer", "--role", "operator", "--directory", str(own)) == Exit.FAILURE
+    assert files(own) == before
+    assert "exists" in capsys.readouterr().err
+
+
+# printed output
+
+
+def test_the_lines_init_prints_are_a_configuration_that_lets_the_roles_in(
+    own: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tls("init", "--force", "--directory", str(own)) == 0
+    config = parse(tables(capsys.readouterr().out))
+    assert config.bus.tls == str(own)
+    assert not config.bus.insecure
+    assert [endpoint.partition("/")[0] for endpoint in config.bus.listen] == ["tcp", "tls"]
+    assert (config.access.viewers, config.access.operators) == (("viewer",), ("operator",))
+    assert config.access.maintainers == ("maintainer",)
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        *(("anna", role) for role in ROLES),
+        ("laptop anna", "viewer"),
+        ("anna+ben: the_old.one@home", "viewer"),
+    ],
+)
+def test_the_lines_add_prints_are_a_configuration_that_lets_it_in(
+    own: Path, capsys: pytest.CaptureFixture[str], role: str, name: str
+) -> None:
+    assert tls("add", name, "--role", role, "--directory", str(own)) == 0
+    told = capsys.readouterr().out
+    assert "systemctl restart acsard" in told
+    assert "--write" in told
+    printed = tables(told)
+    assert set(tomllib.loads(printed.decode())) == {"access"}
+    access = parse(printed).access
+    listed = {"viewer": access.viewers, "operator": access.operators}
+    listed |= {"maintainer": access.maintainers}
+    assert listed == {r: (r, name) if r == role else (r,) for r in ROLES}
+
+
+# refusals
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        ".",
+        "..",
+        "a/b",
+        "../viewer",
+        "/tmp/x",
+        "two\nlines",
+        "nul\0",
+        "x" * 65,
+        "J\u00f6rg",
+        "a*",
+        "a$b",
+        "a#b",
+        "a?b",
+        "@a",
+        "a[b",
+        'a"b',
+    ],
+    ids=ascii,
+)
+def test_what_cannot_name_a_certificate_is_refused_in_words_and_leaves_nothing(
+    own: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    before = sorted(own.parent.rglob("*"))
+    assert tls("add", "--role", "viewer", "--directory", str(own), "--", name) == Exit.USAGE
+    assert "not a name for a certificate" in capsys.readouterr().err
+    assert sorted(own.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("days", ["0", "-1", "99999999", "soon"])
+def test_days_that_no_certificate_can_hold_are_refused_in_words_and_leave_nothing(
+    own: Path, capsys: pytest.CaptureFixture[str], days: str
+) -> None:
+    before = sorted(own.parent.rglob("*"))
+    words = ("--directory", str(own), f"--days={days}")
+    assert tls("add", "anna", "--role", "viewer", *words) == Exit.USAGE
+    assert tls("init", "--force", *words) == Exit.USAGE
+    assert "days" in capsys.readouterr().err
+    assert sorted(own.parent.rglob("*")) == before
+
+
+def test_an_address_that_is_none_is_refused_in_words_and_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--directory", str(tmp_path / "tls"), "--address", "r\u00f6bot")
+    assert tls("init", *words) == Exit.USAGE
+    assert "address" in capsys.readouterr().err
+    assert files(tmp_path) == {}
+
+
+def test_a_role_that_is_none_is_refused(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tls("add", "anna", "--role", "king", "--directory", str(own)) == Exit.USAGE
+    assert "viewer" in capsys.readouterr().err
+
+
+def test_add_without_an_authority_says_what_makes_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--role", "viewer", "--directory", str(tmp_path / "none"))
+    assert tls("add", "anna", *words) == Exit.FAILURE
+    assert "acsard tls init" in capsys.readouterr().err
+    assert files(tmp_path) == {}
+
+
+@pytest.mark.parametrize("name", ["ca.pem", "ca-key.pem"])
+def test_add_with_a_broken_authority_says_so(
+    own: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (own / name).write_text("not what it should be")
+    before = sorted(own.rglob("*"))
+    assert tls("add", "anna", "--role", "viewer", "--directory", str(own)) == Exit.FAILURE
+    assert "cannot use the authority" in capsys.readouterr().err
+    assert sorted(own.rglob("*")) == before
+
+
+AS_NOBODY = """\
+import os, sys
+import acsard.certificates.authority
+from acsard.cli import main
+try:
+    main(["tls", "init", "--help"])  # nobody may not be let read what is imported late
+except SystemExit:
+    pass
+if os.geteuid() == 0:
+    os.setgroups([])
+    os.setgid(65534)
+    os.setuid(65534)
+sys.exit(main(["tls", *sys.argv[1:]]))
+"""
+
+
+@pytest.fixture
+def locked() -> Iterator[Path]:
+    """Yield a directory that everyone may enter but nobody may write to.
+
+    It is not inside a directory that only root may enter.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        directory = Path(name)
+        directory.chmod(0o555)
+        yield directory
+        directory.chmod(0o755)
+
+
+@pytest.mark.parametrize("below", [".", "tls"])
+@pytest.mark.parametrize("words", [["init"], ["add", "anna", "--role", "viewer"]], ids=str)
+def test_without_permission_it_ends_with_77_and_says_how_to_get_it(
+    locked: Path, below: str, words: list[str]
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", AS_NOBODY, *words, "--directory", str(locked / below)],
+        capture_output=True,
+        text=True,
+        timeout=30.0,
+    )
+    assert done.returncode == Exit.NO_PERMISSION, done
+    assert "--directory" in done.stderr
+    assert list(locked.iterdir()) == []
+
+
+# the configuration that `tls init` writes
+
+
+def test_init_writes_the_bus_into_a_configuration_and_keeps_its_comments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, directory = tmp_path / "acsard.toml", tmp_path / "tls"
+    file.write_text('# mine\n[robot]\nid = "r1" # the first\n[bus]\nlisten = ["tcp/127.0.0.1:9"]\n')
+    assert tls("init", "--directory", str(directory), "--write", str(file)) == 0
+    text = file.read_text()
+    assert text.startswith('# mine\n[robot]\nid = "r1" # the first\n')
+    config = parse(text.encode())
+    assert config.bus.listen == ("tcp/127.0.0.1:9", "tls/0.0.0.0:7449")
+    assert config.bus.tls == str(directory)
+    told = capsys.readouterr().out
+    assert str(file) in told
+    assert "systemctl restart acsard" in told
+    # it lists the settings it made and prints no lines to paste
+    assert "listen = [" in told.partition("\n")[0]
+    assert "[bus]" not in told
+
+
+def test_init_keeps_a_configuration_s_line_ends_link_and_mode(tmp_path: Path) -> None:
+    real, link = tmp_path / "real.toml", tmp_path / "acsard.toml"
+    real.write_bytes(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
+    real.chmod(0o640)
+    link.symlink_to("real.toml")
+    assert tls("init", "--directory", str(tmp_path / "tls"), "--write", str(link)) == 0
+    text = real.read_bytes()
+    assert link.is_symlink()
+    assert real.stat().st_mode & 0o777 == 0o640
+    assert text.startswith(b"# mine\r\n[robot]\r\nid = 'r1'\r\n")
+    assert text.count(b"\r\n") == text.count(b"\n")
+    assert parse(text).bus.tls == str(tmp_path / "tls")
+
+
+def test_init_writes_a_configuration_where_there_is_none(tmp_path: Path) -> None:
+    file = tmp_path / "acsard.toml"
+    assert tls("init", "--directory", str(tmp_path / "tls"), "--write", str(file)) == 0
+    assert parse(file.read_bytes()).bus.tls == str(tmp_path / "tls")
+
+
+def test_init_leaves_a_configuration_that_is_wrong_as_it_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    for text in ("[bus\n", "[bus]\ncolour = 1\n"):
+        file.write_text(text)
+        words = ("--directory", str(tmp_path / "tls"), "--force", "--write", str(file))
+        assert tls("init", *words) == Exit.FAILURE
+        assert "was not changed" in capsys.readouterr().err
+        assert file.read_text() == text
+
+
+def test_renew_makes_the_robot_s_certificate_anew_and_leaves_all_others(tmp_path: Path) -> None:
+    directory = tmp_path / "tls"
+    assert tls("init", "--directory", str(directory), "--days", "5") == 0
+    before = files(directory)
+    old = certificate(directory)
+    words = ("--directory", str(directory), "--days", "9", "--address", "10.0.0.9")
+    assert tls("renew", *words) == 0
+    after = files(directory)
+    assert {name for name in after if after[name] != before[name]} == {"certificate.pem", "key.pem"}
+    new = certificate(directory)
+    assert new.not_valid_after_utc > old.not_valid_after_utc
+    names = new.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert "localhost" in names.get_values_for_type(x509.DNSName)
+    assert ipaddress.ip_address("10.0.0.9") in names.get_values_for_type(x509.IPAddress)
+
+
+def test_without_an_authority_nothing_is_renewed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tls("renew", "--directory", str(tmp_path)) == Exit.FAILURE
+    assert "acsard tls init" in capsys.readouterr().err
+
+
+# files that the operator would lose
+
+
+def names_of(directory: Path) -> set[str]:
+    found = certificate(directory).extensions.get_extension_for_class(x509.SubjectAlternativeName)
+    addresses = found.value.get_values_for_type(x509.IPAddress)
+    return {*found.value.get_values_for_type(x509.DNSName), *map(str, addresses)}
+
+
+def test_init_certifies_the_machine_s_addresses_and_prints_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tls("init", "--directory", str(tmp_path / "tls")) == 0
+    said = capsys.readouterr().out
+    expected = {"127.0.0.1", "localhost", os.uname().nodename, *own_addresses()}
+    assert expected <= names_of(tmp_path / "tls")
+    assert all(name in said.splitlines()[0] for name in expected)
+
+
+def test_renew_keeps_the_names_that_were_certified(own: Path) -> None:
+    before = names_of(own)
+    assert tls("renew", "--directory", str(own), "--address", "more.example") == 0
+    assert names_of(own) >= {*before, "more.example", "robot.example", "192.0.2.7"}
+
+
+def test_add_prints_a_list_that_keeps_who_is_there(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text('[access]\noperators = ["bob", "carol"]\n')
+    words = ("--role", "operator", "--directory", str(own), "--config", str(file))
+    assert tls("add", "anna", *words) == 0
+    printed = tables(capsys.readouterr().out)
+    assert parse(printed).access.operators == ("bob", "carol", "anna")
+
+
+@pytest.mark.parametrize("text", ["[bus\n", "[bus]\ncolour = 1\n"])
+def test_nothing_is_made_where_the_configuration_cannot_be_written(
+    tmp_path: Path, text: str
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text(text)
+    words = ("--directory", str(tmp_path / "tls"), "--write", str(file))
+    assert tls("init", *words) == Exit.FAILURE
+    assert [path.name for path in tmp_path.iterdir()] == ["acsard.toml"]
+
+
+def test_add_and_renew_make_no_directory_and_then_fail(tmp_path: Path) -> None:
+    for words in (["add", "anna", "--role", "viewer"], ["renew"]):
+        assert tls(*words, "--directory", str(tmp_path / "none")) == Exit.FAILURE
+    assert not list(tmp_path.iterdir())
+
+
+def test_add_writes_the_name_into_its_role_s_list_and_leaves_nothing_to_paste(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text('# mine\n[access]\noperators = ["bob"]\n')
+    words = ("--directory", str(own), "--write", str(file))
+    assert tls("add", "eve", *words) == Exit.USAGE
+    assert not (own / "clients" / "eve").exists()
+    assert tls("add", "eve", "--role", "operator", *words) == 0
+    told = capsys.readouterr().out
+    assert parse(file.read_bytes()).access.operators == ("bob", "eve")
+    assert file.read_text().startswith("# mine\n")
+    assert "[access]" not in told
+    assert "systemctl restart acsard" in told
+
+
+def encrypt(own: Path, password: bytes) -> None:
+    key = load_pem_private_key((own / "ca-key.pem").read_bytes(), None)
+    (own / "ca-key.pem").write_bytes(
+        key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, BestAvailableEncryption(password))
+    )
+
+
+def test_an_encrypted_authority_s_password_is_asked_for(own: Path) -> None:
+    encrypt(own, b"secret")
+    words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
+    before = certificate(own).serial_number
+    leader, follower = os.openpty()
+    process = subprocess.Popen(
+        words, stdin=follower, stdout=follower, stderr=follower, start_new_session=True
+    )
+    os.close(follower)
+    said = b""
+    while b"password of ca-key.pem" not in said:
+        said += os.read(leader, 1024)
+    os.write(leader, b"secret\n")
+    assert process.wait(30.0) == 0
+    os.close(leader)
+    assert certificate(own).serial_number != before
+
+
+def test_an_encrypted_authority_without_a_terminal_says_so(own: Path) -> None:
+    encrypt(own, b"secret")
+    words = [sys.executable, "-m", "acsard", "tls", "renew", "--directory", str(own)]
+    done = subprocess.run(words, input="secret\n", capture_output=True, text=True, timeout=30.0)
+    assert done.returncode == Exit.USAGE
+    assert "encrypted" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("write", [True, False])
+def test_init_prints_how_this_robot_is_asked_by_its_id(
+    write: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("acsard.toml").write_text('[robot]\nid = "robot7"\n')
+    words = ("--write", "acsard.toml") if write else ()
+    assert tls("init", "--directory", "tls", *words) == 0
+    told = capsys.readouterr().out
+    assert "acsard echo state --id robot7 --connect tls/" in told
+    assert 'robot_id="robot7"' in told

@@ -1,0 +1,232 @@
+"""A link that is down is explained by what was received, or by a delay of this computer.
+
+A link that loses lines is reported once, in whichever direction they are lost.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.config.settings import McuConfig
+from acsard.core.link.lines import LineReader
+from acsard.core.link.link_diagnosis import (
+    LOOK_MENDS,
+    LOST,
+    PATIENCE_NS,
+    WINDOW,
+    Heard,
+    Lateness,
+    Look,
+    SilenceDiagnosis,
+    UnansweredLines,
+    is_ours,
+)
+from acsard.core.link.link_state import WORDS
+from tests.unit.core.link.test_session import GOOD, Bench
+
+MS = 1_000_000
+QUIET_NS = 100 * MS
+
+STILL = b"ap00.00,bp00.00,cp00.00,dp00.00\r\n"
+
+HEARD: dict[str, tuple[bytes, Look, str]] = {
+    "mute": (b"", "nothing", "nothing was received"),
+    "half lines": (
+        b"ap00.00,bp00.00,c" * 9,
+        "cut",
+        "153 bytes received but no line end; the last bytes are `",
+    ),
+    "cut lines": (b"ap00.00,bp0\r\n" * 4, "cut", "none good, the last `ap00.00,bp0`"),
+    "noise": (
+        (b"\x00\xff~" + STILL) * 144,
+        "foreign",
+        r"144 lines received, none good, the last `\x00\xff~ap00.00,bp00.00,cp00.00,dp00.00`",
+    ),
+    "wrong baud rate": (b"\xf8\x00\xe6\n\x9e" * 3, "garbage", "3 lines received, none good"),
+    "no end": (
+        b"\xf8\x00\xe6" * 3, "garbage", r"the last bytes are `\xf8\x00\xe6\xf8\x00\xe6\xf8\x00\xe6`"
+    ),
+    "some good": (STILL + b"ap?\r\n", "few", "2 lines received, only 1 good, the last other `ap?`"),
+    "all good": (STILL * 2, "sparse", "2 lines received, all of them good, but too few"),
+}  # fmt: skip
+
+
+def test_a_board_that_only_prints_noise_is_told_with_what_it_said() -> None:
+    bench = Bench().open()
+    texts = []
+    for tick in range(500):
+        bench.wait(10, *([b"\x00\xff~" + GOOD] if tick % 2 else []))
+        texts += [event.text for event in bench.session.events if event.name == "link_booting"]
+    told = [text for text in texts if "none good" in text]
+    assert len(told) == 1
+    assert "150 lines received, none good, the last `" in told[0]
+    assert bench.session.words() == told[0]
+    bench.wait(10, GOOD * 3)
+    assert bench.session.words() == "linked"
+
+
+def test_a_link_that_fell_silent_says_so_first_and_then_what_is_heard() -> None:
+    bench = Bench().up()
+    for _ in range(20):
+        bench.wait(10)
+    assert bench.session.words().startswith(
+        "the built-in simulator, which is a part of this program, is late"
+    )
+    for _ in range(302):
+        bench.wait(10)
+    assert "nothing was received" in bench.session.words()
+
+
+@pytest.mark.parametrize(
+    ("apart", "longest", "told", "untold"),
+    [
+        (20, 0.25, "set mcu.reply_period = 0.20", "seldom"),
+        (20, 0.15, "at least every 0.15 s", "mcu.reply_period"),
+        (74, 0.25, "at least every 0.25 s", "mcu.reply_period"),
+        (136, 0.25, "at least every 0.25 s", "mcu.reply_period"),
+    ],
+)
+def test_lines_too_far_apart_are_told_and_no_setting_that_would_be_refused(
+    apart: int, longest: float, told: str, untold: str
+) -> None:
+    bench = Bench(McuConfig(port="/dev/board"), longest_reply=longest).open()
+    for tick in range(600):
+        bench.wait(10, *([] if tick % apart else [GOOD]))
+    assert f"lines come {apart / 100:.2f} s apart" in bench.session.words()
+    assert told in bench.session.words()
+    assert untold not in bench.session.words()
+
+
+def test_one_silence_is_no_clock_of_the_boards_own() -> None:
+    bench = Bench(McuConfig(port="/dev/board")).up()
+    for _ in range(20):
+        bench.wait(10)
+    bench.wait(10, GOOD)
+    assert (bench.link(), "reply_period" in bench.session.words()) == ("stale", False)
+
+
+@pytest.mark.parametrize("port", ["sim", "/dev/board"])
+def test_lines_that_we_were_late_to_hear_are_no_advice_about_the_board(port: str) -> None:
+    bench = Bench(McuConfig(port=port)).up()
+    told = set()
+    for _ in range(20):  # this computer runs a step late and finds the bytes that arrived meanwhile
+        bench.wait(200)
+        told.add(bench.session.words())
+        bench.wait(10, GOOD)
+        told.add(bench.session.words())
+    assert not [words for words in told if "reply_period" in words or "seldom" in words]
+    assert any(is_ours(words) for words in told)
+
+
+def after(*steps_ms: int, good: bool = False, simulated: bool = False) -> Lateness:
+    """Look after each of these steps, beginning with a good line at 0.
+
+    `good` tells whether the last step brings a good line.
+    """
+    lateness = Lateness(simulated, QUIET_NS)
+    now_ns = 0
+    lateness.look(now_ns, good=True)
+    for number, step_ms in enumerate(steps_ms, 1):
+        now_ns += step_ms * MS
+        lateness.look(now_ns, good=good and number == len(steps_ms))
+    return lateness
+
+
+def test_a_board_that_does_not_answer_steps_in_time_is_silent() -> None:
+    assert after(*[10] * 11).words("stale") == WORDS["stale"]
+    assert after(*[49] * 3).late_s == 0.0
+
+
+def test_a_computer_that_did_not_run_is_told_with_how_long() -> None:
+    for steps in ((800,), (10, 800, 10), (60, 800)):
+        told = after(*steps).words("stale")
+        assert told.startswith("this computer did not run for 0.80 s")
+        assert "which other program" in told
+
+
+def test_a_good_line_ends_it() -> None:
+    assert after(800, 10, good=True).late_s == 0.0
+    assert after(800, good=True).words("stale") == WORDS["stale"]
+
+
+def test_a_simulator_that_is_late_is_no_silent_microcontroller() -> None:
+    assert "simulator" in after(10, 10, simulated=True).words("stale")
+    assert after(800, simulated=True).words("stale").startswith("this computer")
+
+
+def test_a_link_that_is_up_or_closed_is_told_as_it_is() -> None:
+    late = after(800)
+    assert [late.words(state) for state in ("up", "booting", "down")] == [
+        WORDS["up"], WORDS["booting"], WORDS["down"]
+    ]  # fmt: skip
+
+
+def test_words_of_a_silence_say_whose_it_is() -> None:
+    ours = [after(800), after(800, simulated=True), after(10, simulated=True)]
+    assert all(is_ours(lateness.words("stale")) for lateness in ours)
+    assert not any(is_ours(words) for words in (WORDS["stale"], "", after(800).words("down")))
+
+
+def heard(data: bytes) -> Heard:
+    found = Heard()
+    found.take(data)
+    for line, _ in LineReader().feed(data):
+        found.line(line, line + b"\r\n" == STILL)
+    return found
+
+
+@pytest.mark.parametrize(("data", "looks", "counted"), HEARD.values(), ids=HEARD)
+def test_it_says_what_was_heard_how_that_looks_and_what_to_do(
+    data: bytes, looks: Look, counted: str
+) -> None:
+    found = heard(data)
+    assert found.looks == looks
+    assert counted in found.counted
+    assert found.words.startswith(f"the microcontroller: {found.counted}; {LOOK_MENDS[looks]}")
+    assert "`acsard mcu check`" in found.words
+
+
+def test_it_is_told_after_three_seconds_and_again_only_when_it_looks_otherwise() -> None:
+    hearing, told = SilenceDiagnosis(), []
+    for tick in range(100):
+        now_ns = tick * PATIENCE_NS // 10
+        if tick > 50:
+            hearing.now.take(b"\x00")
+        if hearing.judge(now_ns):
+            assert hearing.heard is not None
+            told.append((tick, hearing.heard.looks))
+    assert told == [(10, "nothing"), (60, "garbage")]
+    hearing.forget()
+    assert hearing.heard is None
+    assert not hearing.judge(10 * PATIENCE_NS)
+
+
+def events_of(every: int, windows: int = 3, period: float = 0.0, linked: bool = True) -> list[str]:
+    """Return the events of a link that loses every n-th line."""
+    answered = UnansweredLines(period)
+    events = [
+        answered.look(sent, sent - sent // every if every else sent, linked)
+        for sent in range(windows * WINDOW + 1)
+    ]
+    return [event.text for event in events if event is not None]
+
+
+def test_a_fifth_lost_is_told_once_with_its_figures() -> None:
+    (text,) = events_of(5)
+    assert f"only {WINDOW * 4 // 5} of {WINDOW} lines were answered" in text
+    assert "`acsard mcu check`" in text
+
+
+def test_what_a_sound_link_loses_is_not_told() -> None:
+    assert events_of(0) == events_of(int(1 / LOST) + 1) == []
+
+
+def test_a_board_known_to_report_by_its_own_clock_and_no_link_are_not_judged() -> None:
+    assert events_of(5, period=0.1) == events_of(5, linked=False) == []
+
+
+def test_it_is_told_again_after_the_link_was_lost() -> None:
+    answered, events = UnansweredLines(0.0), []
+    for sent in range(3 * WINDOW):
+        events.append(answered.look(sent, sent // 2, sent != WINDOW + 10))
+    assert len([event for event in events if event]) == 2

@@ -1,0 +1,64 @@
+"""Tests of the permissions of roles that follow from the table of keys."""
+
+from __future__ import annotations
+
+import pytest
+
+from acsard.core.messages.permissions import (
+    USES,
+    has,
+    keys_for,
+    least_role,
+)
+from acsard.core.messages.topics import FOLLOWED, PUBLISHED, TOPICS
+from acsard.core.values import ROLES, Role
+
+
+@pytest.mark.parametrize("role", ["", *ROLES])
+def test_a_role_has_its_own_permissions_and_those_below_it(role: str) -> None:
+    assert [least for least in ROLES if has(role, least)] == list(
+        ROLES[: ROLES.index(role) + 1] if role in ROLES else ()
+    )
+
+
+def test_each_row_names_a_role_for_the_uses_of_its_direction_and_no_other() -> None:
+    for row in TOPICS:
+        if row in FOLLOWED or row.key in ("json/<key>", "alive"):
+            assert row.subscribe == "viewer"
+        else:
+            assert row.subscribe is None
+        assert (row.publish is not None) == (row.direction == "in"), row.key
+        if row.direction in ("query", "service"):
+            assert row.query is not None, row.key
+
+
+def test_a_key_of_the_robot_s_own_machine_is_granted_to_no_role() -> None:
+    granted = {key for role in ROLES for use in USES for key in keys_for(role, use, TOPICS)}
+    assert "gateway" not in granted
+    assert not any(key.startswith(("cmd/", "wheel_cmd/")) for key in granted)
+
+
+def test_a_published_key_is_granted_with_its_twin_in_json() -> None:
+    assert set(keys_for("viewer", "subscribe", PUBLISHED)) == {
+        key for topic in PUBLISHED for key in (topic.key, f"json/{topic.key}")
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "role"),
+    [
+        ("odom", "viewer"),
+        ("json/sim/pose", "viewer"),
+        ("alive", "viewer"),
+        ("stop", "viewer"),
+        ("cmd/app", "operator"),
+        ("wheel_cmd/app/anna", "operator"),
+        ("srv/clear", "operator"),
+        ("imu", "maintainer"),
+        ("config", "maintainer"),
+        ("whoami/operator", "operator"),
+        ("no/such/key", "viewer"),
+    ],
+)
+def test_the_least_role_of_a_key(key: str, role: Role) -> None:
+    assert least_role(key) == role

@@ -1,0 +1,224 @@
+"""The error model claims the noise, the parameters' effects and the twist variances of a step."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.config.settings import DriveConfig, OdometryConfig
+from acsard.core.motion.error_model import LEAST, ErrorModel, Noise, TwistUncertainty, columns
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.learned_track import CONFIGURED, Track
+from acsard.core.values import REST, Twist
+from tests.vectors.drive import CALIBRATED
+
+L = 0.30
+K = 1e-4
+
+steps = st.floats(-1.0, 1.0)
+
+
+def noise(distance: float, yaw: float, skid: float) -> Noise:
+    config = OdometryConfig(
+        distance_variance_per_metre=distance,
+        yaw_variance_per_metre=yaw,
+        yaw_variance_per_radian=skid,
+    )
+    return Noise(config, Kinematics(DriveConfig()).track)
+
+
+@given(distance=steps, turn=steps)
+def test_a_k_of_each_side_can_be_said_with_the_settings(distance: float, turn: float) -> None:
+    left, right = abs(distance - turn * L / 2), abs(distance + turn * L / 2)
+    got = noise(K / 2, 2 * K / L**2, 0.0).of(distance, turn, abs(turn))
+    assert got == pytest.approx(
+        (K * (left + right) / 4, K * (left + right) / L**2, K * (right - left) / (2 * L)), abs=1e-18
+    )
+
+
+@pytest.mark.parametrize("settings", [(1e-4, 1e-4, 1e-2), (1e-6, 1.0, 0.0), (0.0, 1e-4, 0.0)])
+def test_a_straight_has_the_variances_per_metre(settings: tuple[float, float, float]) -> None:
+    along, yaw, both = noise(*settings).of(-2.0, 0.0, 0.0)
+    assert (along, yaw, both) == pytest.approx((2 * settings[0], 2 * settings[1], 0.0))
+
+
+def test_skidding_adds_to_what_counts_as_turned() -> None:
+    with_skid, without = noise(1e-4, 1e-4, 1e-2), noise(1e-4, 1e-4, 0.0)
+    more = with_skid.of(0.1, 0.3, 0.2)[1] - without.of(0.1, 0.3, 0.2)[1]
+    assert more == pytest.approx(2e-3)
+
+
+variances = st.floats(0.0, 10.0)
+
+
+@given(a=variances, b=variances, c=variances, distance=steps, turn=steps)
+def test_no_setting_makes_a_variance_negative(
+    a: float, b: float, c: float, distance: float, turn: float
+) -> None:
+    along, yaw, both = noise(a, b, c).of(distance, turn, abs(turn))
+    assert along >= -1e-12 * (a + b)
+    assert yaw >= -1e-12 * (a + b)
+    assert abs(both) <= math.sqrt(max(0.0, along * yaw)) + 1e-9 * (a + b)
+
+
+def step(drive: DriveConfig, left: float, right: float) -> tuple[float, float]:
+    """Return d and dyaw for wheel angles by equations (4) to (7)."""
+    dl = drive.wheel_radius * drive.left_wheel_radius_multiplier * left
+    dr = drive.wheel_radius * drive.right_wheel_radius_multiplier * right
+    track = drive.wheel_separation * drive.wheel_separation_multiplier
+    return (dl + dr) / 2, (dr - dl) / track
+
+
+@pytest.mark.parametrize(
+    "multiplier",
+    [
+        "left_wheel_radius_multiplier",
+        "right_wheel_radius_multiplier",
+        "wheel_separation_multiplier",
+    ],
+)
+def test_a_column_is_the_derivative_by_its_multiplier(multiplier: str) -> None:
+    std, tiny = 0.004, 1e-6
+    config = replace(OdometryConfig(), **{f"{multiplier}_std": std})
+    (column,) = columns(config, Kinematics(CALIBRATED))
+    settings = {name: getattr(CALIBRATED, name) for name in CALIBRATED.__struct_fields__}
+    bent = DriveConfig(**(settings | {multiplier: settings[multiplier] + tiny}))
+    (d, turn), (d2, turn2) = step(CALIBRATED, 3.0, 5.0), step(bent, 3.0, 5.0)
+    along, by_turn, yaw, of_turn = column
+    assert along * d + by_turn * turn == pytest.approx((d2 - d) / tiny * std, rel=1e-4, abs=1e-9)
+    assert yaw * d + of_turn * turn == pytest.approx((turn2 - turn) / tiny * std, rel=1e-4)
+
+
+def test_what_is_certain_has_no_column() -> None:
+    assert columns(OdometryConfig(), Kinematics(DriveConfig())) == ()
+
+
+def test_a_scale_that_is_off_bends_no_turn() -> None:
+    config = OdometryConfig(distance_scale_std=0.01)
+    assert columns(config, Kinematics(DriveConfig())) == ((0.01, 0.0, 0.0, 0.0),)
+
+
+# a track that is learned
+
+ALL = OdometryConfig(
+    wheel_separation_multiplier_std=0.05,
+    left_wheel_radius_multiplier_std=0.004,
+    distance_scale_std=0.01,
+)
+
+
+def test_the_column_of_a_track_to_be_learned_is_the_last_and_does_nothing_at_first() -> None:
+    kinematics = Kinematics(CALIBRATED)
+    *declared, learned = columns(ALL, kinematics, CONFIGURED)
+    assert tuple(declared) == columns(ALL, kinematics)
+    assert learned == (0.0, 0.0, 0.0, 0.0)
+
+
+def test_the_error_of_a_learned_track_takes_the_place_of_the_configured_ones() -> None:
+    kinematics = Kinematics(CALIBRATED)
+    left, separation, _, learned = columns(ALL, kinematics, Track(1.25, 0.03))
+    assert separation == (0.0, 0.0, 0.0, 0.0)
+    assert learned == (0.0, 0.0, 0.0, -0.03)
+    wider = replace(
+        CALIBRATED, wheel_separation_multiplier=1.25 * CALIBRATED.wheel_separation_multiplier
+    )
+    assert left == pytest.approx(columns(ALL, Kinematics(wider))[0])
+
+
+EXACT = OdometryConfig(
+    distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0, yaw_variance_per_radian=0.0
+)
+
+
+def uncertainty(config: OdometryConfig = EXACT, counts: int = 0) -> TwistUncertainty:
+    return TwistUncertainty(ErrorModel(config, Kinematics(DriveConfig())), counts)
+
+
+def test_two_decimals_are_the_turnings_least_doubt() -> None:
+    # Four wheels have 0.01^2 / 12 rad2/s2 each. The twist uses a quarter of their sum, and the
+    # difference of the sides.
+    variances = uncertainty().of(Twist(0.5, 0.0), 0.01)
+    assert variances.angular == pytest.approx(0.05**2 * 1e-4 / 12 / 0.3**2)
+    assert variances.linear == LEAST > 0.05**2 * 1e-4 / 48
+
+
+def test_counts_are_coarser_than_decimals() -> None:
+    # With 400 counts, one count in 10 ms is 1.570796 rad/s.
+    variances = uncertainty(counts=400).of(Twist(0.5, 0.0), 0.01)
+    assert variances.linear == pytest.approx(0.05**2 * 1.570796**2 / 48)
+    assert variances.angular == pytest.approx(0.05**2 * 1.570796**2 / 12 / 0.09)
+
+
+def test_counts_that_the_lines_show_are_as_coarse_as_those_that_are_configured() -> None:
+    shown = uncertainty().of(Twist(0.5, 0.0), 0.01, step=1.570796)
+    configured = uncertainty(counts=400).of(Twist(0.5, 0.0), 0.01)
+    assert shown.linear == pytest.approx(configured.linear)
+    assert shown.angular == pytest.approx(configured.angular)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_noise_is_that_of_a_period_over_its_square(sign: float) -> None:
+    # The noise is 1e-4 m2/m x 0.5 m/s / 0.01 s and 1e-4 rad2/m x 0.5 m/s / 0.01 s.
+    variances = uncertainty(OdometryConfig()).of(Twist(0.5 * sign, 0.0), 0.01)
+    assert variances.linear == pytest.approx(5e-3, rel=1e-3)
+    assert variances.angular == pytest.approx(5e-3, rel=1e-3)
+
+
+def test_parameters_scale_the_speed() -> None:
+    both = OdometryConfig(
+        distance_variance_per_metre=0.0,
+        yaw_variance_per_metre=0.0,
+        yaw_variance_per_radian=0.0,
+        left_wheel_radius_multiplier_std=0.02,
+        right_wheel_radius_multiplier_std=0.02,
+        wheel_separation_multiplier_std=0.03,
+    )
+    # The radii add 0.02 of each side's half of 1 m/s. The turn of 2 rad/s adds 0.03, and the radii
+    # over 0.3 m.
+    variances = uncertainty(both).of(Twist(1.0, 0.0), 0.01)
+    assert variances.linear == pytest.approx(2 * (0.02 * 0.5) ** 2, rel=1e-3)
+    assert variances.angular == pytest.approx(2 * (0.02 / 0.3) ** 2, rel=1e-3)
+    turning = uncertainty(both).of(Twist(0.0, 2.0), 0.01)
+    assert turning.angular == pytest.approx((0.03 * 2) ** 2 + 2 * (0.02 * 2 / 2) ** 2, rel=1e-3)
+
+
+def test_lines_that_are_read_together_have_the_period_of_the_others() -> None:
+    steady, batched = uncertainty(OdometryConfig()), uncertainty(OdometryConfig())
+    for i in range(400):
+        one = steady.of(Twist(0.5, 0.0), 0.01)
+        other = batched.of(Twist(0.5, 0.0), 0.02 if i % 2 else 0.0)
+        other = batched.of(Twist(0.5, 0.0), 1e-6 if i % 2 else 0.01)
+    assert other.linear < 3 * one.linear
+
+
+def test_a_line_that_came_late_makes_no_longer_period() -> None:
+    usual, late = uncertainty(OdometryConfig()), uncertainty(OdometryConfig())
+    for _ in range(400):
+        usual.of(Twist(0.5, 0.0), 0.01)
+        late.of(Twist(0.5, 0.0), 0.01)
+    late.of(Twist(0.5, 0.0), 0.5)
+    after = late.of(Twist(0.5, 0.0), 0.01).linear
+    assert after == pytest.approx(usual.of(Twist(0.5, 0.0), 0.01).linear, rel=0.1)
+
+
+def test_at_rest_the_twist_is_certain() -> None:
+    rest = uncertainty(OdometryConfig()).at_rest(0.21)
+    assert (rest.linear, rest.lateral, rest.angular) == (1e-8,) * 3
+
+
+def test_coarse_encoders_see_rest_only_after_a_while() -> None:
+    coarse = uncertainty(counts=20)
+    early, late = coarse.at_rest(0.3), coarse.at_rest(60.0)
+    assert early.linear > 1e-5
+    assert late.linear == LEAST
+    assert early.angular > late.angular
+
+
+def test_to_the_side_it_is_what_is_configured_but_at_rest() -> None:
+    config = OdometryConfig(twist_covariance_diagonal=(1.0, 0.25, 1.0, 1.0, 1.0, 1.0))
+    assert uncertainty(config).of(REST, 0.01).lateral == 0.25
+    assert uncertainty(config).at_rest(1.0).lateral == LEAST

@@ -1,0 +1,180 @@
+"""Tests of the signs that a wheel's encoder is faulty, and of the signs against it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.motion.suspect_wheel import WORDS, Known, Stuck, Suspect, WheelFault, was_faulty
+
+DT = 0.01
+FINE = math.tau / 3200
+NOTHING = Known(0.0, 0.0, False, None)
+
+
+def told(speed: float, slow: float | None = None) -> Known:
+    return Known((speed if slow is None else slow) * DT, speed * DT, True, None)
+
+
+def felt(speed: float) -> Known:
+    return Known(0.0, 0.0, False, speed * DT)
+
+
+def lies(
+    own: float, other: float, known: Known, lines: int = 4, same: bool = False
+) -> tuple[bool, WheelFault | None]:
+    """Return whether the wheel is found faulty after these lines, and its kind of fault.
+
+    Speeds are in rad/s.
+    """
+    suspect = Suspect()
+    for _ in range(lines):
+        if suspect.looks(own * DT, other * DT, same, DT, FINE):
+            suspect.compare(own * DT, other * DT, DT, known)
+    return suspect.sign is not None and suspect.is_faulty(FINE), suspect.sign
+
+
+@pytest.mark.parametrize("known", [told(10.0), told(12.0, slow=8.0), felt(10.0)])
+@pytest.mark.parametrize(("own", "lie"), [(0.0, "dead"), (0.4, "dead"), (-10.0, "reversed")])
+def test_a_sign_that_command_or_gyro_deny_is_a_lie(
+    own: float, lie: WheelFault, known: Known
+) -> None:
+    assert lies(own, 10.0, known) == (True, lie)
+
+
+@pytest.mark.parametrize("own", [0.0, -10.0])
+def test_two_lines_are_none(own: float) -> None:
+    assert not lies(own, 20.0, told(20.0), lines=2)[0]
+
+
+@pytest.mark.parametrize("own", [0.0, -10.0])
+def test_without_command_and_gyro_nothing_is_known(own: float) -> None:
+    assert not lies(own, 10.0, NOTHING, lines=1000)[0]
+
+
+def test_who_does_as_told_does_not_lie() -> None:
+    assert not lies(0.0, 10.0, told(0.4), lines=100)[0]
+    assert not lies(10.0, -10.0, told(10.0), lines=100)[0]
+
+
+def test_a_gyro_is_believed_before_the_command() -> None:
+    spins = Known(10.0 * DT, 10.0 * DT, True, 0.0)
+    assert lies(0.0, 10.0, Known(10.0 * DT, 10.0 * DT, True, None))[0]
+    assert not lies(0.0, 10.0, spins, lines=100)[0]
+
+
+def test_half_the_speed_is_no_sign_of_a_lie() -> None:
+    assert lies(5.0, 10.0, told(10.0), lines=100) == (False, None)
+
+
+def test_a_wheel_that_says_the_same_while_its_command_and_the_other_change_is_stuck() -> None:
+    suspect, speed = Suspect(), 10.0
+    lines = 0
+    while lines < 20:
+        lines += 1
+        speed -= 0.3
+        command = Known((speed + 2.0) * DT, (speed - 1.0) * DT, True, None)
+        assert suspect.looks(10.0 * DT, speed * DT, True, DT, FINE)
+        suspect.compare(10.0 * DT, speed * DT, DT, command)
+        if suspect.is_faulty(FINE):
+            break
+    assert suspect.sign == "stuck"
+    assert 3 <= lines < 15
+
+
+def test_what_no_hand_turns_so_evenly_is_stuck_too() -> None:
+    assert not lies(3.0, 0.0, NOTHING, lines=25, same=True)[0]
+    assert lies(3.0, 0.0, NOTHING, lines=35, same=True) == (True, "stuck")
+
+
+@pytest.mark.parametrize(
+    ("lie", "own", "other", "lied"),
+    [
+        ("dead", 0.0, 5.0, True), ("dead", 5.0, 5.0, False),
+        ("reversed", -5.0, 5.0, True), ("reversed", 5.0, 5.0, False),
+        ("stuck", 7.0, 5.0, True), ("stuck", 7.01, 5.0, False),
+    ],
+)  # fmt: skip
+def test_a_line_before_belongs_to_the_lie_if_it_has_its_sign(
+    lie: WheelFault, own: float, other: float, lied: bool
+) -> None:
+    assert was_faulty(lie, own, other, 7.0) is lied
+
+
+def test_every_lie_has_its_words() -> None:
+    assert set(WORDS) == set(WheelFault.__args__)  # type: ignore[attr-defined]
+
+
+SLOW_S = 0.25
+"""Time in which a slow wheel completes most of a change, s."""
+
+
+def after(acceleration: float, other: float = 1.0, same: bool = True, count: float = FINE) -> float:
+    """Return the time until a wheel that still reports 10 rad/s is found stuck, s.
+
+    The time starts when the command leaves 10 rad/s. The other wheel follows the change by the
+    share `other`. The result is inf if one second is not enough.
+    """
+    stuck, slow, command, turned = Stuck(), 10.0, 10.0, 10.0
+    for line in range(200):
+        command += acceleration * DT if line >= 100 else 0.0
+        slow += (command - slow) * DT / (SLOW_S + DT)
+        turned = 10.0 + other * (command - 10.0)
+        if stuck.says(same, (turned - 10.0) * DT, DT, count, slow, command):
+            return (line - 99) * DT
+    return math.inf
+
+
+@pytest.mark.parametrize("acceleration", [20.0, 32.0, -20.0, -32.0])
+def test_it_is_out_within_50_ms_of_being_2_rad_s_wrong(acceleration: float) -> None:
+    assert after(acceleration) <= 2.0 / abs(acceleration) + 0.05
+
+
+def test_a_steady_wheel_says_the_same_for_ever() -> None:
+    assert after(0.0) == math.inf
+
+
+def test_a_wheel_that_says_another_speed_is_not_stuck() -> None:
+    assert after(20.0, same=False) == math.inf
+
+
+def test_if_neither_wheel_follows_it_is_the_command_that_is_not_obeyed() -> None:
+    assert after(20.0, other=0.0) == math.inf
+    assert after(20.0, other=-1.0) == math.inf
+
+
+@pytest.mark.parametrize("counts", [96, 400])
+def test_coarser_encoders_need_more_turn_to_tell(counts: int) -> None:
+    assert after(20.0) < after(20.0, count=math.tau / counts)
+
+
+def test_a_speed_that_changes_in_between_begins_it_anew() -> None:
+    stuck = Stuck()
+    for line in range(1, 100):
+        command = 10.0 + 0.2 * line
+        found = stuck.says(line % 3 != 0, 0.002 * line, DT, FINE, command - 1.0, command)
+        assert not found
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.02, 0.1), st.sampled_from([16, 96, 400, 3200]))
+def test_a_sound_wheel_with_an_encoder_of_any_kind_is_not_stuck(
+    phase: float, lag: float, counts: int
+) -> None:
+    stuck, count = Stuck(), math.tau / counts
+    slow = command = speed = 10.0
+    angles, said = [phase * count, 0.0], [0, 0]
+    last = None
+    for line in range(300):
+        command += 0.2 if 100 <= line < 160 else 0.0
+        slow += (command - slow) * DT / (SLOW_S + DT)
+        speed += (command - speed) * DT / (lag + DT)
+        angles = [angle + speed * DT for angle in angles]
+        own, other = (  # both are whole counts
+            math.floor(angle / count) - before for angle, before in zip(angles, said, strict=True)
+        )
+        said = [said[0] + own, said[1] + other]
+        assert not stuck.says(own == last, (other - own) * count, DT, count, slow, command)
+        last = own

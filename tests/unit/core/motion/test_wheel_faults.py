@@ -1,0 +1,466 @@
+"""The wheels of each side check each other: a faulty one leaves the pose, and slip is reported."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from acsard.core.config.settings import DriveConfig, FeedbackConfig
+from acsard.core.link.feedback import Feedback
+from acsard.core.motion.gyro import Turn
+from acsard.core.motion.kinematics import Kinematics
+from acsard.core.motion.sanity import Sanity
+from acsard.core.motion.wheel_faults import WheelFaults
+from acsard.core.values import STILL, WHEELS, WheelSpeeds
+from tests.unit.core.motion.liars import (
+    AT,
+    LIES,
+    PERIOD,
+    Array,
+    Plain,
+    Robot,
+    apart,
+    commands,
+    lines,
+    odometry,
+    rolled,
+    said,
+    wishes,
+)
+from tests.unit.core.motion.test_odometry import Says
+
+TEN = WheelSpeeds(10.0, 10.0, 10.0, 10.0)
+
+
+def only(wheel: int, speed: float, others: float = 10.0) -> WheelSpeeds:
+    return WheelSpeeds(*(speed if i == wheel else others for i in range(4)))
+
+
+class Bench:
+    """A consistency check that is fed line by line."""
+
+    def __init__(self, counts: int = 3200) -> None:
+        kinematics = Kinematics(DriveConfig())
+        self.faults = WheelFaults(kinematics, counts, FeedbackConfig().response_time)
+        self.events: list[str] = []
+
+    def run(
+        self,
+        says: WheelSpeeds,
+        told: WheelSpeeds | None = None,
+        seconds: float = 1.0,
+        turn: float | None = None,
+    ) -> float:
+        """Return the time until a wheel was found faulty, s, or inf.
+
+        `turn` is the gyro's rate in rad/s.
+        """
+        found = math.inf
+        for line in range(round(seconds / PERIOD)):
+            front_right, front_left, rear_left, rear_right = says.as_tuple()
+            turned = (
+                front_right * PERIOD, front_left * PERIOD, rear_left * PERIOD, rear_right * PERIOD
+            )  # fmt: skip
+            by_gyro = None if turn is None else turn * PERIOD
+            if self.faults.look(turned, says, PERIOD, told, by_gyro):
+                found = min(found, (line + 1) * PERIOD)
+            self.events += [event.kind for event in self.faults.events]
+        return found
+
+
+def driven(told: WheelSpeeds = TEN, counts: int = 3200) -> Bench:
+    bench = Bench(counts)
+    bench.run(told, told, seconds=2.0)
+    assert bench.faults.status.text == ""
+    return bench
+
+
+# faulty wheels
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("says", [0.0, -10.0])
+def test_a_wheel_that_lies_is_left_out_within_fifty_milliseconds_and_named(
+    wheel: int, says: float
+) -> None:
+    bench = driven()
+    assert bench.run(only(wheel, says), TEN) <= 0.05
+    assert bench.faults.status.left_out == (WHEELS[wheel],)
+    assert bench.faults.status.text.startswith(f"{WHEELS[wheel]} wheel is left out")
+    said = only(wheel, says).as_tuple()
+    assert bench.faults.believed(said) == pytest.approx((10.0,) * 4, 1e-3)
+
+
+def test_its_other_wheel_stands_in_for_it_and_no_wheel_else_changes() -> None:
+    bench = driven()
+    bench.run(only(1, 0.0), TEN)
+    front_right, front_left, *rear = bench.faults.believed((1, 2, 3, 4))
+    assert (front_right, rear) == (1, [3, 4])
+    assert front_left == pytest.approx(3, rel=1e-3)
+
+
+def test_a_wheel_of_each_side_can_be_left_out_and_never_both_of_one() -> None:
+    bench = driven()
+    bench.run(WheelSpeeds(0.0, 0.0, 10.0, 10.0), TEN)
+    assert bench.faults.status.left_out == ("front_left", "front_right")
+    bench.run(STILL, TEN)
+    assert bench.faults.status.left_out == ("front_left", "front_right")
+
+
+def test_it_counts_again_when_it_has_agreed_for_half_a_second() -> None:
+    bench = driven()
+    bench.run(only(2, 0.0), TEN)
+    bench.run(STILL, STILL, seconds=5.0)
+    assert bench.faults.status.left_out == ("rear_left",), "who stands agrees with everybody"
+    bench.run(TEN, TEN, seconds=2.0)
+    assert not bench.faults.status.left_out
+    assert bench.events == ["left out", "again"]
+
+
+def test_what_it_made_of_the_pose_until_then_is_taken_back() -> None:
+    robot, plain = odometry(3200), Plain()
+    for told in [TEN] * 200 + [only(0, 0.0)] * 50:
+        robot.fold(Feedback(AT, told, PERIOD), TEN)
+        plain.fold(Feedback(AT, told, PERIOD))
+    assert abs(plain.pose.yaw) > 0.3
+    assert abs(robot.pose.yaw) < 1e-3
+    assert robot.pose.x == pytest.approx(250 * 10 * PERIOD * 0.05, rel=1e-3)
+
+
+def test_the_wheels_angles_are_what_the_encoders_said() -> None:
+    robot = odometry()
+    for says in [TEN] * 100 + [only(0, 0.0)] * 100:
+        estimate = robot.fold(Feedback(AT, says, PERIOD), TEN)
+    assert estimate.positions == pytest.approx((10.0, 20.0, 20.0, 20.0))
+    assert estimate.speeds == only(0, 0.0)
+
+
+def test_a_pose_that_was_set_since_is_not_taken_back() -> None:
+    robot = odometry(3200)
+    for says in [TEN] * 100 + [only(0, 0.0)] * 2:
+        robot.fold(Feedback(AT, says, PERIOD), TEN)
+    robot.set_pose(robot.pose)
+    before = robot.pose
+    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    robot.fold(Feedback(AT, only(0, 0.0), PERIOD), TEN)
+    assert robot.checks.wheels.status.left_out == ("front_right",)
+    assert apart(before, robot.pose)[0] == pytest.approx(0.01, abs=1e-3)
+
+
+# no healthy wheel is left out
+
+
+@pytest.mark.parametrize("pushed", [0.5, 3.0, 12.0])
+@pytest.mark.parametrize("in_the_air", range(4))
+def test_hands_that_push_with_nothing_commanded_leave_no_wheel_out(
+    pushed: float, in_the_air: int
+) -> None:
+    """Either three wheels roll while one hangs in the air, or only the one in the air turns."""
+    for says in (only(in_the_air, 0.0, pushed), only(in_the_air, pushed, 0.0)):
+        bench = Bench()
+        for line in range(500):
+            noisy = WheelSpeeds(*(s + 0.1 * (line % 2) * (s != 0.0) for s in says.as_tuple()))
+            assert bench.run(noisy, STILL, PERIOD) == math.inf
+        assert bench.faults.status.left_out == ()
+
+
+def test_with_a_gyro_the_wheel_in_the_air_is_left_out_though_nothing_is_commanded() -> None:
+    bench = Bench()
+    assert bench.run(only(3, 0.0, 5.0), STILL, turn=0.0) <= 0.05
+    assert bench.faults.status.left_out == ("rear_right",)
+
+
+def test_a_wheel_that_spins_in_the_air_counts_and_is_told_as_slip() -> None:
+    bench = driven()
+    assert bench.run(only(0, 12.5), TEN, seconds=10.0) == math.inf
+    assert bench.faults.status.slipping == ("right",)
+
+
+# slip
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_slip_is_told_by_its_side_and_ends_half_a_second_after(wheel: int) -> None:
+    bench = driven()
+    bench.run(only(wheel, 11.0), TEN, seconds=0.2)
+    side = WHEELS[wheel].partition("_")[2]
+    assert bench.faults.status.slipping == (side,)
+    bench.run(TEN, TEN, seconds=0.4)
+    assert bench.faults.slips
+    bench.run(TEN, TEN, seconds=0.5)
+    assert not bench.faults.slips
+
+
+def test_while_it_slips_every_variance_is_a_hundred_times_as_large() -> None:
+    calm, slipping = odometry(3200), odometry(3200)
+    for says in [TEN] * 200:
+        sure = calm.fold(Feedback(AT, says, PERIOD), TEN)
+        slipping.fold(Feedback(AT, says, PERIOD), TEN)
+    begun = sure.covariance.yawyaw
+    for _ in range(100):
+        sure = calm.fold(Feedback(AT, TEN, PERIOD), TEN)
+        unsure = slipping.fold(Feedback(AT, only(0, 12.0), PERIOD), TEN)
+    assert unsure.twist_variances.linear > 90 * sure.twist_variances.linear
+    assert unsure.twist_variances.lateral == pytest.approx(100 * sure.twist_variances.lateral)
+    assert unsure.twist_variances.angular > 90 * sure.twist_variances.angular
+    assert unsure.covariance.yawyaw - begun > 80 * (sure.covariance.yawyaw - begun)
+
+
+def test_wheels_that_a_gyro_denies_are_as_uncertain() -> None:
+    calm, slipping = odometry(3200), odometry(3200)
+    calm.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=False))
+    slipping.checks.gyro = Says(Turn(0.0, 0.0, 0.0, 0.0, slips=True))
+    for _ in range(100):
+        line = Feedback(AT, TEN, PERIOD)
+        sure = calm.fold(line)
+        unsure = slipping.fold(line)
+    ratio = unsure.twist_variances.linear / sure.twist_variances.linear
+    assert ratio == pytest.approx(100.0)
+    assert unsure.covariance.xx > 90 * sure.covariance.xx
+
+
+# thousands of random drives
+
+
+class Fall:
+    """One drive with one failure: the pose errors with and without the check, until the fault."""
+
+    def __init__(self, kind: str, seed: int, counts: int) -> None:
+        rng = np.random.default_rng(seed)
+        told = commands(rng, 8.0, stops=0.05)
+        true = said(rolled(told, Robot(counts, tyres=0.005), rng), counts)
+        wheel = int(rng.integers(4))
+        begun = int(rng.integers(300, 700))
+        fast = 300 + np.flatnonzero(abs(told[300:700, wheel]) >= 2.0)
+        if not fast.size:  # the robot stands during the whole drive
+            begun, wheel = (int(i) for i in np.unravel_index(np.argmax(abs(told[:700])), (700, 4)))
+        while fast.size and abs(told[begun, wheel]) < 2.0:
+            begun = int(rng.integers(300, 700))
+        lying = LIES[kind](true, wheel, begun)
+        healthy, plain, robot = Plain(), Plain(), odometry()
+        sanity = Sanity(FeedbackConfig())
+        self.out_s = self.wrong = 0.0
+        off = out = None
+        truth, wishing = lines(true), wishes(told)
+        for i, line in enumerate(lines(lying, counts)):
+            healthy.fold(truth[i])
+            if sanity.impossible(line):
+                plain.skip(line)
+                robot.skip(line)
+                if sanity.doubtful:
+                    break
+                continue
+            fault = sanity.watch(wishing[i], line.speeds, PERIOD)
+            plain.fold(line)
+            robot.fold(line, wishing[i])
+            if off is None and i >= begun and abs(lying[i, wheel] - true[i, wheel]) > 2.0:
+                off = i
+            if out is None and robot.checks.wheels.status.left_out:
+                out = i
+                self.wrong += robot.checks.wheels.status.left_out != (WHEELS[wheel],) or i < begun
+            if fault:
+                break
+        self.plain, self.mine = apart(healthy.pose, plain.pose), apart(healthy.pose, robot.pose)
+        if off is not None:
+            self.out_s = math.inf if out is None else max(0, out - off + 1) * PERIOD
+
+
+GOAL = 0.05
+"""Largest share of the plain mean's error, for encoders that reveal a failure at once."""
+
+COARSE = {
+    (400, "stuck"): 0.1,
+    (96, "stuck"): 0.15,
+    (20, "dead"): 0.1,
+    (20, "reversed"): 0.5,
+    (20, "stuck"): 0.1,
+}
+"""Larger shares for cases in which 3.5 counts must pass before a failure shows.
+
+With 20 counts per turn and at low speed, a reversed wheel is not always found.
+"""
+
+SOAK = [pytest.mark.soak, pytest.mark.timeout(3600)]
+
+
+@pytest.mark.parametrize(
+    ("counts", "count"),
+    [
+        (3200, 4),
+        *(pytest.param(counts, 30, marks=pytest.mark.slow) for counts in (20, 96, 400)),
+        pytest.param(3200, 50, marks=pytest.mark.slow),
+        *(pytest.param(counts, 1000, marks=SOAK) for counts in (20, 96, 400, 3200)),
+    ],
+)
+@pytest.mark.parametrize("kind", list(LIES))
+def test_until_the_fault_a_lie_costs_less_than_a_twentieth(
+    kind: str, counts: int, count: int
+) -> None:
+    """The drives are random. `COARSE` allows more for coarse encoders."""
+    falls = [Fall(kind, seed, counts) for seed in range(count)]
+    plain = np.array([fall.plain for fall in falls]).mean(axis=0)
+    mine = np.array([fall.mine for fall in falls]).mean(axis=0)
+    soon = sum(fall.out_s <= 0.05 + 1e-9 for fall in falls) / count
+    print(
+        f"\n{kind}, {counts} counts x {count}: plain mean {plain[0]:.3f} m "
+        f"{math.degrees(plain[1]):.1f} deg, "
+        f"left out {mine[0] / plain[0]:.1%} and {mine[1] / plain[1]:.1%} of that; "
+        f"out within 50 ms {soon:.1%}"
+    )
+    assert not sum(fall.wrong for fall in falls)
+    goal = COARSE.get((counts, kind), GOAL)
+    assert mine[1] < goal * plain[1]
+    assert mine[0] < goal * plain[0]
+    assert soon > 0.95 or counts < 3200 or count < 50
+
+
+def steady(counts: int, speed: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return commanded speeds in rad/s and wheel angles in rad of a straight drive."""
+    steps = np.concatenate([np.linspace(0.0, 1.0, 150), np.ones(450)])
+    told = np.round(steps[:, None] * speed * np.ones(4), 2)
+    return told, rolled(told, Robot(counts, tyres=0.005), rng)
+
+
+def out_after(kind: str, counts: int, speed: float, seed: int) -> float:
+    """Return the time until the faulty wheel is left out on a straight drive, s.
+
+    The test fails if another wheel is left out.
+    """
+    rng = np.random.default_rng(seed)
+    told, angles = steady(counts, speed, rng)
+    wheel, begun = int(rng.integers(4)), int(rng.integers(300, 400))
+    lying = LIES[kind](said(angles, counts), wheel, begun)
+    robot = odometry()
+    for i, (line, wish) in enumerate(zip(lines(lying, counts), wishes(told), strict=True)):
+        robot.fold(line, wish)
+        if robot.checks.wheels.status.left_out:
+            assert robot.checks.wheels.status.left_out == (WHEELS[wheel],)
+            assert i >= begun
+            return (i - begun + 1) * PERIOD
+    return math.inf
+
+
+@pytest.mark.parametrize(
+    ("kind", "counts", "speed", "within"),
+    [
+        ("dead", 400, 20.0, 0.03), ("dead", 400, 4.0, 0.05),
+        ("dead", 96, 20.0, 0.05), ("dead", 96, 10.0, 0.06), ("dead", 96, 4.0, 0.13),
+        ("dead", 20, 20.0, 0.1), ("dead", 20, 10.0, 0.2), ("dead", 20, 4.0, 0.7),
+        ("reversed", 400, 4.0, 0.04), ("reversed", 96, 4.0, 0.1), ("reversed", 20, 20.0, 0.08),
+    ],
+)  # fmt: skip
+def test_how_soon_a_lie_is_out_is_a_matter_of_counts_and_speed(
+    kind: str, counts: int, speed: float, within: float
+) -> None:
+    """Speeds are those of the wheels in rad/s; 20 rad/s are 1 m/s."""
+    found = max(out_after(kind, counts, speed, seed) for seed in range(3))
+    print(f"\n{kind}, {counts} counts, {speed:g} rad/s: {found:.2f} s")
+    assert found <= within + 1e-9
+
+
+def healthy(
+    seed: int, seconds: float, counts: int, before: tuple[WheelSpeeds, ...] = ()
+) -> tuple[int, bool]:
+    """Return how often slip is reported on a clean drive, and whether the pose stays exact.
+
+    The pose must equal the plain mean's bit for bit.
+
+    The lines of `before` precede the drive.
+    """
+    rng = np.random.default_rng(10_000 + seed)
+    told = commands(rng, seconds)
+    robot, plain, alarms, slips = odometry(), Plain(), 0, False
+    speeds = said(rolled(told, Robot(counts, load=0.02), rng), counts)
+    for one in before:
+        robot.fold(Feedback(AT, one, PERIOD))
+        plain.fold(Feedback(AT, one, PERIOD))
+    for line, wish in zip(lines(speeds), wishes(told), strict=True):
+        robot.fold(line, wish)
+        plain.fold(line)
+        if line.speeds != STILL:
+            was, slips = slips, bool(robot.checks.wheels.status.slipping)
+            alarms += slips and not was
+    return alarms, robot.pose == plain.pose
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_digit_that_flips_at_rest_makes_no_encoder_a_fine_one(seed: int) -> None:
+    flipped = only(1, 0.01, 0.0)
+    assert healthy(seed, 20.0, 96, (STILL, flipped, STILL, STILL, flipped, STILL)) == (0, True)
+
+
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        20,
+        pytest.param(120, marks=pytest.mark.slow),
+        pytest.param(3600, marks=[pytest.mark.soak, pytest.mark.timeout(3600)]),
+    ],
+)
+@pytest.mark.parametrize("counts", [96, 400, 3200])
+def test_an_hour_of_clean_driving_raises_one_false_alarm_at_most(counts: int, seconds: int) -> None:
+    """The robots differ in motors, tyres and loads. Each drives for at most five minutes."""
+    each = min(seconds, 300)
+    found = [healthy(seed, each, counts) for seed in range(seconds // each)]
+    alarms = sum(alarm for alarm, _ in found)
+    print(f"\n{counts} counts, {seconds} s: {alarms} false alarms")
+    assert alarms <= 1
+    assert all(same for _, same in found)
+
+
+def slipping(rng: np.random.Generator, counts: int, speed: float = 0.0) -> float:
+    """Return the time until an error of a tenth on one wheel is reported on a steady drive, s.
+
+    With `speed` 0 the speed is random.
+    """
+    speed = rng.choice((-1, 1)) * (speed or rng.uniform(6.0, 18.0))
+    steps = np.concatenate([np.linspace(0.0, 1.0, 90), np.ones(410)])
+    told = np.round(steps[:, None] * speed * np.ones(4), 2)
+    angles: Array = rolled(told, Robot(counts, tyres=0.01), rng)
+    wheel, begun = int(rng.integers(4)), int(rng.integers(350, 450))
+    angles[begun:, wheel] += 0.1 * rng.choice((-1, 1)) * (
+        angles[begun:, wheel] - angles[begun - 1, wheel]
+    )  # fmt: skip
+    robot = odometry()
+    for i, (line, wish) in enumerate(zip(lines(said(angles, counts)), wishes(told), strict=True)):
+        robot.fold(line, wish)
+        if i >= begun and robot.checks.wheels.status.slipping:
+            return (i - begun + 1) * PERIOD
+    return math.inf
+
+
+@pytest.mark.parametrize(
+    "count", [10, pytest.param(300, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])]
+)
+@pytest.mark.parametrize(("counts", "share"), [(3200, 0.95), (400, 0.7)])
+def test_slip_of_a_tenth_is_told_within_a_fifth_of_a_second(
+    counts: int, share: float, count: int
+) -> None:
+    rng = np.random.default_rng(5)
+    found = sorted(slipping(rng, counts) for _ in range(count))
+    soon = sum(one <= 0.2 + 1e-9 for one in found) / count
+    print(f"\n{counts} counts: median {found[count // 2]:.2f} s, {soon:.0%} in 0.2 s")
+    assert soon >= share
+
+
+@pytest.mark.parametrize(
+    ("counts", "speed", "within"),
+    [
+        (3200, 20.0, 0.2), (3200, 4.0, 0.3), (400, 20.0, 0.25), (400, 10.0, 0.4),
+        pytest.param(400, 4.0, 1.5, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_how_soon_slip_is_told_is_a_matter_of_counts_and_speed(
+    counts: int, speed: float, within: float
+) -> None:
+    """Speeds are those of the wheels in rad/s."""
+    rng = np.random.default_rng(7)
+    found = sorted(slipping(rng, counts, speed) for _ in range(5))
+    print(f"\n{counts} counts, {speed:g} rad/s: median {found[2]:.2f} s, at most {found[-1]:.2f}")
+    assert found[-1] <= within + 1e-9
+
+
+def test_of_twenty_counts_a_turn_slip_of_a_tenth_does_not_show() -> None:
+    assert slipping(np.random.default_rng(7), 20, 20.0) == math.inf

@@ -1,0 +1,88 @@
+"""Tests of the front-rear difference of one side.
+
+It comes from slip, or from a count, a tyre or a slower motor.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.core.motion.wheel_residual import MEMORY_S, UNEQUAL, Residual
+
+DT = 0.01
+KEEP = MEMORY_S / (MEMORY_S + DT)
+FINE = math.tau / 3200
+
+
+def rolled(
+    residual: Residual, front: float, rear: float, seconds: float, count: float = FINE
+) -> list[bool]:
+    """Return for each line whether the front and rear wheels agreed at these speeds, rad/s."""
+    lines = round(seconds / DT)
+    return [residual.add(front * DT, rear * DT, KEEP, DT, count) for _ in range(lines)]
+
+
+@given(st.floats(-40.0, 40.0))
+def test_two_wheels_that_turn_alike_agree(speed: float) -> None:
+    residual = Residual()
+    assert all(rolled(residual, speed, speed, 1.0))
+    assert residual.ratio == 0.0
+
+
+@pytest.mark.parametrize("speed", [8.0, -15.0])
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_tenth_more_on_one_wheel_is_a_contradiction_within_a_fifth_of_a_second(
+    speed: float, share: float
+) -> None:
+    residual = Residual()
+    rolled(residual, speed, speed, 2.0)
+    said = rolled(residual, speed * share, speed, 0.2)
+    assert said[0]
+    assert not said[-1]
+    assert residual.slips
+
+
+def test_wheels_of_another_size_are_learned_and_agree() -> None:
+    residual = Residual()
+    rolled(residual, 10.3, 10.0, 30.0)
+    assert residual.ratio == pytest.approx(0.3 / 10.15, rel=0.02)
+    assert all(rolled(residual, -10.3, -10.0, 1.0))
+
+
+def test_what_is_learned_stays_within_what_tyres_can_be() -> None:
+    residual = Residual()
+    rolled(residual, 14.0, 10.0, 600.0)
+    assert residual.ratio == pytest.approx(UNEQUAL)
+    assert not residual.add(0.14, 0.10, KEEP, DT, FINE)
+
+
+@pytest.mark.parametrize("front", [True, False])
+def test_who_stands_in_turns_as_the_other_one_would_have(front: bool) -> None:
+    residual = Residual()
+    rolled(residual, 10.4, 10.0, 60.0)
+    said, missing = (10.0, 10.4) if front else (10.4, 10.0)
+    assert said * residual.stand_in(front) == pytest.approx(missing, rel=2e-3)
+
+
+@pytest.mark.parametrize("counts", [16, 96, 400])
+@given(phase=st.floats(0.0, 1.0), speed=st.floats(0.5, 30.0))
+def test_wheels_a_part_of_a_count_apart_agree(counts: int, phase: float, speed: float) -> None:
+    residual, count = Residual(), math.tau / counts
+    angles = [(math.floor(speed * DT * n / count), math.floor(speed * DT * n / count + phase))
+              for n in range(301)]  # fmt: skip
+    for (front, rear), (after, behind) in pairwise(angles):
+        assert residual.add((after - front) * count, (behind - rear) * count, KEEP, DT, count)
+
+
+def test_a_motor_that_follows_later_than_the_other_is_no_slip() -> None:
+    residual, speeds = Residual(), [0.0, 0.0]
+    for n in range(600):
+        goal = min(15.0, 0.2 * n) if n < 300 else max(0.0, 15.0 - 0.2 * (n - 300))
+        for i, lag in enumerate((0.05, 0.065)):
+            speeds[i] += (goal - speeds[i]) * DT / lag
+        assert residual.add(speeds[0] * DT, speeds[1] * DT, KEEP, DT, FINE) or not residual.slips

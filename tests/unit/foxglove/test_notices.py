@@ -1,0 +1,100 @@
+"""Viewers get each notice once, and those who come later the ones that last."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from acsard.client.commander import GRACE_S
+from acsard.core.values import NS_PER_S
+from acsard.foxglove.notices import AGAIN, WAITING, Notices, Objections
+from acsard.host import clock
+
+OBJECTS_NS = int(GRACE_S * NS_PER_S)
+
+WHY = "stopped by request"
+
+
+class Server:
+    """The server's status messages: each text, or the id of one that was withdrawn."""
+
+    def __init__(self) -> None:
+        self.shown: list[str] = []
+
+    def publish_status(self, text: str, level: object, stays: str | None) -> None:
+        self.shown.append(text)
+
+    def remove_status(self, ids: list[str]) -> None:
+        self.shown += [f"without {one}" for one in ids]
+
+
+def shown(notices: Notices, *, newcomers: bool = False) -> list[str]:
+    """Send the waiting notices and return what a viewer saw."""
+    server: Any = Server()
+    notices.send(server, lambda line: None, newcomers=newcomers)
+    return list(server.shown)
+
+
+def test_a_text_is_repeated_only_after_a_while_and_a_lasting_one_always(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    notices, again_ns = Notices(lambda text: None, lambda: None), int(NS_PER_S / AGAIN.hz)
+    for at_ns in (0, again_ns - 1, again_ns):
+        monkeypatch.setattr(clock, "mono_ns", lambda at_ns=at_ns: at_ns)
+        notices.say("warning", "drive", "too slow")
+        notices.say("error", "daemon", "gone", stays="daemon")
+    assert shown(notices) == ["too slow", "gone", "gone", "too slow", "gone"]
+
+
+def test_a_newcomer_gets_the_statuses_that_last_until_they_are_over() -> None:
+    notices = Notices(lambda text: None, lambda: None)
+    notices.say("error", "daemon", "gone", stays="daemon")
+    notices.say("info", "set", "done")
+    assert shown(notices) == ["gone", "done"]
+    assert shown(notices, newcomers=True) == ["gone"]
+    notices.over("daemon")
+    assert shown(notices) == ["without daemon"]
+    assert shown(notices, newcomers=True) == []
+
+
+def test_the_newest_notices_wait_for_the_viewers_and_each_wakes_the_main_thread() -> None:
+    wakes: list[int] = []
+    notices = Notices(lambda text: None, lambda: wakes.append(1))
+    for number in range(WAITING + 3):
+        notices.say("info", "test", str(number))
+    assert shown(notices) == [str(number) for number in range(3, WAITING + 3)]
+    assert len(wakes) == WAITING + 3
+
+
+# why commands do not drive
+
+
+def test_the_first_moment_is_no_news() -> None:
+    told = Objections()
+    assert not told.look(WHY, 0)
+    assert not told.look(WHY, OBJECTS_NS - 1)
+    assert told.look(WHY, OBJECTS_NS)
+    assert told.told == WHY
+
+
+def test_it_is_told_once_and_taken_back_when_over() -> None:
+    told = Objections()
+    changes = [told.look(WHY if n < 20 else "", n * OBJECTS_NS) for n in range(30)]
+    assert changes.count(True) == 2
+    assert changes[1]
+    assert changes[20]
+    assert told.told == ""
+
+
+def test_another_reason_is_told_at_once() -> None:
+    told = Objections()
+    told.look(WHY, 0)
+    told.look(WHY, OBJECTS_NS)
+    assert told.look("fault", OBJECTS_NS + 1)
+    assert told.told == "fault"
+
+
+def test_what_is_over_soon_is_never_told() -> None:
+    told = Objections()
+    assert not any(told.look(WHY if n % 2 else "", n * (OBJECTS_NS - 1)) for n in range(20))

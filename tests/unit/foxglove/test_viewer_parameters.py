@@ -1,0 +1,96 @@
+"""A viewer's parameters are exactly the live settings, and follow them while a viewer looks."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+
+from acsard.client import Client
+from acsard.core.config.live import LIVE
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.foxglove.drives import Drives
+from acsard.foxglove.notices import Notices
+from acsard.foxglove.server import Listener, Shown
+from acsard.foxglove.viewer_parameters import POLL_NS, Settings, asked, changes, values
+from acsard.host import clock
+
+KEY, OTHER = "rates.odom", "rates.joint_states"
+
+NOW = values(effective(Config()))
+
+
+class Robot:
+    """A client of a robot whose setting somebody else has changed."""
+
+    def get(self, key: str) -> Any:
+        tables: Any = effective(Config())
+        tables["rates"]["odom"] = 7.0
+        return tables
+
+
+def settings_after(monkeypatch: pytest.MonkeyPatch, *calls: tuple[str, list[str]]) -> Settings:
+    """Return the settings after these calls of the server, at a time at which a poll is due."""
+    made = Settings(
+        cast(Client, Robot()), Notices(lambda _: None, lambda: None), effective(Config())
+    )
+    listener = Listener(Shown(lambda: None), cast(Drives, None), made)
+    for name, keys in calls:
+        getattr(listener, f"on_parameters_{name}")(keys)
+    later_ns = clock.mono_ns() + 2 * POLL_NS
+    monkeypatch.setattr(clock, "mono_ns", lambda: later_ns)
+    return made
+
+
+def test_a_change_reaches_a_viewer_that_follows_a_parameter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert settings_after(monkeypatch, ("subscribe", [KEY])).refresh() == {KEY: 7.0}
+
+
+def test_the_end_of_one_subscription_does_not_end_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = settings_after(
+        monkeypatch, ("subscribe", [KEY]), ("subscribe", [OTHER]), ("unsubscribe", [OTHER])
+    )
+    assert made.refresh() == {KEY: 7.0}
+
+
+def test_without_a_follower_the_robot_is_not_queried(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = settings_after(
+        monkeypatch, ("subscribe", [KEY, OTHER]), ("unsubscribe", [OTHER]), ("unsubscribe", [KEY])
+    )
+    assert made.refresh() == {}
+
+
+def test_they_are_the_settings_that_may_be_set_and_no_others() -> None:
+    single = {key for key in LIVE if "*" not in key}
+    timeouts = {
+        f"commands.sources.{name}.timeout" for name in ("teleop", "app", "nav", "ros2_control")
+    }
+    assert set(NOW) == single | timeouts
+
+
+def test_lists_are_lists_as_the_protocol_wants_them() -> None:
+    assert {type(value) for value in NOW.values()} <= {float, int, str, bool, list}
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        ([], set(NOW)),
+        (["rates.odom"], {"rates.odom"}),
+        (["rates.odom", "no.such"], {"rates.odom"}),
+    ],
+)
+def test_who_names_none_gets_all(names: list[str], found: set[str]) -> None:
+    assert set(asked(NOW, names)) == found
+
+
+def test_changes_are_the_settings_with_another_value() -> None:
+    later = NOW | {"rates.odom": 50.0, "log.level": "debug"}
+    assert changes(NOW, later) == {"rates.odom": 50.0, "log.level": "debug"}
+    assert changes(later, later) == {}
+    assert changes({}, later) == later

@@ -1,0 +1,273 @@
+"""A child starts, lives, is limited and ends as its parent says, and never outlives it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from asyncio.subprocess import PIPE
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from acsard.core.values import NS_PER_S
+from acsard.host import child as module
+from acsard.host import clock
+from acsard.host.child import Child, Limits, Parent, acsard, end, environment, how_it_ended, running
+
+WAIT_S = 20.0
+
+ALIVE = "import os, time; os.write(0, b'.'); "
+UNTIL_CLOSED = "import os; os.read(0, 1)"
+
+
+def program(text: str) -> list[str]:
+    return [sys.executable, "-S", "-c", text]
+
+
+def started(text: str) -> subprocess.Popen[bytes]:
+    """Start a program and wait until it has printed a line."""
+    process = subprocess.Popen(program(text), stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    return process
+
+
+def is_alive(pid: int) -> bool:
+    """Return whether a process runs. One that has ended and is not yet collected does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def until_gone(pid: int) -> None:
+    end_ns = clock.mono_ns() + WAIT_S * NS_PER_S
+    while is_alive(pid):
+        assert clock.mono_ns() < end_ns
+        threading.Event().wait(0.01)
+
+
+# one run of a child
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "words"),
+    [
+        ("", 0, "ended with 0"),
+        ("raise SystemExit(78)", 78, "ended with 78"),
+        ("import os; os.kill(os.getpid(), 9)", -9, "was ended by signal 9"),
+    ],
+)
+def test_a_run_returns_how_the_child_ended(text: str, code: int, words: str) -> None:
+    child = Child(program(text))
+    assert (child.run(), child.silent, how_it_ended(code)) == (code, "", words)
+
+
+def test_a_program_that_is_not_there_raises_an_error() -> None:
+    with pytest.raises(OSError, match="No such file"):
+        Child(["/nowhere/acsard"]).run()
+
+
+def test_a_child_that_is_released_sees_the_end_of_its_input() -> None:
+    child, codes = Child(program(UNTIL_CLOSED)), []
+    thread = threading.Thread(target=lambda: codes.append(child.run()))
+    thread.start()
+    while child._ours is None:
+        threading.Event().wait(0.001)
+    child.release()
+    thread.join(WAIT_S)
+    assert codes == [0]
+
+
+def test_a_child_that_is_released_before_it_starts_ends_at_once() -> None:
+    child = Child(program(UNTIL_CLOSED))
+    child.release()
+    assert child.run() == 0
+
+
+def test_a_child_without_a_first_sign_of_life_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "START_NS", 0)
+    child = Child(program("import time; time.sleep(100)"))
+    assert child.run() == -signal.SIGKILL
+    assert "stopped, or hung" in child.silent
+
+
+def test_a_child_that_falls_silent_is_killed_although_it_is_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "START_NS", 3600 * NS_PER_S)
+    monkeypatch.setattr(module, "SILENT_NS", 0)
+    child = Child(program(ALIVE + "os.kill(os.getpid(), 19)"))
+    assert child.run() == -signal.SIGKILL
+    assert "stopped, or hung" in child.silent
+
+
+def test_a_child_that_gives_signs_of_life_is_not_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "BEAT_S", 0.4)
+    monkeypatch.setattr(module, "SILENT_NS", 9 * NS_PER_S // 10)
+    child = Child(program("import os, time\nfor _ in range(15): os.write(0, b'.'); time.sleep(.1)"))
+    assert (child.run(), child.silent) == (0, "")
+
+
+def test_a_child_has_a_session_of_its_own_and_does_not_speak_for_our_unit(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", "/run/us")
+    monkeypatch.setenv("MORE", "1")
+    found = tmp_path / "found"
+    text = "import os; print(os.getsid(0) == os.getpid(), 'NOTIFY_SOCKET' in os.environ, "
+    assert Child(program(f"{text} file=open({str(found)!r}, 'w'))")).run() == 0
+    assert found.read_text() == "True False\n"
+    assert "MORE" in environment()
+    assert "MORE" not in environment(("MORE",))
+
+
+def test_the_command_runs_the_installed_package() -> None:
+    command = acsard("--version")
+    assert command[1] == "-P"
+    assert subprocess.run(command, capture_output=True, check=True).stdout.startswith(b"acsard ")
+
+
+# a child in the event loop
+
+
+def test_a_child_is_killed_and_collected_when_its_block_fails() -> None:
+    async def story() -> int | None:
+        with suppress(ValueError):
+            async with running(program("import time; time.sleep(100)")) as child:
+                raise ValueError
+        return child.returncode
+
+    assert asyncio.run(story()) == -signal.SIGKILL
+
+
+def test_a_child_is_collected_although_nobody_reads_its_output() -> None:
+    flood = "import os\nwhile True: os.write(1, bytes(65536))"
+
+    async def story() -> int | None:
+        async with running(program(flood), stdout=PIPE) as child:
+            assert child.stdout is not None
+            await child.stdout.readexactly(1)
+            await asyncio.sleep(0.2)  # asyncio stops reading when its buffer is full
+        return child.returncode
+
+    assert asyncio.run(asyncio.wait_for(story(), 20)) == -signal.SIGKILL
+
+
+def test_a_child_that_has_ended_keeps_its_exit_code_and_its_output() -> None:
+    async def story() -> tuple[bytes, int | None]:
+        async with running(program("print(1); raise SystemExit(3)"), stdout=PIPE) as child:
+            out, _ = await child.communicate()
+        return out, child.returncode
+
+    assert asyncio.run(story()) == (b"1\n", 3)
+
+
+def test_a_child_gets_its_limits_and_one_that_has_ended_needs_none() -> None:
+    limits = Limits(nice=19, memory_bytes=64 << 20)
+
+    async def story() -> bytes:
+        text = "import sys; sys.stdin.read(1); bytearray(100 << 20)"
+        async with running(program(text), limits, stdin=PIPE, stderr=PIPE) as child:
+            assert os.getpriority(os.PRIO_PROCESS, child.pid) == 19
+            _, said = await child.communicate(b"go")
+        return said
+
+    assert b"MemoryError" in asyncio.run(story())
+    ended = subprocess.Popen(program(""))
+    ended.wait(WAIT_S)
+    module.limit(ended.pid, limits)
+
+
+# the end by signals
+
+
+def test_a_child_that_obeys_is_ended_by_sigterm() -> None:
+    process = started("import time; print(1, flush=True); time.sleep(100)")
+    end(process, WAIT_S)
+    assert process.returncode == -signal.SIGTERM
+
+
+def test_a_child_that_does_not_obey_is_killed() -> None:
+    ignores = "import signal, time; signal.signal(15, signal.SIG_IGN); print(1, flush=True); "
+    process = started(ignores + "time.sleep(100)")
+    end(process, 0.05)
+    assert process.returncode == -signal.SIGKILL
+
+
+def test_a_child_that_has_ended_is_left_alone() -> None:
+    process = started("print(1, flush=True)")
+    process.wait(WAIT_S)
+    end(process, 0.05)
+    assert process.returncode == 0
+
+
+def test_a_child_ends_when_its_parent_is_killed() -> None:
+    inner = (
+        "import signal, time; from acsard.host.child import end_with_parent; "
+        "end_with_parent(signal.SIGKILL); print(1, flush=True); time.sleep(100)"
+    )
+    outer = (
+        "import subprocess, sys, time; "
+        f"child = subprocess.Popen([sys.executable, '-c', {inner!r}], stdout=subprocess.PIPE); "
+        "child.stdout.readline(); print(child.pid, flush=True); time.sleep(100)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", outer], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    grandchild = int(process.stdout.readline())
+    assert is_alive(grandchild)
+    process.kill()
+    process.wait(WAIT_S)
+    until_gone(grandchild)
+
+
+# the parent, as the child sees it
+
+
+def test_signs_of_life_reach_the_parent_and_never_wait_for_it() -> None:
+    ours, its = socket.socketpair()
+    with ours, its:
+        parent = Parent(its.fileno())
+        for _ in range(100_000):  # more than the socket holds
+            parent.beat()
+        assert set(ours.recv(1 << 20)) == set(b".")
+
+
+def test_a_parent_that_closed_its_end_is_gone_and_takes_no_signs_of_life() -> None:
+    ours, its = socket.socketpair()
+    with its:
+        parent = Parent(its.fileno())
+        assert not parent.gone()  # nothing to read
+        ours.send(b"?")
+        assert not parent.gone()
+        parent.beat()
+        ours.close()
+        assert parent.gone()  # it left a sign of life unread
+        assert parent.gone()
+        parent.beat()
+
+
+def test_a_terminal_takes_no_signs_of_life_and_still_blocks_for_other_programs() -> None:
+    ours, its = os.openpty()
+    parent = Parent(its)
+    parent.beat()
+    assert (os.get_blocking(its), select.select([ours], [], [], 0.05)[0]) == (True, [])
+    os.close(ours)
+    assert parent.gone()
+    os.close(its)
+
+
+def test_the_end_of_a_pipe_is_the_end_of_the_parent() -> None:
+    reads, writes = os.pipe()
+    parent = Parent(reads)
+    parent.beat()
+    os.close(writes)
+    assert parent.gone()
+    os.close(reads)

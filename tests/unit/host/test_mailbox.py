@@ -1,0 +1,214 @@
+"""A mailbox keeps the newest items in order, and its reader is woken for each of them."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from threading import Thread
+from typing import cast
+
+import pytest
+
+from acsard.core.values import NS_PER_S
+from acsard.host import clock
+from acsard.host.mailbox import Bell, Mailbox
+
+WAIT_S = 10.0
+
+
+def filled(most: int, items: int) -> Mailbox[int]:
+    box = Mailbox[int](most)
+    for number in range(items):
+        box.put(number)
+    return box
+
+
+def took_s(begin_ns: int) -> float:
+    return (clock.mono_ns() - begin_ns) / NS_PER_S
+
+
+# the items
+
+
+def test_items_come_out_once_and_in_the_order_in_which_they_came() -> None:
+    box = filled(4, 3)
+    assert (len(box.waiting), box.pop(), box.take(), box.take(), box.pop(), len(box.waiting)) == (
+        3, 0, [1, 2], [], None, 0,
+    )  # fmt: skip
+
+
+def test_a_full_mailbox_drops_its_oldest_items_and_reports_each_to_the_writer() -> None:
+    box = Mailbox[int](3)
+    assert [box.put(number) for number in range(5)] == [True, True, True, False, False]
+    assert box.take() == [2, 3, 4]
+    assert box.put(5)
+
+
+class Flooded(deque[int]):
+    """The items of a mailbox into which another thread puts one for each that is taken."""
+
+    def popleft(self) -> int:
+        item = super().popleft()
+        self.append(item + 1)
+        assert item < 100, "the flood holds the reader"
+        return item
+
+
+def test_a_flood_cannot_hold_the_reader() -> None:
+    box = Mailbox[int](3)
+    box.waiting = Flooded([0, 0, 0], maxlen=3)
+    assert box.take() == [0, 0, 0]
+    assert box.take() == [1, 1, 1]
+
+
+# the wake-up
+
+
+def test_an_item_that_came_before_the_wait_ends_it_at_once() -> None:
+    box = filled(4, 1)
+    assert box.wait(0.0)
+    assert box.wait(None)
+
+
+def test_a_wait_for_nothing_ends_after_its_time() -> None:
+    begin_ns = clock.mono_ns()
+    assert not Mailbox[int](4).wait(0.05)
+    assert 0.05 <= took_s(begin_ns) < WAIT_S
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0])
+def test_without_time_to_wait_it_looks_only(seconds: float) -> None:
+    assert not Mailbox[int](4).wait(seconds)
+    assert not Bell().wait(seconds)
+
+
+def test_a_wake_up_for_an_item_that_is_gone_does_not_end_a_wait() -> None:
+    box = filled(4, 3)
+    box.take()
+    assert not box.wait(0.01)
+
+
+def test_an_item_ends_a_wait_that_has_begun() -> None:
+    box = Mailbox[int](4)
+    writer = threading.Timer(0.05, box.put, (7,))
+    writer.start()
+    assert box.wait(WAIT_S)
+    assert box.take() == [7]
+    writer.join(WAIT_S)
+
+
+def test_no_wake_up_is_lost_however_writers_and_reader_meet() -> None:
+    # The reader waits without a limit, so a lost wake-up leaves it waiting for ever.
+    writers, each = 4, 2000
+    box, seen, done = Mailbox[int](writers * each), [0], threading.Event()
+
+    def read() -> None:
+        while seen[0] < writers * each:
+            box.wait()
+            seen[0] += len(box.take())
+        done.set()
+
+    def write() -> None:
+        for number in range(each):
+            box.put(number)
+
+    threads = [Thread(target=read, daemon=True)] + [Thread(target=write) for _ in range(writers)]
+    for thread in threads:
+        thread.start()
+    assert done.wait(WAIT_S), seen
+
+
+def test_an_item_that_is_only_stored_wakes_no_reader() -> None:
+    woken: list[str] = []
+    box = Mailbox[int](4, lambda: woken.append("woken"))
+    assert box.store(1)
+    assert woken == []
+    box.put(2)
+    assert woken == ["woken"]
+    assert box.take() == [1, 2]
+
+
+def test_a_callback_runs_on_the_writer_s_thread_and_finds_the_item() -> None:
+    found: list[tuple[str, int | None]] = []
+    box = Mailbox[int](4, lambda: found.append((threading.current_thread().name, box.pop())))
+    writer = Thread(target=box.put, args=(5,), name="writer")
+    writer.start()
+    writer.join(WAIT_S)
+    assert found == [("writer", 5)]
+
+
+@pytest.mark.parametrize(("items", "closes", "woken"), [(0, False, 0), (2, False, 1), (0, True, 1)])
+def test_a_callback_that_is_set_late_is_called_for_the_items_before_it(
+    items: int, closes: bool, woken: int
+) -> None:
+    box, calls = filled(4, items), []
+    if closes:
+        box.close()
+    box.wakes(lambda: calls.append(1))
+    assert len(calls) == woken
+
+
+def test_a_callback_that_fails_fails_its_writer_and_the_item_is_there() -> None:
+    def fail() -> None:
+        raise ValueError("a bug")
+
+    box = Mailbox[int](4, fail)
+    with pytest.raises(ValueError, match="a bug"):
+        box.put(1)
+    assert box.take() == [1]
+
+
+# the end
+
+
+def test_a_closed_mailbox_still_gives_its_items_and_never_makes_its_reader_wait() -> None:
+    box = filled(4, 2)
+    assert not box.closed
+    box.close()
+    assert (box.closed, box.wait(), box.take(), box.wait(), box.take()) == (
+        True,
+        True,
+        [0, 1],
+        True,
+        [],
+    )
+
+
+def test_to_close_ends_a_wait_that_has_begun() -> None:
+    box = Mailbox[int](4)
+    closer = threading.Timer(0.05, box.close)
+    closer.start()
+    assert box.wait(WAIT_S)
+    closer.join(WAIT_S)
+
+
+# the bell
+
+
+def test_a_bell_that_rang_many_times_ends_one_wait() -> None:
+    bell = Bell()
+    for _ in range(3):
+        bell.ring()
+    assert bell.wait(0.0)
+    assert not bell.wait(0.0)
+
+
+def test_two_threads_may_ring_at_the_same_moment() -> None:
+    bell = Bell()
+    lock = bell._lock
+
+    class Between:
+        """The bell's lock, with another thread that rings between the look and the ring."""
+
+        def locked(self) -> bool:
+            lock.release()
+            return True
+
+        def release(self) -> None:
+            lock.release()
+
+    bell._lock = cast(threading.Lock, Between())
+    bell.ring()
+    bell._lock = lock
+    assert bell.wait(0.0)
+    assert not bell.wait(0.0)

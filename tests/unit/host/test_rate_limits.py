@@ -1,0 +1,106 @@
+"""A bucket passes its burst, then its rate; places are limited per name and in all."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import pytest
+
+from acsard.core.values import NS_PER_S
+from acsard.host.rate_limits import Bucket, Buckets, Places, Rate
+
+GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
+
+
+def test_a_bucket_lets_its_rate_through_and_some_at_once() -> None:
+    bucket = Bucket(Rate(10.0, 20.0))
+    assert [bucket.take(0) for _ in range(21)] == [True] * 20 + [False]
+    taken = sum(bucket.take(n * NS_PER_S // 1000) for n in range(10_000))
+    assert 99 <= taken <= 100  # within ten seconds
+
+
+def test_a_bucket_holds_no_more_than_its_most_after_a_long_rest() -> None:
+    bucket = Bucket(Rate(10.0, 20.0))
+    assert sum(bucket.take(3600 * NS_PER_S) for _ in range(100)) == 20
+
+
+def test_wrong_tokens_are_enough_after_some_and_a_minute_forgets_them() -> None:
+    guesses, most = Buckets(GUESSES_OF_ONE, GUESSES), int(GUESSES_OF_ONE.most)
+    assert [guesses.take("a", 0) for _ in range(most + 1)] == [True] * most + [False]
+    assert guesses.take("b", 0)
+    assert all(guesses.take("a", 61 * NS_PER_S) for _ in range(most))
+
+
+def test_an_address_has_no_moment_at_which_it_may_guess_twice_as_often() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    assert guesses.take("b", 0)
+    tenths = [n * NS_PER_S // 10 for n in range(595, 610) for _ in range(20)]
+    assert sum(guesses.take("a", at_ns) for at_ns in tenths) <= GUESSES_OF_ONE.most + 1
+
+
+def test_many_addresses_together_are_held_too() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    assert all(guesses.take(f"10.0.0.{n}", 0) for n in range(int(GUESSES.most)))
+    assert not guesses.take("never seen", 0)
+
+
+def test_an_address_that_may_guess_no_more_uses_up_nothing_of_the_others() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    for _ in range(2 * int(GUESSES.most)):
+        guesses.take("a", 0)
+    assert guesses.take("b", 0)
+
+
+def test_a_name_that_rests_is_forgotten_so_that_names_fill_no_memory() -> None:
+    guesses = Buckets(GUESSES_OF_ONE, GUESSES)
+    tracemalloc.start()
+    try:
+        for n in range(10_000):
+            guesses.take(f"address {n}", n * NS_PER_S // 10)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 200_000  # bytes; all names together take 2.3 MB
+
+
+def test_places_are_bounded_by_address_and_in_all() -> None:
+    places = Places(3, 2)
+    assert [places.enter("a") for _ in range(3)] == [True, True, False]
+    assert [places.enter("b"), places.enter("c")] == [True, False]
+    places.leave("a")
+    assert places.enter("c")
+    assert places.taken == 3
+
+
+def test_a_bucket_for_one_unit_sets_a_shortest_interval_to_the_nanosecond() -> None:
+    bucket, minute_ns = Bucket(Rate(1 / 60)), 60 * NS_PER_S
+    times = [0, 1, minute_ns - 1, minute_ns, minute_ns + 1, 3 * minute_ns, 4 * minute_ns - 1]
+    assert [bucket.take(at_ns) for at_ns in times] == [True, False, False, True, False, True, False]
+
+
+def test_a_bucket_that_refuses_takes_nothing() -> None:
+    bucket = Bucket(Rate(10.0, 2.0))
+    for _ in range(100):
+        bucket.take(0)
+    assert bucket.take(NS_PER_S // 10)
+
+
+def test_a_bucket_is_full_again_when_all_its_units_are_back() -> None:
+    bucket = Bucket(Rate(10.0, 3.0))
+    assert bucket.full(0)
+    for _ in range(3):
+        bucket.take(0)
+    assert not bucket.room(NS_PER_S // 10 - 1)
+    assert bucket.room(NS_PER_S // 10)
+    assert not bucket.full(3 * NS_PER_S // 10 - 1)
+    assert bucket.full(3 * NS_PER_S // 10)
+
+
+def test_a_place_is_held_for_a_block_and_given_back_after_an_error() -> None:
+    places = Places(1, 1)
+    with places.held() as first, places.held() as second:
+        assert (first, second, places.taken) == (True, False, 1)
+    assert places.taken == 0
+    with pytest.raises(ValueError, match="a bug"), places.held():
+        raise ValueError("a bug")
+    assert places.enter("")
