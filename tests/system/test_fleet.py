@@ -526,7 +526,7 @@ def test_robots_say_that_their_router_is_there_by_whatever_name(fleet: Fleet) ->
 def test_a_second_robot_with_the_same_id_ends_at_once(fleet: Fleet) -> None:
     with fleet.robot("robot1", "twin", ready=False) as twin:
         assert twin.ended(10.0) == Exit.IN_USE
-    assert "already is robot1" in twin.stderr
+    assert "already has the id robot1" in twin.stderr
     assert fleet.robots[0].state()["link"] == "up"
 
 

@@ -463,7 +463,7 @@ def test_what_is_no_command_is_told(viewer: Viewer) -> None:
     viewer.status("refused: needs both `linear` and `angular`")
     send, _ = viewer.publish_on("/initialpose", "json", "geometry_msgs/Twist")
     send(speed(1.0))
-    viewer.status("nothing listens on /initialpose: drive on /cmd_vel")
+    viewer.status("no program listens on /initialpose: drive on /cmd_vel")
 
 
 @SLOW

@@ -98,7 +98,7 @@ STOPS: dict[str, Late] = {
     "send a zero first": changed(
         mode="ready", source="", sources=[SourceState("app", 50, 0.01, "send a zero first")]
     ),
-    "the daemon hears no command of source app": changed(
+    "the daemon receives no command of source app": changed(
         sources=[SourceState("app", 50, 3.0, "a command")]
     ),
     "no command of source app has arrived for 0.4 s": changed(
