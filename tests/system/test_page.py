@@ -124,7 +124,7 @@ def test_space_stops_from_every_view_and_who_held_the_stick_drives_no_more(page:
     browser.tap("tab-drive")
     page.hold()
     bus.get("srv/stop")  # by another client
-    page.shows("told", "why stands above")
+    page.shows("told", "the reason is shown above")
     assert browser.js("document.body.innerText").count("press Clear") == 1
     bus.get("srv/clear")
     page.shows("mode", "READY")
@@ -214,7 +214,7 @@ def test_who_has_no_mouse_sets_the_slider_by_the_arrows_and_drives_by_letters(pa
 def test_a_second_finger_wherever_lets_go(page: Phone, where: str) -> None:
     page.hold()
     page.browser.tap(where)
-    page.shows("told", "one finger drives")
+    page.shows("told", "use one finger to drive")
     page.bus.at_rest()
 
 
@@ -403,7 +403,7 @@ def test_a_gamepad_that_is_gone_lets_go(page: Phone) -> None:
     until(lambda: (bus.state()["linear"] or 0.0) > 0.15, 10.0, "it drives")
     # The gamepad's last values stay pressed, as when its battery is empty.
     browser.js("dispatchEvent(new Event('gamepaddisconnected'))")
-    page.shows("told", "the gamepad is gone")
+    page.shows("told", "the gamepad is disconnected")
     bus.at_rest()
 
 
@@ -445,7 +445,7 @@ def test_what_is_old_is_grey_and_says_so_and_comes_back_by_itself(page: Phone) -
     page.daemon.signal(signal.SIGSTOP)
     try:
         page.shows("age", "STALE")
-        page.shows("mode", "NOT HEARD")  # the page cannot know whether it still drives
+        page.shows("mode", "NO DATA")  # the page cannot know whether it still drives
         page.shows("reason", "nothing is received from the daemon")
         assert page.browser.js("document.body.classList.contains('stale')")
     finally:
@@ -569,7 +569,7 @@ def test_somebody_else_who_drives_is_named(page: Phone) -> None:
         assert page.browser.text("who") != "you"
         page.browser.push(0, 0, "Start")
         page.browser.push(0, 90)
-        page.shows("told", "somebody else drives")
+        page.shows("told", "another client drives")
         page.browser.touch("End")
 
 
@@ -622,7 +622,7 @@ def test_what_is_pressed_is_large_enough_for_a_finger(page: Phone) -> None:
 
 def test_words_at_the_stick_say_how_to_drive_while_nobody_holds_it(page: Phone) -> None:
     seen = "getComputedStyle(document.getElementById('hint')).visibility"
-    page.shows("hint", "Hold and push to drive; let go to stop.")
+    page.shows("hint", "Hold and push to drive; release to stop.")
     assert page.browser.js(seen) == "visible"
     page.hold()
     assert page.browser.js(seen) == "hidden"
@@ -790,7 +790,7 @@ STOPPING = """import('/page/stopping.js').then(async ({Stopping}) => {
     return out;
 })"""
 
-FAILS = ["sent", "STOP: no answer; it is sent again"]
+FAILS = ["sent", "STOP: no answer; this page sends it again"]
 """The expected trace of a first attempt that gets no answer."""
 
 
@@ -864,17 +864,17 @@ def test_a_hand_opens_with_zeros_drives_at_20_hz_and_ends_with_one_zero(page: Ph
 @pytest.mark.parametrize(
     ("script", "why"),
     [
-        ("hand.press(0); look(0, ready); look(1100, ready)", "the page stood still"),
+        ("hand.press(0); look(0, ready); look(1100, ready)", "this page was suspended"),
         ("hand.press(0); look(0, stopped)", "stopped by request"),
         (
             "hand.press(0); for (let now = 0; now <= 2100; now += 100) look(now, null)",
-            "nothing is heard",
+            "nothing is received",
         ),
         (
             "hand.press(-1); look(0, driving);"
             "for (let now = 100; now <= 600; now += 100)"
             " look(now, {...driving, sender: 'other'})",
-            "somebody else drives",
+            "another client drives",
         ),
     ],
 )
@@ -952,7 +952,7 @@ def test_what_a_viewer_may_not_is_switched_off_and_says_why(tmp_path: Path) -> N
             described = browser.js(f"[...document.querySelectorAll('[data-does]')].map({WORDS})")
             assert all("for operators; you are viewer" in one for one in described)
             page.shows("barred", "for operators; you are viewer")
-            page.shows("hint", "You may watch and stop, not drive")
+            page.shows("hint", "You may watch and stop, but not drive")
             browser.tap("tab-events")
             page.shows("recordings", "download and report are for operators")
             assert (
@@ -989,7 +989,7 @@ def test_a_recording_is_drawn_when_asked_for_and_its_report_has_neither_cookie_n
             button = "document.querySelector('#recordings button')"
             assert "Report of 000001" in browser.js(f"{button}.getAttribute('aria-label')")
             browser.js(f"{button}.click()")
-            page.shows("recordings", "being drawn")
+            page.shows("recordings", "drawing: ")
             opened = "document.querySelector('#recordings a[target=_blank]')"
             until(lambda: browser.js(f"Boolean({opened})"), 60.0, "a report")
             assert browser.too_small() == []
@@ -1050,14 +1050,14 @@ def test_the_plots_begin_with_the_minute_before_and_say_what_is_not_known_of_it(
         browser.open(page.server.here)
         page.shows("mode", "READY")
         browser.tap("tab-status")
-        page.shows("unknown", "Nothing is known of before")
+        page.shows("unknown", "There is no data from before")
         measured, wished = browser.js(ABOVE)
         return measured, wished
 
     measured, wished = looked()
     assert measured > 20
     assert wished == 0
-    page.shows("unknown", "What was wished before")
+    page.shows("unknown", "Commanded speeds from before")
     with bus.commanding(0.4, 0.0):
         until(lambda: (bus.state()["linear"] or 0.0) > 0.35, 10.0, "it drives")
     bus.at_rest()

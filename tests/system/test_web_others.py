@@ -133,7 +133,7 @@ def test_a_card_opens_its_robot_which_can_be_seen_and_stopped_and_not_driven(two
         link = f"document.querySelector('#cards a[href*={THEIRS}]')"
         until(lambda: browser.js(f"Boolean({link})"), 10.0, "a card to open")
         browser.js(f"{link}.click()")
-        shows("other", f"{THEIRS}, seen by the page of {OURS}")
+        shows("other", f"This is {THEIRS} on the page of {OURS}")
         shows("robot", THEIRS)
         shows("mode", "READY")
         shows("age", "live")

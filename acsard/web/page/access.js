@@ -12,9 +12,9 @@ export async function invited(waiting) {
   for (;;) {
     const { status, error } = await shown(token);
     if (status && status < 500 && status !== 429) history.replaceState(null, "", location.pathname);
-    if (status === 401) return "this invitation is not valid: it has ended, was revoked, or is not whole. Ask for a new one (acsard web --invite)";
+    if (status === 401) return "this invitation is not valid: it has expired, was revoked, or is incomplete. Ask for a new one (acsard web --invite)";
     if (status && status < 500) return error;
-    waiting(`your invitation has no answer yet (${error}); it is shown again until it has`);
+    waiting(`your invitation has no answer yet (${error}); this page sends it again`);
     await new Promise((done) => setTimeout(done, AGAIN));
   }
 }

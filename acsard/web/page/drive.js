@@ -13,7 +13,7 @@ const KEYS = {
 };
 const SHOULDERS = [4, 5, 6, 7];
 const STRANGE =
-  "this gamepad does not drive: the browser does not know which of its axes is which. Try its switch (X, XInput) or another browser";
+  "this gamepad does not drive, because the browser does not know its axes. Try the gamepad's mode switch (X, XInput) or another browser";
 
 export class Drive {
   #hand = new Hand();
@@ -124,27 +124,27 @@ export class Drive {
     addEventListener("keydown", (event) => this.#key(event, true));
     addEventListener("keyup", (event) => this.#key(event, false));
     addEventListener("focusin", (event) => this.#by === "keys" && busy(event) && this.release());
-    addEventListener("blur", () => this.release("let go: the window lost the focus"));
+    addEventListener("blur", () => this.release("released: the window lost the focus"));
     // The browser waits for this handler before it navigates. The next event, pagehide, may come late on a
     // busy machine.
-    addEventListener("beforeunload", () => this.release("let go: the page is being left"));
+    addEventListener("beforeunload", () => this.release("released: you left the page"));
     addEventListener("pagehide", () => this.release());
     document.addEventListener("freeze", () => this.release());
-    document.addEventListener("visibilitychange", () => document.hidden && this.release("let go: the page was hidden"));
-    addEventListener("contextmenu", () => this.#by === "keys" && this.release("let go: a menu is open"), true);
-    addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("let go: the gamepad is gone"));
+    document.addEventListener("visibilitychange", () => document.hidden && this.release("released: the page was hidden"));
+    addEventListener("contextmenu", () => this.#by === "keys" && this.release("released: a menu is open"), true);
+    addEventListener("gamepaddisconnected", () => this.#by === "pad" && this.release("released: the gamepad is disconnected"));
     setInterval(() => this.#pad(), 50);
   }
 
   /** A second finger on anything but STOP releases the stick. */
   #second(event) {
-    if (this.#pointer !== null && !event.target.closest?.("#stick, #stop")) this.release("let go: one finger drives");
+    if (this.#pointer !== null && !event.target.closest?.("#stick, #stop")) this.release("released: use one finger to drive");
   }
 
   #down(event) {
     if (event.button !== 0) return;
     event.preventDefault();
-    if (this.#pointer !== null) return this.release("let go: one finger drives");
+    if (this.#pointer !== null) return this.release("released: use one finger to drive");
     if (this.#by) return;
     this.#pointer = event.pointerId;
     this.stick.setPointerCapture(event.pointerId);
@@ -156,7 +156,7 @@ export class Drive {
   /** A mouse reports a change of a second button by a move event, so check the buttons on each move. */
   #moved(event) {
     if (event.buttons === 1) this.#move(event);
-    else this.release("let go: another button is down");
+    else this.release("released: another button is down");
   }
 
   #move(event) {
@@ -168,7 +168,7 @@ export class Drive {
   #key(event, down) {
     // With a modifier key down, some systems do not report the release of another key.
     if (down && this.#by === "keys" && (event.metaKey || event.ctrlKey || event.altKey))
-      return this.release("let go: another key is down");
+      return this.release("released: another key is down");
     if (!(event.code in KEYS)) return;
     // Handle a key release no matter where the focus is and which other keys are down.
     if (!down && !this.#pressed.delete(event.code)) return;

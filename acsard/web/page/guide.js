@@ -8,7 +8,7 @@ import { number } from "./words.js";
 const $ = (id) => document.getElementById(id);
 const LABELS = {
   fr: "front right", fl: "front left", rl: "rear left", rr: "rear right", none: "none", again: "show it again",
-  start: "Start", write: "Write them", leave: "Leave the file as it is", lifted: "The wheels are lifted: none touches anything",
+  start: "Start", write: "Write the values", leave: "Do not change the file", lifted: "The wheels are lifted: none touches anything",
 };
 const NAMES = { check: "Check of the board", calibrate: "Calibration" };
 const LOOKS = { PASS: "", WARN: "warning", FAIL: "error", SKIPPED: "skipped" };
@@ -25,7 +25,7 @@ export class Guide {
   constructor(link) {
     this.#link = link;
     link.addEventListener("guide", ({ detail }) => this.#take(detail.guide));
-    link.addEventListener("down", () => this.#running && this.#over("the connection is gone: the robot's computer has ended it"));
+    link.addEventListener("down", () => this.#running && this.#over("the connection is lost, so the robot's computer has ended it"));
     $("check").addEventListener("click", () => this.#begin({ begin: "check", port: $("check-port").value }));
     $("calibrate").addEventListener("click", () => this.#begin({ begin: "calibrate", ...this.#method() }));
     $("method").addEventListener("change", () => this.#methods());
@@ -57,7 +57,7 @@ export class Guide {
     if (error) return;
     options($("check-port"), ports.map(({ port, what }) => [port, what ? `${port} (${what})` : port]));
     const first = !$("method").options.length;
-    options($("method"), [["", "a gyro where the robot has one, else a tape"], ...Object.entries(methods).map(([name, needs]) => [name, `${name}: ${needs}`])]);
+    options($("method"), [["", "a gyro if the robot has one, else a tape"], ...Object.entries(methods).map(([name, needs]) => [name, `${name}: ${needs}`])]);
     if (first) $("method").value = method; // keep a choice that the operator has made
     text("advice", advice);
     this.#methods();
@@ -94,7 +94,7 @@ export class Guide {
   }
 
   #runs({ running, by, yours }) {
-    const busy = running && !yours ? `${NAMES[running]} goes on: ${by} goes through it. One at a time.` : "";
+    const busy = running && !yours ? `${NAMES[running]} is running, started by ${by}. Only one can run at a time.` : "";
     for (const id of ["check", "calibrate"]) [$(id).disabled, $(id).title] = [Boolean(running), busy];
     if (busy !== this.#busy) text("guide-note", (this.#busy = busy));
     if (!running || !yours) return;
@@ -106,7 +106,7 @@ export class Guide {
     $("guide-leave").hidden = false;
     $("guide-close").hidden = $("guide-result").hidden = $("guide-where").hidden = true;
     text("guide-name", NAMES[running]);
-    text("guide-doing", "it begins");
+    text("guide-doing", "starting");
     $("guide-story").replaceChildren();
     this.#progress(0);
     focus("guide-name");
@@ -154,7 +154,7 @@ export class Guide {
     const form = $("guide-question");
     form.hidden = false;
     text("guide-words", worded(question.words));
-    text("guide-wrong", again && `That does not do: ${again}`);
+    text("guide-wrong", again && `Not accepted: ${again}`);
     text("guide-doing", "");
     const number = !question.answers;
     $("guide-answers").replaceChildren(...(number ? this.#number(question) : this.#choice(question)));
@@ -173,7 +173,7 @@ export class Guide {
     if (answers.length > 1 || answers[0] === "start") return answers.map((one) => answer(one));
     // A safety confirmation needs a tick before the operator can go on.
     const tick = made("input");
-    const go = answer(answers[0], "Go on");
+    const go = answer(answers[0], "Continue");
     tick.type = "checkbox";
     tick.id = "guide-tick";
     go.disabled = true;
@@ -187,8 +187,8 @@ export class Guide {
     field.inputMode = "decimal";
     field.autocomplete = "off";
     field.setAttribute("aria-describedby", "guide-words guide-wrong");
-    const label = made("label", "number", "read off: ", field, ` ${unit}`);
-    const button = made("button", "go", "Take it");
+    const label = made("label", "number", "measured: ", field, ` ${unit}`);
+    const button = made("button", "go", "OK");
     button.addEventListener("click", () => this.#answer(typed(field.value, usual)));
     return [label, button];
   }
@@ -198,7 +198,7 @@ export class Guide {
     if (!question || !this.#link.send({ reply: question.question, value })) return;
     this.#question = null;
     $("guide-question").hidden = true;
-    text("guide-doing", "it goes on");
+    text("guide-doing", "running");
     if (question.leg) {
       this.#progress(0);
       this.#ride(true, question.by_key);
@@ -244,7 +244,7 @@ export class Guide {
 export function worded(words) {
   return words
     .replace('then type "lifted".', "then tick this.")
-    .replace(" q or Ctrl-C leaves, here and later:", " Leaving ends it, here and later:")
+    .replace(" q or Ctrl-C leaves, here and later:", " Stop and quit ends it, here and later:")
     .replace("Press SPACE", "Press NOW")
     .replace("Enter alone:", "Left empty:")
     .replace("any key stops it", "any key or the button stops it");

@@ -18,13 +18,13 @@ export const ZERO = { linear_x: 0, angular_z: 0 };
 
 /** Return why the robot does not follow `sender`, in words, or "" if it does. */
 export function objection(state, source, sender) {
-  if (!state) return "nothing is heard of the robot";
+  if (!state) return "nothing is received from the robot";
   const ours = state.sources.find((one) => one.name === source);
   if (NEVER.includes(state.mode) || state.mode === "waiting") return state.reason;
   if (!ours) return `${source} is not one of the robot's sources`;
-  if (state.source !== source) return ours.waits_for === "a command" ? "not heard yet" : ours.waits_for || state.reason || "not followed";
+  if (state.source !== source) return ours.waits_for === "a command" ? "the robot has not received a command yet" : ours.waits_for || state.reason || "the robot does not follow this source";
   if (state.mode !== "driving") return state.reason;
-  if (state.sender && state.sender !== sender) return `somebody else drives as ${source}: ${state.sender}`;
+  if (state.sender && state.sender !== sender) return `another client drives as ${source}: ${state.sender}`;
   return "";
 }
 
@@ -68,7 +68,7 @@ export class Hand {
    *  time at which `state` was true. */
   look(now, state, heard, source, sender) {
     if (!this.held) return {};
-    if (now - this.#looked > FROZEN) return { send: this.release(), ended: "the page stood still: press again" };
+    if (now - this.#looked > FROZEN) return { send: this.release(), ended: "this page was suspended: press again" };
     if (now - this.#looked > HICCUP) this.#open(now);
     this.#looked = now;
     const why = objection(state, source, sender);

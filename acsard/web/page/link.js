@@ -165,7 +165,7 @@ export class Link extends EventTarget {
   #down(reason) {
     this.open = false;
     this.way = null;
-    for (const id of [...this.#answers.keys()]) this.#unanswered(id, "the connection went before an answer came");
+    for (const id of [...this.#answers.keys()]) this.#unanswered(id, "the connection was lost before an answer came");
     this.#tell("down", { reason });
   }
 

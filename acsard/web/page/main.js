@@ -94,7 +94,7 @@ async function set(payload) {
 
 /** Show a message at the stick. A reason that the banner already shows is not repeated. */
 function told(why) {
-  views.text("told", why && why === state?.reason ? "not driving: why stands above" : words(why));
+  views.text("told", why && why === state?.reason ? "not driving: the reason is shown above" : words(why));
 }
 
 function said(told) {
@@ -113,7 +113,7 @@ async function got(path) {
 }
 
 async function listed() {
-  if (OTHER) return recordings.show([], "", `those of ${OTHER} are listed on its own page`);
+  if (OTHER) return recordings.show([], "", `the recordings of ${OTHER} are listed on its own page`);
   const files = await got("api/recordings");
   recordings.show(files.error ? [] : files, barred(hello, "recordings"), files.error);
 }
@@ -145,7 +145,7 @@ function looked() {
   const none = link.open ? "waiting" : tried ? "no connection" : "connecting";
   views.freshness(old, lasts(), link.way, none, seen);
   if (state && performance.now() - heard > lasts()) views.unheard(silent);
-  if (old > 2 * lasts()) drive.release("let go: nothing is heard of the robot");
+  if (old > 2 * lasts()) drive.release("released: nothing is received from the robot");
   if (view !== "status" || document.hidden) return;
   plots.draw(performance.now());
   views.text("unknown", plots.lacks(performance.now()));
@@ -167,7 +167,7 @@ function stated({ detail }) {
   views.banner(state, Boolean(hello?.barred.clear), OTHER);
   $("clear").hidden = Boolean(OTHER) || !LATCHED.includes(state.mode);
   const mine = state.source === SOURCE && state.sender === hello?.sender;
-  views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "nobody");
+  views.text("who", state.source ? (mine ? "you" : `${state.source}${state.sender ? ` (${state.sender})` : ""}`) : "no source");
   views.text("where", `x ${signed(state.x, 2)} m · y ${signed(state.y, 2)} m · ${signed((state.yaw * 180) / Math.PI, 0)}°`);
   const { linear, angular } = state; // null without feedback from the board
   views.text("speed", `${figure(linear, 2)} of ${figure(wished?.linear, 2)} m/s`);
@@ -204,7 +204,7 @@ function greeted({ detail }) {
 function elsewhere() {
   const back = views.made("a", "", `Back to ${hello.robot}`);
   back.href = "./";
-  const words = `${OTHER}, seen by the page of ${hello.robot}: you may watch it and stop it here. To drive it, open its own page. `;
+  const words = `This is ${OTHER} on the page of ${hello.robot}: you may watch and stop it here. To drive it, open its own page. `;
   $("other").replaceChildren(words, back);
   $("other").hidden = false;
 }
@@ -256,10 +256,10 @@ link.addEventListener("up", () => {
   views.waiting();
 });
 link.addEventListener("down", ({ detail }) => {
-  drive.release("let go: the connection is gone");
+  drive.release("released: the connection is lost");
   tried = true;
   heard = -Infinity;
-  views.lost(detail.reason || (state ? "it is tried again" : "")); // the text shown before is outdated
+  views.lost(detail.reason || (state ? "this page connects again" : "")); // the text shown before is outdated
   state = drive.state = wished = null;
 });
 

@@ -3,9 +3,9 @@
 
 import { GAP, Plot, SPAN } from "./plot.js";
 
-const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "wished", colour: "--wished" }];
+const COMPARED = [{ name: "measured", colour: "--accent" }, { name: "commanded", colour: "--wished" }];
 const WHEELS = ["front right", "front left", "rear left", "rear right"].map((name, n) => ({ name, colour: `--w${n}` }));
-const LATE = [{ name: "99 %", colour: "--accent" }, { name: "most", colour: "--bad" }];
+const LATE = [{ name: "99 %", colour: "--accent" }, { name: "maximum", colour: "--bad" }];
 
 export class Minute {
   #before = performance.now(); // nothing is known from before this time
@@ -44,8 +44,8 @@ export class Minute {
     const recent = now - SPAN + GAP;
     const clock = (at) => new Date(Date.now() - now + at).toLocaleTimeString();
     const said = [];
-    if (this.#before > recent) said.push(`Nothing is known of before ${clock(this.#before)}.`);
-    if (this.#wished > recent) said.push(`What was wished before ${clock(this.#wished)} is known only while this page was open somewhere.`);
+    if (this.#before > recent) said.push(`There is no data from before ${clock(this.#before)}.`);
+    if (this.#wished > recent) said.push(`Commanded speeds from before ${clock(this.#wished)} are known only for times at which this page was open in a browser.`);
     return said.join(" ");
   }
 }

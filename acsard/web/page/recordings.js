@@ -22,7 +22,7 @@ export class Recordings {
     const shown = JSON.stringify([files, barred, trouble]);
     if (shown === this.#shown) return; // do not rebuild an unchanged list, so the focus stays
     this.#shown = shown;
-    this.#none.textContent = trouble || "none here";
+    this.#none.textContent = trouble || "There are no recordings.";
     this.#none.hidden = files.length > 0;
     this.#list.replaceChildren(...files.map((one) => this.#row(one, barred)));
   }
@@ -58,7 +58,7 @@ export class Recordings {
         return place.replaceChildren(button, " ", link);
       }
       if (told.report !== "drawing" && told.report !== "busy") return place.replaceChildren(button, made("span", "warn", ` ${told.text}`));
-      const how = told.report === "busy" ? told.text : `being drawn: ${told.percent ?? 0} %, ${Math.round(told.seconds ?? 0)} s`;
+      const how = told.report === "busy" ? told.text : `drawing: ${told.percent ?? 0} %, ${Math.round(told.seconds ?? 0)} s`;
       place.replaceChildren(how);
       await new Promise((done) => setTimeout(done, AGAIN));
     }

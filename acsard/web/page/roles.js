@@ -9,7 +9,7 @@ export function barred(hello, what) {
  *  id of a robot that is not the page's own. */
 export function hint(hello, other) {
   if (other) return `To drive ${other}, open its own page.`;
-  return barred(hello, "drive") ? "You may watch and stop, not drive." : "Hold and push to drive; let go to stop.";
+  return barred(hello, "drive") ? "You may watch and stop, but not drive." : "Hold and push to drive; release to stop.";
 }
 
 /** Disable the controls that this client may not use and explain why, on the control and in its description.

@@ -22,7 +22,7 @@ export class Settings {
 
   #row(row, id) {
     const range = row.low === undefined ? "" : ` (${row.low} to ${row.high})`;
-    const list = Array.isArray(row.value) ? "; commas between them and no space, which is STOP" : "";
+    const list = Array.isArray(row.value) ? "; separate the values by commas without a space, because Space is STOP" : "";
     // Allow a narrow screen to break a key at its dots and underscores.
     const name = row.key.split(/(?<=[._])/).flatMap((part) => [part, made("wbr")]);
     const label = made("label", "", ...name, made("small", "", `${row.what}${range}; ${row.when}${list}`));

@@ -3,7 +3,7 @@
 
 const URGENT = 30000; // ms after the press, by the clock that gets there first: one may be set, the other may sleep
 const PAUSE = 300; // ms between two attempts
-const UNSURE = "STOP was not confirmed: look at the robot, and press it again";
+const UNSURE = "STOP was not confirmed: look at the robot, and press STOP again";
 
 export class Stopping {
   #send;
@@ -30,7 +30,7 @@ export class Stopping {
       const told = await this.#send();
       if (press !== this.#press) return; // a newer press took over
       if (this.#ends(told)) return;
-      this.#tell(`STOP: ${told.text}; it is sent again`);
+      this.#tell(`STOP: ${told.text}; this page sends it again`);
       await new Promise((done) => setTimeout(done, PAUSE));
       if (press !== this.#press || this.#ends(told)) return;
       if (Date.now() > last || performance.now() > this.#since + URGENT) return this.over();

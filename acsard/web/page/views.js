@@ -61,7 +61,7 @@ export function cards(list, robots, own, here) {
       typeof one.speed === "number" ? `${signed(one.speed, 2)} m/s` : "",
       one.link ? `link ${one.link}` : "",
       one.version ? `version ${one.version}` : "",
-      typeof one.age === "number" ? `heard ${ago(one.age)}` : "",
+      typeof one.age === "number" ? `seen ${ago(one.age)}` : "",
     ];
     const card = before.get(one.robot) ?? empty(one.robot, own);
     const [, mode, why, what] = card.children;
@@ -71,7 +71,7 @@ export function cards(list, robots, own, here) {
     what.textContent = facts.filter(Boolean).join(" · ");
     return card;
   });
-  if (!shown.length) shown.push(made("li", "warning", "no robot is heard yet"));
+  if (!shown.length) shown.push(made("li", "warning", "no robot is visible yet"));
   if (shown.length !== list.children.length || shown.some((card, n) => card !== list.children[n])) list.replaceChildren(...shown);
 }
 
@@ -105,8 +105,8 @@ export function waiting() {
 /** Show that the data is old and that the robot may or may not be driving. */
 export function unheard(why) {
   document.body.dataset.mode = "waiting";
-  text("mode", "NOT HEARD");
-  text("reason", why || "nothing is heard of the robot; what is shown is of before");
+  text("mode", "NO DATA");
+  text("reason", why || "nothing is received from the robot; the values below are old");
 }
 
 /** Show that the connection is lost, and blank the values that are no longer known. */

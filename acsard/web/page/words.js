@@ -63,6 +63,6 @@ export function said(text, elsewhere = "") {
   const there = `on the own page of ${elsewhere}`;
   const buttons = elsewhere
     ? { "call srv/clear": `Clear is ${there}`, "srv/clear": `Clear ${there}`, "call srv/activate": `Switch on is ${there}` }
-    : { "call srv/clear": "press Clear", "srv/clear": "Clear", "then call srv/activate": "then press Switch on", "call srv/activate": "Set has Switch on" };
+    : { "call srv/clear": "press Clear", "srv/clear": "Clear", "then call srv/activate": "then press Switch on", "call srv/activate": "press Switch on under Settings" };
   return Object.entries(buttons).reduce((words, [call, button]) => words.replace(call, button), text);
 }
