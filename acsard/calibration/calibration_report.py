@@ -165,17 +165,17 @@ def _better(found: Report) -> list[str]:
     told = []
     for before, after, words, unit, factor in (
         (found.turn_error_before, found.turn_error_after,
-         "a turn of 360 deg ends {} off now, {} then", "deg", 1),
+         "error of a turn of 360 deg: {} now, {} with the new values", "deg", 1),
         (found.straight_error_before, found.straight_error_after,
-         "10 m straight on end turned by {} more than odometry says now, {} then", "deg", 1),
+         "heading error after 10 m straight ahead: {} now, {} with the new values", "deg", 1),
         (found.position_error_before, found.position_error_after,
-         "over a few seconds odometry leaves the positions by {} now, {} then", "cm", 100),
+         "position error over a few seconds: {} now, {} with the new values", "cm", 100),
     ):  # fmt: skip
         if before is not None and after is not None:
             told.append(
                 words.format(f"{_two(before * factor)} {unit}", f"{_two(after * factor)} {unit}")
             )
-    return [*told, "(measured on parts of the log that were left out of the fit)"] if told else []
+    return [*told, "(measured on parts of the log that the fit did not use)"] if told else []
 
 
 def _two(value: float) -> str:
@@ -188,14 +188,15 @@ def _remains(found: Report, calibration: Calibration) -> list[str]:
     fastest = calibration.drives.fastest
     share = calibration.found.std[SEPARATION] / calibration.found.values[SEPARATION]
     told = [
-        f"what remains: the effective track is no constant on wheels that skid; here it is sure to "
-        f"{share:.1%}, and changes by {found.effective_track_growth * fastest:+.1%} (+- "
-        f"{found.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. Other "
-        "ground has another: calibrate where you drive"
+        "what remains: on wheels that skid the effective track is not constant; here it is known "
+        f"to {share:.1%}, and changes by {found.effective_track_growth * fastest:+.1%} (+- "
+        f"{found.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
+        "differs on other ground, so calibrate where you drive"
     ]
     if not found.scale:
         told.append(
-            "the size of the wheels was not measured, only left to right: distances are as right "
-            "as drive.wheel_radius is. Drive 2 m or more straight on and give --distance METRES"
+            "the size of the wheels was not measured, only the ratio of left to right: distances "
+            "are only as accurate as drive.wheel_radius. Drive 2 m or more straight ahead and give "
+            "--distance METRES"
         )
     return told

@@ -69,9 +69,9 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
     spread = float(turned @ turned)
     if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
         raise RefusedError(
-            f"{source} does not follow what the wheels do: is it of the upright axis (yaw, not "
-            "roll or pitch), of the same drive, on the same clock within 2 s, and did the wheels "
-            "touch the ground? And are the wheels' columns speeds, not angles?"
+            f"{source} does not follow the wheels: does it measure the upright axis (yaw, not "
+            "roll or pitch), is it from the same drive, on the same clock within 2 s, and did the "
+            "wheels touch the ground? Are the wheels' columns speeds, not angles?"
         )
 
 
@@ -79,8 +79,8 @@ def places_follow(begun: Begin) -> None:
     """Raise `RefusedError` if the positions do not show the path of the wheels."""
     if begun.unexplained > UNLIKE:
         raise UnlikeError(
-            "the positions do not follow what the wheels do: are they x ahead and y to the left in "
-            "m (not latitude and longitude), of the same drive, on the same clock within 1 s?"
+            "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
+            "latitude and longitude), from the same drive, on the same clock within 1 s?"
         )
 
 
@@ -107,23 +107,23 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: Begin | None) 
         if side in (by_heading, by_places):
             raise RefusedError(
                 f"the {side} wheels turn backwards when the robot goes ahead: their speeds have "
-                "the wrong sign; rad/s are positive ahead on both sides"
+                "the wrong sign; rad/s must be positive ahead on both sides"
             )
     if sides is not None and begun is not None and by_heading != by_places:
         other = "x and y are swapped, or y is positive to the right"
         sign = f"{source} has the wrong sign (it must be positive to the left)"
         raise RefusedError(
-            f"wheels and positions agree on the side the robot turns to, {source} does not: {sign}"
+            f"wheels and positions agree on the direction of turns, but {source} does not: {sign}"
             if by_heading
-            else f"wheels and {source} agree on the side the robot turns to, positions do not: "
+            else f"wheels and {source} agree on the direction of turns, but the positions do not: "
             f"{other}"
         )
     if by_heading:
         seen = source or "the positions"
         also = "" if begun is not None and sides is not None else _ALSO[sides is not None]
         raise RefusedError(
-            f"by {seen} the robot turns to the other side than by the wheels: the columns of left "
-            f"and right are swapped, or ahead is negative on both sides{also}"
+            f"by {seen} the robot turns in the opposite direction than by the wheels: the columns "
+            f"of left and right are swapped, or ahead is negative on both sides{also}"
         )
 
 
@@ -143,7 +143,7 @@ def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
     if rate > FASTEST_TURN:
         raise RefusedError(
             f"{source} is in degrees (multiply by pi / 180): it shows turns of {rate:.0f} rad/s; "
-            "and see that the wheel speeds are in rad/s, not deg/s, rpm or mm/s"
+            "also check that the wheel speeds are in rad/s, not deg/s, rpm or mm/s"
         )
 
 
@@ -162,12 +162,12 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
         f"{source} is in degrees (multiply by pi / 180), or the wheel speeds are in m/s (divide "
         "by the wheel radius) or turns/s (multiply by 2 pi)"
         if turn > 1
-        else "the wheel speeds are in deg/s, rpm or counts, or are angles (rad/s are needed)"
+        else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
     )
     raise RefusedError(
-        f"the robot turns {turn:.3g} times as far as its wheels say: {may}, or drive.wheel_radius "
-        f"= {base.radius:g} and drive.wheel_separation = {base.separation:g} are another robot's "
-        "(--config)"
+        f"the robot turns {turn:.3g} times as far as its wheels report: {may}, or "
+        f"drive.wheel_radius = {base.radius:g} and drive.wheel_separation = {base.separation:g} "
+        "belong to another robot (--config)"
     )
 
 
@@ -181,14 +181,14 @@ def way_units(size: float, base: Base) -> None:
     may = (
         "the wheel speeds are in m/s (divide by the wheel radius), or the positions in mm or cm"
         if size > 1
-        else "the positions are latitude and longitude, or in km (x ahead and y to the left, in m, "
-        "are needed)"
+        else "the positions are latitude and longitude, or in km (they must be x ahead and y to "
+        "the left, in m)"
         if size < FAR_SIZE
-        else "the wheel speeds are in deg/s, rpm or counts, or are angles (rad/s are needed)"
+        else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
     )
     raise RefusedError(
-        f"the robot goes {size:.3g} times as far as its wheels say: {may}, or drive.wheel_radius "
-        f"= {base.radius:g} is another robot's (--config)"
+        f"the robot drives {size:.3g} times as far as its wheels report: {may}, or "
+        f"drive.wheel_radius = {base.radius:g} belongs to another robot (--config)"
     )
 
 
@@ -198,8 +198,8 @@ def in_range(values: Floats) -> None:
         return
     shown = ", ".join(f"{value:.3g}" for value in values)
     raise RefusedError(
-        f"the multipliers come out as {shown} (wheel separation, left, right), which must be from "
-        f"{LEAST_FACTOR:g} to {MOST_FACTOR:g}: put the measured drive.wheel_radius and "
+        f"the multipliers are {shown} (wheel separation, left, right), but must be from "
+        f"{LEAST_FACTOR:g} to {MOST_FACTOR:g}: write the measured drive.wheel_radius and "
         "drive.wheel_separation into the configuration first"
     )
 
@@ -223,23 +223,26 @@ def remarks(
             far = "; set the clocks" if abs(seconds) > FAR_S else ""
             yield (
                 f"the times of {source} are {abs(seconds) * 1000:.0f} ms {word} than those of the "
-                f"wheels; this was allowed for{far}"
+                f"wheels; the calibration has corrected this{far}"
             )
     if abs(bias) > LARGE_BIAS:
-        yield f"the gyro turns by {bias:.3f} rad/s while the robot stands: allowed for, but much"
+        yield (
+            f"the gyro turns by {bias:.3f} rad/s while the robot stands: the calibration has "
+            "corrected this large value"
+        )
     left, right = float(turned[turned > 0].sum()), float(-turned[turned < 0].sum())
     if min(left, right) < ONE_SIDED * max(left, right):
-        yield "nearly all turns are to one side: what differs between the sides is not seen"
+        yield "nearly all turns are to one side, so differences between the sides are not measured"
     size = float(values[1:].mean())
     if sized and not 1 / ODD_SIZE < size < ODD_SIZE:
         yield (
-            f"the wheels come out {size:.3g} times as large as drive.wheel_radius = "
-            f"{base.radius:g}: measure it, and see that wheel speeds are in rad/s and x, y in m"
+            f"the wheels are {size:.3g} times as large as drive.wheel_radius = {base.radius:g}: "
+            "measure it, and check that wheel speeds are in rad/s and x, y in m"
         )
     track = float(values[0])
     if not LEAST_TRACK < track < MOST_TRACK:
         yield (
             f"an effective track of {track:.3g} times drive.wheel_separation = "
-            f"{base.separation:g} is unusual (1 to 2.5 is usual): measure it, and see that all "
-            "units are right"
+            f"{base.separation:g} is unusual (1 to 2.5 is usual): measure it, and check all "
+            "units"
         )

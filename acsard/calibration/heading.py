@@ -114,7 +114,7 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
     if not any(len(run.gyro) for run in driven):
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
-        raise LogError("yaw_rate is the same in every row: the gyro is not recorded or dead")
+        raise LogError("yaw_rate is the same in every row: the gyro was not recorded, or is dead")
     seen = [_biases(run) for run in driven]
     every = np.concatenate([values for _, values, _ in seen])
     usual = float(np.median(every)) if len(every) else 0.0
@@ -144,7 +144,7 @@ def of_yaw(driven: Sequence[Run], angles: Sequence[Wheels], gain: float) -> Head
     found = []
     for run, turned in zip(driven, angles, strict=True):
         if _in_degrees(run, turned, gain):
-            raise LogError("yaw is in degrees: multiply it by pi / 180, it must be in radians")
+            raise LogError("yaw is in degrees, but must be in radians: multiply it by pi / 180")
         angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
         found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
     return Headings("yaw", tuple(found), offset(found, angles), 0.0, drifts=False)

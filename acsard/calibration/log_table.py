@@ -92,7 +92,7 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
             values[wild] = math.nan
             count = int(wild.sum())
             cells = f"{count} cell{'s' if count > 1 else ''}"
-            yield f"{cells} of {name} left out as impossible, like {example:g}"
+            yield f"{cells} of {name} left out because no robot has such a value, like {example:g}"
 
 
 def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
@@ -186,7 +186,7 @@ def _text(data: bytes) -> str:
         if data.startswith(mark):
             return data.decode(coding, errors="replace")
     if b"\0" in data[:4096]:
-        raise LogError(f"it is not text (a recording of ROS, perhaps): {AS_CSV}")
+        raise LogError(f"it is not text (perhaps a ROS bag): {AS_CSV}")
     return data.decode("utf-8-sig", errors="replace")
 
 
@@ -211,10 +211,10 @@ def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
             if 1 < len(names) == len(cells) or "t" in [name for name, _ in names]:
                 return at, names, separator
             raise LogError(
-                f"line {at + 1} is numbers where the names of the columns should be: "
+                f"line {at + 1} contains numbers instead of the names of the columns: "
                 f"write a first line like {EXAMPLE}"
             )
-    raise LogError(f"it is empty: its first line names the columns, like {EXAMPLE}")
+    raise LogError(f"it is empty: its first line must name the columns, like {EXAMPLE}")
 
 
 def _separator(text: str) -> str:
@@ -247,11 +247,11 @@ def _columns(header: list[str], number: int) -> list[str]:
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
     if twice:
-        raise LogError(f"{where}: column {min(twice)} is there twice; leave one out")
+        raise LogError(f"{where}: column {min(twice)} exists twice; leave one out")
     wheels = FOUR if set(FOUR) <= set(header) else TWO
     wanted = ["t", *wheels]
     if len(header) == 1 and "t" in header[0].split("_"):
-        raise LogError(f"{where}: the names stand without commas between: write {EXAMPLE}")
+        raise LogError(f"{where}: there are no commas between the names: write {EXAMPLE}")
     if missing := [name for name in wanted if name not in header]:
         raise LogError(
             f"{where}: no column {', '.join(missing)}{_near(missing, header)}; it must name t, "
@@ -262,8 +262,8 @@ def _columns(header: list[str], number: int) -> list[str]:
         sensors += ["x", "y"]
     if not sensors:
         raise LogError(
-            f"{where}: nothing to compare the wheels with: it must name yaw_rate (a gyro, rad/s), "
-            f"or x and y (positions, m){_near(['yaw_rate', 'x', 'y'], header)}"
+            f"{where}: no column with which to compare the wheels: it must name yaw_rate (a gyro, "
+            f"rad/s), or x and y (positions, m){_near(['yaw_rate', 'x', 'y'], header)}"
         )
     used = {*wanted, *sensors, "run"}
     return [name if name in used else "" for name in header]
@@ -289,7 +289,7 @@ def _ignored(header: list[tuple[str, str]], names: list[str]) -> list[str]:
 
 def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]:
     return [
-        f"column {name} says ({unit[:20]}), which is no unit known here: it was taken for "
+        f"column {name} says ({unit[:20]}), an unknown unit: the tool read it as "
         f"{SI.get(name, 'rad/s')}"
         for (_, unit), name in zip(header, names, strict=True)
         if name and name != "run" and factor(name, unit) is None
@@ -369,7 +369,7 @@ class _Reader:
                     return []  # the header is repeated because logs were concatenated
                 shown = printable(cell if len(cell) <= 30 else cell[:27] + "...")
                 date = self._names[i] == "t" and ":" in cell
-                why = "a date, and t is in s" if date else "no number"
+                why = "a date, but t must be in s" if date else "not a number"
                 self._refuse(f'line {number}, column {self._names[i]}: "{shown}" is {why}')
                 return []
         return row
@@ -383,8 +383,8 @@ class _Reader:
         rows = len(self._runs)
         if self._bad > max(FEW, SHARE * rows) or (self._bad and not rows):
             raise LogError(
-                f"{self._first}, and {self._bad} of {self._bad + rows} rows are so: "
-                "write numbers with a point, or leave a cell empty where there is no value"
+                f"{self._first}, and {self._bad} of {self._bad + rows} rows have such errors: "
+                "write numbers with a point, or leave a cell empty if there is no value"
             )
         if not rows:
             raise LogError("there are no rows below the header: record a drive")
@@ -418,6 +418,6 @@ def row(message: Message, arrived_ns: int) -> str:
         yaw = 2 * math.atan2(turn.z, turn.w)
         cells = ["", "", "", "", "", f"{where.x:.4f}", f"{where.y:.4f}", f"{yaw:.5f}"]
     else:
-        raise ValueError(f"{type(message).__name__} is no part of a log")
+        raise ValueError(f"{type(message).__name__} cannot be in a log")
     stamp_ns = message.header.stamp.to_ns() or arrived_ns
     return ",".join([f"{stamp_ns // NS_PER_S}.{stamp_ns % NS_PER_S // 1000:06d}", *cells])

@@ -56,7 +56,7 @@ def drives_enough(parts: Sequence[Block]) -> None:
     """Raise `RefusedError` if the wheels hardly move at all."""
     if len(parts) < LEAST_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
-        raise RefusedError(f"the wheels turn for {seconds:.0f} s only, too little: {DRIVE}")
+        raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
 
 
 def rolls_enough(rows: Rows) -> None:
@@ -68,13 +68,13 @@ def rolls_enough(rows: Rows) -> None:
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
         if (turns := float(np.abs(rolled).sum()) / (2 * np.pi)) < LEAST_ROLL / (2 * np.pi):
             raise RefusedError(
-                f"the wheels roll {turns:.1f} turns {what} in all, which is too little to tell "
-                f"their size, left to right and the effective track: {DRIVE}"
+                f"the wheels roll {turns:.1f} turns {what} in all, which is too little to measure "
+                f"their size, the ratio of left to right and the effective track: {DRIVE}"
             )
     cross = float(together @ against) ** 2
     if cross > ALIKE * float(together @ together) * float(against @ against):
         raise RefusedError(
-            f"the robot drives one and the same circle, which tells nothing: {DRIVE}"
+            f"the robot drives always the same circle, which measures nothing: {DRIVE}"
         )
 
 
@@ -96,11 +96,11 @@ def sure_enough(
     `chance` is the standard deviation of the track as a fraction, without the track's own
     variation. `mend` is what to do then.
     """
-    told = {"the effective track": chance, "left to right": found.ratio_std}
+    told = {"the effective track": chance, "the ratio of left to right": found.ratio_std}
     for (name, deviation), most in zip(told.items(), worst, strict=True):
         if not deviation <= most:
             raise RefusedError(
-                f"{name} comes out of {log} only to {deviation:.1%}, which is of no use: {mend}"
+                f"{log} determines {name} only to {deviation:.1%}, which is too inaccurate: {mend}"
             )
 
 
@@ -111,8 +111,8 @@ def told_apart(normal: Floats) -> None:
     """
     if condition(normal) > WORST_CONDITION:
         raise RefusedError(
-            f"the log turns and goes ahead only together, so that the track and the wheels cannot "
-            f"be told apart (condition number over {WORST_CONDITION:g}): {DRIVE}"
+            f"in the log the robot turns only while it drives ahead, so the track and the wheels "
+            f"cannot be separated (condition number over {WORST_CONDITION:g}): {DRIVE}"
         )
 
 
@@ -145,8 +145,8 @@ def prepared(
         rows = heading.level(every)
     if headings is not None and not len(rows.turned):
         raise RefusedError(
-            f"{headings.source} tells nothing while the wheels turn: record both at the same time, "
-            "with times of one clock"
+            f"{headings.source} has no samples while the wheels turn: record both at the same "
+            "time, with times of one clock"
         )
     rolls_enough(rows)
     spots = places.spots(driven, angles, parts)

@@ -90,7 +90,7 @@ def runs(table: Table) -> Log:
     columns["left"], columns["right"] = _sides(columns, notes)
     if len(table.names) > MOST_RUNS:
         raise LogError(
-            f"column run has {len(table.names)} different names: it tells drives apart, not rows"
+            f"column run has {len(table.names)} different names: it must name drives, not rows"
         )
     timed = np.isfinite(t)
     if lost := int((~timed).sum()):
@@ -102,13 +102,13 @@ def runs(table: Table) -> Log:
         parts = _restarts(t, rows, columns)
         if len(parts) > 1:
             again = many(len(parts) - 1, "time")
-            notes.append(f"{of}the time begins anew {again}: as many runs more")
+            notes.append(f"{of}the time restarts {again}: each restart begins a new run")
         _in_seconds(name, t, parts, columns)
         whole, parts = len(parts), [piece for part in parts for piece in _pauses(t, part, columns)]
         if len(parts) > whole:
             notes.append(
                 f"{of}the wheels are silent for over {PAUSE_S:g} s "
-                f"{many(len(parts) - whole, 'time')}: as many runs more"
+                f"{many(len(parts) - whole, 'time')}: each pause begins a new run"
             )
         for at, part in enumerate(parts):
             label = name or str(len(found) + 1)
@@ -121,7 +121,7 @@ def runs(table: Table) -> Log:
             if name in table.columns and not np.isfinite(table.columns[name]).any()
         ]  # fmt: skip
         raise LogError(
-            f"column {empty[0]} has a number in no row: record the wheels while the robot drives"
+            f"column {empty[0]} has no number in any row: record the wheels while the robot drives"
             if empty
             else f"no run has {LEAST_ROWS} rows with a time and both sides' wheel speeds: "
             "record the wheels at 5 Hz or more while the robot drives"
@@ -136,7 +136,8 @@ def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats
         apart = _apart(columns, front, rear)
         if apart > TOLD:
             notes.append(
-                f"{front} and {rear} differ by {apart:.0%} of their way: their mean counts"
+                f"{front} and {rear} differ by {apart:.0%} of their distance: the tool uses their "
+                "mean"
             )
     fr, fl, rl, rr = (columns[name] for name in FOUR)
     return (fl + rl) / 2, (fr + rr) / 2
@@ -158,10 +159,11 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
     least, most = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
     sizes = sorted(float(np.abs(one).sum()) for one in (a, b))
     raise LogError(
-        f"{least} hardly turns while {most} does: name the wheels that are right left and right, "
-        "without the others"
+        f"{least} hardly turns while {most} does: name the wheels that work left and right, and "
+        "omit the others"
         if sizes[0] < (1 - APART) * sizes[1]
-        else f"{front} and {rear} turn opposite ways: a sign is wrong, or columns are swapped"
+        else f"{front} and {rear} turn in opposite directions: a sign is wrong, or columns are "
+        "swapped"
     )
 
 
@@ -198,12 +200,12 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
         if len(times) > REPEATED * len(once) and period > ENOUGH_S:
             raise LogError(
                 f"run {name or 1}: {len(times)} rows of wheel speeds have {len(once)} different "
-                "times: t was rounded, write it with 3 decimals of a second"
+                "times, because t was rounded: write it with 3 decimals of a second"
             )
         if period > SLOWEST_S:
             raise LogError(
-                f"run {name or 1}: {period:g} s between two rows of wheel speeds: t is in seconds "
-                "(divide ms by 1000, ns by 1e9), and the wheels are needed at 5 Hz or more"
+                f"run {name or 1}: {period:g} s between two rows of wheel speeds: t must be in "
+                "seconds (divide ms by 1000, ns by 1e9), and the wheels recorded at 5 Hz or more"
             )
 
 
@@ -227,7 +229,10 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
     wheels, gyro, yaw, place = (_stream(columns, rows, n, name, notes) for n in names)
     if len(wheels[0]) < LEAST_ROWS:
         if len(rows):
-            notes.append(f"run {name} has {len(wheels[0])} rows of wheel speeds and is left out")
+            notes.append(
+                f"run {name} has {len(wheels[0])} rows of wheel speeds, which is too few, and is "
+                "left out"
+            )
         return None
     yaw, place = (
         _new(yaw, wheels, f"run {name}: yaw", notes),
@@ -256,8 +261,8 @@ def _new(
         return stream
     # This includes repetitions at rest: the first of them may be older than its row.
     notes.append(
-        f"{what} stay between samples: of {rolling} rows that say them again "
-        "while the wheels turn none is taken"
+        f"{what} repeat their value between samples: {rolling} such rows while the wheels turn "
+        "are left out"
     )
     return tuple(column[~again] for column in stream)
 
@@ -282,7 +287,9 @@ def _ordered(stream: list[Floats], what: str, run: str, notes: list[str]) -> Ite
     order = np.argsort(t, kind="stable")
     times, first = np.unique(t[order], return_index=True)
     if count := len(t) - len(times):
-        notes.append(f"run {run}: {count} rows of {what} repeat a time: the first of each is taken")
+        notes.append(
+            f"run {run}: {count} rows of {what} repeat a time: the first row of each time is used"
+        )
     yield times
     for values in stream[1:]:
         yield values[order][first]

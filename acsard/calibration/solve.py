@@ -147,7 +147,7 @@ def _calibration(
     """Convert the fit to settings and evaluate its improvement."""
     rows, spots, every = made.rows, made.spots, fitted.covariance()
     if not fitted.converged:
-        raise RefusedError(f"the search for the parameters does not settle: {DRIVE}")
+        raise RefusedError(f"the search for the parameters does not converge: {DRIVE}")
     told_apart(fitted.apart())
     by_wheels = heading.turned(rows, base, fitted.parameters)
     bias = headings.bias if headings is not None else 0.0
@@ -172,7 +172,7 @@ def _calibration(
         names = [run.name for run in log.runs]
         result, name = scaled(result, tape, names, follow, known=bool(spots))
         scale.append("distance")
-        notes.append(f"the distance of {tape.metres:g} m is taken for run {name}")
+        notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
     in_range(result.values)
     drives = Drives.of(log.runs, rows, by_wheels, base, result, rate)
     notes += _cuts(log.runs, angles)
@@ -188,12 +188,12 @@ def _calibration(
 def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
     """Yield a sentence for each kind of place where the log was cut."""
     if gone := sum(len(turned.gaps) for turned in angles):
-        yield f"the wheel speeds have {gone} gaps: nothing is taken across them"
+        yield f"the wheel speeds have {gone} gaps: the tool uses no data across them"
     pairs = zip(driven, angles, strict=True)
     if jumps := sum(len(places.jumps(run, turned)) for run, turned in pairs):
         yield (
-            f"the positions jump {jumps} times (outliers, or a source that found itself "
-            "elsewhere): nothing is taken across that"
+            f"the positions jump {jumps} times (outliers, or a source that corrected "
+            "itself): the tool uses no data across the jumps"
         )
 
 
@@ -214,9 +214,9 @@ def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base
 
 def _own(what: str) -> str:
     return (
-        f"no sensor agrees with the wheels so well as {what}: if that was made of the same wheels, "
-        "like the odometry of a driver, this tells how the driver is set and nothing of the robot; "
-        "take a gyro, SLAM, GPS or motion capture"
+        f"no sensor agrees as well with the wheels as {what}: if these values were computed from "
+        "the same wheels, like the odometry of a driver, the result describes the settings of that "
+        "driver and not the robot; use a gyro, SLAM, GPS or motion capture"
     )
 
 

@@ -69,8 +69,8 @@ def scaled(
     way = ways[best]
     if way.straight < STRAIGHT:
         raise RefusedError(
-            f"--distance: run {names[best]} ends {way.apart:.2f} m from where it began, after "
-            f"{way.along:.2f} m: drive straight on for 2 m or more in a run of its own, and "
+            f"--distance: run {names[best]} ends {way.apart:.2f} m from its start, after "
+            f"{way.along:.2f} m: drive straight ahead for 2 m or more in a separate run, and "
             "measure from start to end"
         )
     slopes = np.zeros(3)

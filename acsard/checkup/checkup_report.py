@@ -67,8 +67,8 @@ def withheld(simulated: bool, config: Config) -> str:
     if not simulated or config.mcu.simulated:
         return ""
     return (
-        f"the simulator was checked, and mcu.port here is {config.mcu.port}: what the simulator "
-        "likes says nothing of that robot"
+        f"the tool checked the simulator, but mcu.port here is {config.mcu.port}: the results "
+        "do not apply to that robot"
     )
 
 
@@ -152,10 +152,10 @@ def summary(found: Report, where: str) -> str:
     verdicts = [finding.verdict for finding in found.findings]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in COLOURS if v in verdicts)
     if late := lateness.unjudged(found.findings):
-        again = "so it has not passed: try again when this computer is free"
+        again = "so the check has not passed: try again when this computer is idle"
         counts += f"\n{len(late)} not judged, {again}"
     if found.withheld:
-        return f"\n{counts}\nnothing is for {where}: {found.withheld}"
+        return f"\n{counts}\nnothing to write into {where}: {found.withheld}"
     if not found.toml:
         return f"\n{counts}\nacsard.toml: nothing to change"
     head = f"{where}: written" if found.written else "for acsard.toml:"

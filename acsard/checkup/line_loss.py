@@ -183,7 +183,7 @@ def direction(board: Board, operator: Operator, motors: Sequence[int]) -> Findin
     """
     if not (board.own_clock or board.lost > MOST):
         return None
-    operator.doing("the motors turn for a moment each time, to tell on which way lines are lost")
+    operator.doing("the motors turn for a moment each time, to find out where lines are lost")
     ways = pulsed(board, motors) if motors else None
     if ways is None:
         return outcomes.find("lost where: untold")

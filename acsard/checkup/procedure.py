@@ -31,10 +31,10 @@ from acsard.core.formatting import many
 LIFTED = "lifted"
 
 CONFIRM = (
-    "The wheels will turn one by one, then together. They are told 3 rad/s at the most, but a "
-    "wheel whose encoder is dead or reversed can reach full speed, for a second or so. Lift the "
-    "robot so that none touches anything, keep a hand on the power switch, then type "
-    f'"{LIFTED}". Nothing has turned yet; q or Ctrl-C leaves, here and later:'
+    "The wheels will turn one by one, then together. The tool commands 3 rad/s at most, but a "
+    "wheel whose encoder is dead or reversed can reach full speed for about a second. Lift the "
+    "robot so that no wheel touches anything, keep a hand on the power switch, then type "
+    f'"{LIFTED}". Nothing has turned yet; q or Ctrl-C quits, here and later:'
 )
 
 STEPS = (
@@ -46,12 +46,12 @@ STEPS = (
 
 SILENT: tuple[tuple[str, Callable[[Board], Finding | None]], ...] = (
     ("listening at the configured baud rate, 3 s, then at the others", dialect.baud),
-    ("asking who it is", dialect.identity),
-    ("listening how often it answers", dialect.rate),
-    ("measuring how soon it answers", dialect.trip),
+    ("asking the board for its name", dialect.identity),
+    ("measuring how often the board answers", dialect.rate),
+    ("measuring how fast the board answers", dialect.trip),
     ("trying the comma at the end of the line", dialect.form),
-    ("looking at its replies", dialect.replies),
-    ("asking for the check", dialect.check),
+    ("checking the form of its replies", dialect.replies),
+    ("asking the board for the link check", dialect.check),
     ("counting lost lines, 3 s and more", line_loss.finding),
 )
 """Steps that send only zeros and questions, with the message that the operator sees meanwhile."""
@@ -141,9 +141,9 @@ class _Steps:
         right = [channel.motor for channel in channels if channel.kind in ("right", "off")]
         self._measure("", lambda: line_loss.direction(board, operator, right))
         self._take("", lambda: encoder_counts.finding(board, right))
-        together = "the motors turn together, then the host falls silent, several times perhaps"
+        together = "the motors turn together, then this computer sends nothing; this may repeat"
         self._measure(together, lambda: watchdog.finding(board, right))
-        broken = "broken lines go out; nothing may turn"
+        broken = "sending broken lines; no motor may turn"
         self._measure(broken, lambda: damage.finding(board, right))
 
     def _stand(self) -> None:
@@ -153,7 +153,7 @@ class _Steps:
     def _turn(self, motor: int) -> Finding:
         """Test one motor. The operator is asked only if this computer was in time."""
         board, operator, channels = self._board, self._operator, self._channels
-        operator.doing(f"{motor_name(board.mcu, motor)} turns: a moment first, then forth and back")
+        operator.doing(f"{motor_name(board.mcu, motor)} turns: briefly, then forward and back")
 
         def looked() -> Finding:
             channels[motor:] = [wheels.channel(board, motor)]
@@ -179,7 +179,7 @@ class _Steps:
         for _ in range(1 + min(LATE_AGAIN, self._late_left)):
             if late_s:
                 self._late_left -= 1
-                self._operator.doing("this computer was late; once more")
+                self._operator.doing("this computer was late; the step runs again")
                 board.known = known
                 if board.armed:
                     board.rest()
@@ -249,7 +249,7 @@ class _Steps:
         """Send zeros until a restarted board answers and its motors stand."""
         board = self._board
         board.forget()
-        self._operator.doing("the board started anew; once more, when it answers")
+        self._operator.doing("the board restarted; the step runs again when it answers")
         if not board.wakes(BOOT_S):
             raise StoppedError(restarts.finding(board.mcu, self._seen, back=False))
         if said := restarts.cause(board.others):

@@ -128,7 +128,7 @@ class Restarts:
 
     def _line_sign(self, line: bytes, at_s: float) -> str:
         if line.startswith(IDENTITY) and at_s - self._asked_s > ASKED_S:
-            return "it named itself, unasked"
+            return "it sent its name without a request"
         boots = self._unanswered >= UNANSWERED and _WORD.search(line)
         return "it was silent, then printed a text" if boots else ""
 
@@ -142,7 +142,7 @@ class Restarts:
         most_ms = 1000 * (reply.at_s - before[1] + AHEAD_S)
         # If more than half a minute passed without a reply, the clock may have wrapped round.
         if most_ms < CLOCK / 2 and (reading.mcu_ms - before[0]) % CLOCK > most_ms:
-            return "its clock and its counts began again"
+            return "its clock and its counts restarted"
         return ""
 
 
@@ -159,7 +159,7 @@ def finding(mcu: McuConfig, restarts: Sequence[Restart], back: bool = True) -> F
     """Return the finding for at least one restart. `back` says whether the board answers again."""
     each = Counter(_told(mcu, one) for one in restarts)
     seen: dict[str, object] = {
-        "times": f"started anew{_times(len(restarts))}",
+        "times": f"restarted{_times(len(restarts))}",
         "told": "; ".join(f"while {when}{_times(n)}: {sign}" for (when, sign), n in each.items()),
         "silent": min(one.silent_s for one in restarts),
         "patience": BOOT_S,

@@ -328,7 +328,7 @@ def seen(board: Board, operator: Operator, channel: Channel) -> Channel:
     if which is None:
         return channel
     if wheel := ANSWERS[which]:
-        question = "which way did it turn first: forward (as when the robot drives ahead) or back?"
+        question = "how did it turn first: forward (as when the robot drives ahead) or back?"
         way = operator.ask(question, ("forward", "back"))
         return structs.replace(channel, wheel=wheel, forward=way != "back")
     return structs.replace(channel, wheel="")

@@ -168,9 +168,9 @@ class JsonPrompt:
             file = writable(config)
             require_changeable(file, keys)
         except MendableError as error:
-            self.say(f"Nothing can be written from here: {error}")
+            self.say(f"The tool cannot write the file from here: {error}")
             return False
-        wanted = self.ask(f"Write these lines into {file}? Comments stay.", ("write", "leave"))
+        wanted = self.ask(f"Write these lines into {file}? Its comments stay.", ("write", "leave"))
         self._moves = False
         if wanted == "write":
             change(file, keys)
@@ -224,7 +224,7 @@ class JsonPrompt:
         try:
             self._end(self._heard_out())
         except BaseException as error:
-            self._end(f"what comes in cannot be read: {error}")
+            self._end(f"the input cannot be read: {error}")
             raise
 
     def _heard_out(self) -> str:
@@ -235,12 +235,12 @@ class JsonPrompt:
                 read = os.read(self._input, 4096)
                 *whole, held = (held + read).split(b"\n")
                 if not read or len(held) > LINE_BYTES:
-                    return "the program that asks is gone"
+                    return "the program that passes on the questions has ended"
                 for line in whole:
                     self._take(line)
                 heard_s = time.monotonic()
             elif self._moves and time.monotonic() - heard_s > HEARD_S and not self._readable(0.0):
-                return f"nothing was heard for {HEARD_S:g} s of who is to stop it"
+                return f"no sign of life of the operator arrived for {HEARD_S:g} s"
         return ""
 
     def _readable(self, wait_s: float) -> bool:

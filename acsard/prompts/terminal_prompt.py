@@ -106,7 +106,7 @@ class NoPrompt(Screen):
     def number(self, ask: Ask) -> float:
         """Return the default."""
         if ask.usual is None:
-            raise NobodyError("this way needs a person who measures: leave --yes out")
+            raise NobodyError("this method needs a person who measures: leave --yes out")
         return ask.usual
 
     def keys(self, wait_s: float) -> str:
@@ -136,7 +136,7 @@ class TerminalPrompt(Screen):
                 raise KeyboardInterrupt
             if word in answers:
                 return word
-            self._print(f"   please type {' or '.join(answers)}; {LEAVES} leaves\n")
+            self._print(f"   please type {' or '.join(answers)}; {LEAVES} quits\n")
 
     def start(self, text: str, by_key: bool = False) -> None:
         """Return when Enter is pressed."""
@@ -145,7 +145,7 @@ class TerminalPrompt(Screen):
         self.say(text)
         # Keys that were pressed before the text appeared must not start anything.
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
-        self.say("Enter starts it, any key then stops it; q leaves.")
+        self.say("Enter starts it, then any key stops it; q quits.")
         while True:
             pressed = _read()
             if not pressed.strip("\r\n"):
@@ -167,7 +167,7 @@ class TerminalPrompt(Screen):
                 try:
                     return ask.number(line)
                 except ValueError as error:
-                    self.say(f"{error} (q leaves)")
+                    self.say(f"{error} (q quits)")
 
     def keys(self, wait_s: float) -> str:
         """Return the keys that were pressed."""

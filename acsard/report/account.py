@@ -75,10 +75,10 @@ def summary(course: Course) -> str:
     fast, counts = course.fastest, course.marks.counts
     drove = sum(one.seconds for one in course.driven.values())
     way = (
-        f"It drove {course.metres:.2f} m in {lasting(drove)} of {lasting(course.seconds)}, "
+        f"The robot drove {course.metres:.2f} m in {lasting(drove)} of {lasting(course.seconds)}, "
         f"at most {fast.linear:.2f} m/s and {fast.angular:.2f} rad/s."
         if drove
-        else f"It did not drive in these {lasting(course.seconds)}."
+        else f"The robot did not drive in these {lasting(course.seconds)}."
     )
     stops = many(counts["stop"], "stop")
     by = _names([mark for mark in course.marks.all() if mark.name == "stop"])
@@ -135,15 +135,15 @@ def notes(course: Course, origin: Origin) -> list[str]:
     found = list(origin.notes)
     if course.missing:
         found.append(
-            f"{many(course.missing, 'step is', 'steps are')} missing: after that, speeds wished "
-            "and limited and what sources wait for are computed without knowing what happened."
+            f"{many(course.missing, 'step is', 'steps are')} missing: after them, the "
+            "commanded and limited speeds and the reasons of waiting sources may be wrong."
         )
     curves = [*course.linear.values(), *course.angular.values()]
     width = max(curve.width for curve in curves)
     if width > FINE_S:
         found.append(
-            f"A point of a picture stands for up to {width:.2g} s: the lowest and the highest of "
-            "each such time are drawn. --from and --to show a shorter time finer."
+            f"A point of a picture stands for up to {width:.2g} s and shows the lowest and the "
+            "highest value of that time. --from and --to draw a shorter time in more detail."
         )
     return found
 
@@ -152,15 +152,15 @@ def rows(course: Course, origin: Origin, clock: Clock) -> Iterator[tuple[str, st
     """Yield the label and the content of each row of the summary table."""
     began, config = course.began or 0.0, course.config
     yield "When", f"{clock(began, True)} to {clock(began + course.seconds, True)}"
-    yield "How long", f"{lasting(course.seconds)}, {course.steps} steps"
-    yield "How far", f"{course.metres:.2f} m, both ways counted"
+    yield "Duration", f"{lasting(course.seconds)}, {course.steps} steps"
+    yield "Distance", f"{course.metres:.2f} m, forward and backward"
     fast = course.fastest
     yield "Top speed", f"{fast.linear:.2f} m/s, {fast.angular:.2f} rad/s (measured)"
     driven = [
         f"{name} {one.metres:.2f} m in {lasting(one.seconds)}"
         for name, one in course.driven.items()
     ]
-    yield "Who drove", ", ".join(driven) or "nobody"
+    yield "Driven by", ", ".join(driven) or "no source"
     marks = course.marks.all()
     for name, title in (("fault", "Faults"), ("stop", "Stops")):
         told = [mark for mark in marks if mark.name == name]

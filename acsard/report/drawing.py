@@ -159,9 +159,9 @@ def path(course: Course) -> Figure:
         "margin": {"l": 58, "r": 12, "t": 8, "b": 48},
     }
     caption = (
-        "By odometry, both axes in m and equal."
+        "By odometry; both axes are in m and have the same scale."
         if places
-        else "No feedback that could be believed: nothing is known of where it went."
+        else "There is no valid feedback, so the path is unknown."
     )
     return Figure("path", "The path", caption, keys, 460, data, axes, timed=False)
 

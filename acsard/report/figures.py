@@ -127,7 +127,7 @@ class Pictures:
             Part(
                 title,
                 [
-                    Line("wished", WISHED, curves["wished"].points(), "hv"),
+                    Line("commanded", WISHED, curves["wished"].points(), "hv"),
                     Line("limited", LIMITED, curves["limited"].points(), "hv", BENEATH),
                     Line("measured", MEASURED, curves["measured"].points()),
                 ],
@@ -138,8 +138,9 @@ class Pictures:
             )
         ]
         caption = (
-            "Wished by who is followed; limited is what was asked of the wheels; measured is what "
-            "they said. Turning left and driving forward are above zero."
+            "Commanded is the speed of the source that drives; limited is the speed sent to the "
+            "wheels; measured is the speed that they reported. Left turns and forward driving are "
+            "above zero."
         )
         return self._stack("speeds", "Speed", caption, parts, 210)
 
@@ -150,7 +151,7 @@ class Pictures:
             Part(
                 f"{name.replace('_', ' ')}, rad/s",
                 [
-                    Line("asked", LIMITED, asked.points(), "hv", BENEATH),
+                    Line("commanded", LIMITED, asked.points(), "hv", BENEATH),
                     Line("measured", MEASURED, turned.points()),
                 ],
             )
@@ -167,24 +168,26 @@ class Pictures:
             bad.append(Line("no answer", WISHED, link.unanswered.points(), "hvh"))
         parts = [
             Part(
-                "lines a second",
+                "lines per second",
                 [
                     Line("sent", LIMITED, link.sent.points(), "hvh", BENEATH),
                     Line("answered", MEASURED, link.good.points(), "hvh"),
                 ],
             ),
-            Part("lost a second", bad),
+            Part("lost per second", bad),
         ]
         caption = (
-            "Dropped lines came and could not be read or believed; those without an answer are "
-            "lost on the way there or back."
+            "Dropped lines arrived, but were unreadable or implausible. Lines without an answer "
+            "were lost on the way there or back."
         )
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
         """Draw the lateness of the control loop."""
         late = Line("late", LIMITED, self._course.lateness.points(), "hv")
-        caption = "From when a period was due to its step, against the one that was least late."
+        caption = (
+            "Delay from the time at which a period is due to its step, relative to the least delay."
+        )
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
     def who(self) -> Figure:
@@ -208,12 +211,14 @@ class Pictures:
             "yaxis": {"range": [len(rows) - 0.45, -0.75], "visible": False, "fixedrange": True},
             "annotations": [note(name, 0, at - 0.44) for at, (name, _) in enumerate(rows)],
         }
-        caption = "Point at a band to read why. A source waits while another one before it sends."
+        caption = (
+            "Point at a band to read the reason. A source waits while a source before it sends."
+        )
         if silent:
             caption += f" Silent all the time: {', '.join(silent)}."
         height = ROW_PX * len(rows) + ROOM_PX
         return Figure(
-            "who", "Who drove, and why others did not", caption, _keys(looks), height, data, axes
+            "who", "Active source, and why others wait", caption, _keys(looks), height, data, axes
         )
 
     def _bars(self, look: Look, spans: list[tuple[int, Span]]) -> Trace:
@@ -250,7 +255,7 @@ class Pictures:
             "yaxis": {"range": [-0.5, len(levels)], "visible": False, "fixedrange": True},
             "annotations": [note(level, 0, at + 0.42) for at, level in enumerate(levels)],
         }
-        caption = "Point at a mark to read it; the list is at the end."
+        caption = "Point at a mark to read it; the full list is at the end."
         keys = [Key("◆", COLOURS[level], level) for level in reversed(levels)]
         return Figure("events", "Events", caption, keys, 230, data, axes)
 

@@ -188,7 +188,7 @@ def _reasons(course: Course) -> str:
         )
         for name, does, words, seconds in reasons(course)
     ]
-    return _table(["source", "", "why it did not drive", "for"], cells) if cells else ""
+    return _table(["source", "", "why it did not drive", "duration"], cells) if cells else ""
 
 
 def _events(course: Course, clock: Clock) -> str:
@@ -203,8 +203,8 @@ def _events(course: Course, clock: Clock) -> str:
         for mark in marks
     ]
     more = (
-        f'<p class="soft">{left_out} more of the same names are left out; '
-        "acsard recording show tells all.</p>"
+        f'<p class="soft">{left_out} more events of the same names are left out; '
+        "acsard recording show prints all of them.</p>"
         if left_out
         else ""
     )
@@ -217,9 +217,9 @@ def _events(course: Course, clock: Clock) -> str:
 def _settings(course: Course) -> str:
     changed = differences(course.config)
     if not changed:
-        return "<h2>Configuration</h2><p>As by default, every key.</p>"
+        return "<h2>Configuration</h2><p>Every key has its default.</p>"
     cells = [tuple(f"<td>{escaped(part)}</td>" for part in setting) for setting in changed]
-    heading = "<h2>Configuration, where it is not the default</h2>"
+    heading = "<h2>Configuration keys that differ from the default</h2>"
     return heading + _table(["key", "here", "default"], cells, "rows settings")
 
 

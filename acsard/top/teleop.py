@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 HELP = (
     " u  i  o    arrows drive, too",
     " j  k  l    space or k stops",
-    " m  ,  .    Ctrl-C leaves",
+    " m  ,  .    Ctrl-C quits",
     " q/z  both speeds +/- 10 %",
     " w/x  linear only    e/c  angular only",
 )

@@ -71,7 +71,7 @@ def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
         while not suspend:
             feed.poll()
             width, height = console.size
-            shown.update(screen(feed.seen("q leaves"), width, height), refresh=True)
+            shown.update(screen(feed.seen("q quits"), width, height), refresh=True)
             typed = read(PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
@@ -88,7 +88,7 @@ def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
             for line in told[1:]:
                 if "GONE" in line.plain or "SILENT" in line.plain:
                     line.stylize("bold red")
-            below = f"q leaves   {fleet.more or fleet.seen}" if rows else fleet.hint()
+            below = f"q quits   {fleet.more or fleet.seen}" if rows else fleet.hint()
             last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
             shown.update(Group(*told, Text(), last), refresh=True)
             typed = read(PERIOD_S)

@@ -186,7 +186,7 @@ def measured(bus: Bus, words: str) -> str:
         return f"{1000 * LENGTH_M:.0f}"
     if "from its mark" in words:
         return f"{math.hypot(where['x'], where['y']):.3f}"
-    ahead = LENGTH_M / 2 if "Front" in words else -LENGTH_M / 2
+    ahead = LENGTH_M / 2 if "front" in words else -LENGTH_M / 2
     left = where["y"] + ahead * math.sin(yaw) + WIDTH_M / 2 * math.cos(yaw)
     return f"{1000 * (LINE_M - left):.0f}"
 
@@ -202,7 +202,7 @@ def shown(terminal: Terminal) -> str:
 def question(terminal: Terminal, program: Program, seen: int) -> str | None:
     """Return the question after the text seen so far. `ENDED` means that no more will come."""
     words = shown(terminal)[seen:]
-    if words.endswith((" mm:", " m:", " deg:", "q leaves.")):
+    if words.endswith((" mm:", " m:", " deg:", "q quits.")):
         return words
     return ENDED if program.process.poll() is not None else None
 
@@ -250,7 +250,7 @@ def test_a_person_with_a_tape_alone_is_guided_to_the_written_file(tmp_path: Path
         bus.linked()
         said = goes_through(daemon, bus, "tape", reads)
         written = parse(daemon.config.read_bytes()).drive
-    assert "a turn of 360 deg ends" in said
+    assert "error of a turn of 360 deg" in said
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     assert written.left_wheel_radius_multiplier == pytest.approx(0.99, abs=0.006)
     assert written.right_wheel_radius_multiplier == pytest.approx(1.0, abs=0.006)
@@ -283,7 +283,7 @@ class Beside:
         return complex(where["x"], where["y"]), 2 * math.atan2(turn["z"], turn["w"])
 
 
-SETS = ("Push", "Set", "Mark")
+SETS = ("Push", "Place", "Mark")
 """Words of legs before which a person sets the robot by hand."""
 
 
@@ -300,7 +300,7 @@ def test_a_person_with_a_wall_or_marks_is_guided_to_the_written_file(
         written = parse(daemon.config.read_bytes()).drive
     print(f"{way}: {written.wheel_separation_multiplier} {written.left_wheel_radius_multiplier} "
           f"{written.right_wheel_radius_multiplier}")  # fmt: skip
-    assert "a turn of 360 deg ends" in said
+    assert "error of a turn of 360 deg" in said
     assert abs(written.wheel_separation_multiplier - 1.6 * 1.06) < 0.1
     ratio = written.left_wheel_radius_multiplier / written.right_wheel_radius_multiplier
     assert ratio == pytest.approx(0.99, abs=0.006)

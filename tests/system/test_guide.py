@@ -36,7 +36,7 @@ async def drives(guided: Guided, standing: Bus) -> None:
     for _ in range(4):
         await guided.begin("calibrate", method="umbmark")
         await guided.answer(await guided.asks("How wide"), 300)
-        await guided.starts("1. Set the robot")
+        await guided.starts("1. Place the")
         said = await guided.says(lambda said: said.get("progress", 0.0) > 0.15 or "ended" in said)
         if "ended" not in said:
             break
@@ -166,10 +166,10 @@ def test_who_is_not_heard_any_more_drives_no_more(page: Page, standing: Bus) -> 
                 await guided.answer(await guided.asks("How wide"), 300)
                 await guided.starts()
                 end = await guided.ended()
-                if "nothing was heard" in end["text"]:
+                if "no sign of life" in end["text"]:
                     break
                 await guided.says(lambda said: said.get("running") == "")
-            assert f"nothing was heard for {HEARD_S:g} s" in end["text"]
+            assert f"no sign of life of the operator arrived for {HEARD_S:g} s" in end["text"]
             await beside(standing.at_rest)
 
     run(story)
@@ -222,7 +222,7 @@ def test_a_network_that_is_gone_in_the_middle_of_a_drive_stops_it_within_a_secon
             await guided.begin("calibrate", method="umbmark")
             await guided.answer(await guided.asks("How wide"), 300)
             begun = time.monotonic()
-            await guided.starts("1. Set the robot")
+            await guided.starts("1. Place the")
             speed = await beside(lambda: until(lambda: fast(begun), 10.0, "the leg moves"))
             hosts.cut()
             gone = time.monotonic()

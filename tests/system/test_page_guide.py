@@ -127,7 +127,7 @@ def test_a_board_is_checked_without_a_daemon_and_the_lines_are_written(
             if n == 0:
                 sound(browser)
             person.press(wheel)
-            person.asked("which way")
+            person.asked("how did it turn")
             person.press("forward")
         person.asked("Write these lines")
         person.shows("guide-result", 'front_left = "+a"')
@@ -159,7 +159,7 @@ def drives(person: Person, bus: Bus) -> None:
     def moves() -> bool:
         if person.hidden("guide"):
             person.begin("calibrate", method="")
-            person.asked("1. Set the robot", 30.0)
+            person.asked("1. Place the", 30.0)
             person.shows("guide-where", "SIMULATED")
             person.press("start")
         elif not person.hidden("guide-close"):
@@ -242,7 +242,7 @@ def test_on_the_simulator_the_card_says_which_way_makes_sense_and_has_chosen_it(
     person.shows("advice", "no floor to lay a tape on")
     # The default works, and a different choice is kept.
     person.click("calibrate")
-    person.asked("1. Set the robot", 30.0)
+    person.asked("1. Place the", 30.0)
     person.click("guide-leave")
     person.ended("stopped")
     person.click("guide-close")
@@ -267,7 +267,7 @@ def test_the_simulator_is_calibrated_from_the_first_question_to_the_written_line
     person.types("far")
     person.shows("guide-wrong", "a number of m")
     person.types(f"{math.hypot(where['x'], where['y']):.3f}".replace(".", ","))
-    person.asked("2. It drives back")
+    person.asked("2. The robot drives back")
     person.press("start")
     until(
         lambda: browser.js("document.getElementById('guide-progress').value") > 0.1, 60.0, "a bar"

@@ -25,8 +25,8 @@ WORST = 0.1, 0.02
 """Largest useful standard deviations, as fractions: of the track, and of the ratio of radii."""
 
 MEND = (
-    "they contradict each other, or the robot skids much. Begin again on even ground, set the "
-    "robot exactly, and read off to the millimetre"
+    "they contradict each other, or the robot skids much. Start again on even ground, place the "
+    "robot exactly, and measure to the millimetre"
 )
 
 TURNED, STRAIGHT = np.pi, 0.5

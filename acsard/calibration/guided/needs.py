@@ -15,8 +15,8 @@ NEEDS: dict[str, str] = {
 
 SIMULATED = (
     "positions",
-    "On the simulator there is no floor to lay a tape on: positions does there, with sim/pose, "
-    "where it truly is; and gyro where [odometry] gyro is on, with its distance left empty. tape, "
-    "wall and umbmark are for a real robot.",
+    "On the simulator there is no floor to lay a tape on: use positions with sim/pose, the true "
+    "position, or gyro if [odometry] gyro is on, with its distance left empty. tape, wall and "
+    "umbmark are for a real robot.",
 )
 """The way to begin with on the simulator, and why."""

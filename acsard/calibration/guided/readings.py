@@ -146,9 +146,9 @@ def _begun(readings: Sequence[Reading], steps: Sequence[Grid], base: Base) -> Fl
             told = predicted(grid_, "turned", base, start).value
             if not 0.1 < told / reading.value < 10.0:
                 raise RefusedError(
-                    f"the wheels say that the robot turned by {math.degrees(told):.0f} deg, the "
-                    f"person {math.degrees(reading.value):.0f}: begin again, and let it turn once "
-                    "round, to the left"
+                    f"by the wheels the robot turned by {math.degrees(told):.0f} deg, by your "
+                    f"measurement {math.degrees(reading.value):.0f}: start again, and let it turn "
+                    "one full circle to the left"
                 )
             start[TURN] *= reading.value / told
             break
@@ -179,16 +179,16 @@ def _solved(
         inner = normal[np.ix_(ACTIVE, ACTIVE)]
         if condition(inner) > WORST_CONDITION:
             raise RefusedError(
-                "what was measured does not tell the wheels from the track: the robot hardly moved "
-                "or hardly turned. See that it can, and begin again"
+                "the measurements cannot separate the wheels from the track: the robot hardly "
+                "moved or hardly turned. Give it room, and start again"
             )
         step = np.linalg.solve(inner, score[ACTIVE])
         parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
         if float(np.abs(step).max()) < SMALL:
             return parameters, normal
     raise RefusedError(
-        "what was measured does not fit together: is each number in its unit, and of the end that "
-        "was asked for? Begin again"
+        "the measurements contradict each other: is each number in its unit, and of the end that "
+        "the question names? Start again"
     )
 
 
@@ -261,8 +261,9 @@ def effective(reading: Reading, drive: DriveConfig) -> float:
     least, most = BELIEVABLE
     if not least < track < most:
         raise GuideError(
-            f"once round, its wheels say {math.degrees(told):.0f} deg: was it one whole turn, and "
-            "are drive.wheel_radius and drive.wheel_separation what a tape says? Begin again"
+            f"for one full circle the wheels report {math.degrees(told):.0f} deg: was it one full "
+            "circle, and do drive.wheel_radius and drive.wheel_separation agree with a tape? Start "
+            "again"
         )
     return min(WIDEST, max(1.0, track))
 

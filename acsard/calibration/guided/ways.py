@@ -64,8 +64,8 @@ DISTANCE = Mean("distance", ("metres",), TAPE_M)
 
 def _at_the_edge(setup: Setup) -> str:
     return (
-        f"Set the robot {setup.from_edge:.2f} m (its middle) from the near edge of a free floor of "
-        f"{ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, looking to the far edge."
+        f"Place the middle of the robot {setup.from_edge:.2f} m from the near edge of a free floor "
+        f"of {ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, facing the far edge."
     )
 
 
@@ -73,7 +73,7 @@ def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: 
     """Return a leg that turns to the left until a key is pressed."""
     longest = LATE * 2 * math.pi * WIDEST
     rate = abs(setup.command(FIRST)) * setup.drive.wheel_separation_multiplier
-    words = f"It turns to the left, on the spot. Press SPACE {until}"
+    words = f"The robot turns to the left on the spot. Press SPACE {until}"
     return Leg(ROUND, words, (setup.spin(FIRST, longest / rate),), asks, measures, by_key=True)
 
 
@@ -86,8 +86,14 @@ def turns(setup: Setup, rate: float, track: float, most: int) -> int:
 # A tape measure beside a straight line.
 
 TO_LINE = (
-    Ask("Front left wheel to the line, at a right angle to it?", "mm", 0, 1500, name="front"),
-    Ask("Rear left wheel to the line?", "mm", 0, 1500, name="rear"),
+    Ask(
+        "How far is the front left wheel from the line, at a right angle?",
+        "mm",
+        0,
+        1500,
+        name="front",
+    ),
+    Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
 )
 LINE = "front", "rear", "wheelbase"
 
@@ -98,14 +104,14 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         count = turns(setup, rate, track, 3)
         around = setup.turn(side * 2 * math.pi * count, rate, track)
         to = "left" if side > 0 else "right"
-        words = f"It turns {count} times round to the {to}, {how}."
+        words = f"The robot turns {count} full circles to the {to}, {how}."
         measure = Slant("angle", *LINE, since=since)
         return Leg(how, words, (SETTLE, around, SETTLE), TO_LINE, (measure,))
 
     around = once_round(
         setup,
-        "when it has turned once round and looks along the line as before; 20 deg too far or too "
-        "short do not matter.",
+        "when it has turned one full circle and faces along the line as before; 20 deg too far or "
+        "too short do not matter.",
         TO_LINE,
         Slant("turned", *LINE, since="ahead", plus=2 * math.pi, over=("back", ROUND)),
     )
@@ -113,16 +119,19 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "ahead",
             f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
-            "middle (a joint of tiles, a board, chalk). Set the robot to the right of the line, "
-            f"about 300 mm off, its middle {setup.from_edge:.2f} m from the near edge, looking "
-            "along the line, so that its front left and rear left wheel are equally far from it, "
-            "to the millimetre. Mark where one wheel stands. Do not move it by hand until all is "
-            f"done. It drives {setup.length:.2f} m straight ahead.",
+            "middle (a joint of tiles, a board, chalk). Place the robot to the right of the line, "
+            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the near edge, facing "
+            "along the line, so that its front left and rear left wheel have the same distance "
+            "from the line, to the millimetre. Mark where one wheel stands. Do not move the robot "
+            "by hand until the calibration is done. The robot drives "
+            f"{setup.length:.2f} m straight ahead.",
             (SETTLE, setup.ahead(setup.length), SETTLE),
             (FROM_MARK, *TO_LINE),
             (DISTANCE, Slant("angle", *LINE)),
         ),
-        Leg("back", "It drives back to the middle.", (setup.ahead(-setup.to_middle), SETTLE)),
+        Leg(
+            "back", "The robot drives back to the middle.", (setup.ahead(-setup.to_middle), SETTLE)
+        ),
         around,
         spun("slowly", -1, 0.6, ROUND),
         spun("fast", 1, 1.2, "slowly"),
@@ -147,8 +156,8 @@ SQUARE = (
 
 def _corners(end: str) -> tuple[Ask, Ask]:
     return (
-        Ask(f"From the wall to the robot's {end} left corner?", "mm", 0, 2500, name="left"),
-        Ask(f"And to its {end} right corner?", "mm", 0, 2500, name="right"),
+        Ask(f"How far is the robot's {end} left corner from the wall?", "mm", 0, 2500, name="left"),
+        Ask(f"How far is its {end} right corner from the wall?", "mm", 0, 2500, name="right"),
     )
 
 
@@ -166,8 +175,8 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         home = setup.ahead(setup.length - 2 * GAP_M)
         return Leg(
             f"half round to the {to}",
-            f"{SQUARE}. It drives away from the wall, turns half round to the {to}, and drives "
-            "back.",
+            f"{SQUARE}. The robot drives away from the wall, turns half a circle to the {to}, and "
+            "drives back.",
             (STOP, out, STOP, half, STOP, home, STOP),
             _corners("front"),
             (Slant("angle", *FRONT, plus=side * math.pi),),
@@ -177,7 +186,7 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         Leg(
             "out",
             f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the middle "
-            f"of that. It drives {setup.length:.2f} m away from the wall.",
+            f"of that floor. The robot drives {setup.length:.2f} m away from the wall.",
             (STOP, out, STOP),
             (
                 Ask(
@@ -189,12 +198,12 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         ),
         once_round(
             setup,
-            "when it has turned once round and looks straight away from the wall as before; 10 deg "
-            "too far or too short do not matter.",
+            "when it has turned one full circle and faces straight away from the wall as before; "
+            "10 deg too far or too short do not matter.",
         ),
         Leg(
             "home",
-            "It drives back towards the wall.",
+            "The robot drives back towards the wall.",
             (setup.ahead(GAP_M - setup.length), STOP),
             _corners("rear"),
             (Slant("turned", *REAR, plus=2 * math.pi, over=("out", ROUND, "home")),),
@@ -203,8 +212,8 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
         there_and_back("right", -1),
         Leg(
             "round at the wall",
-            f"{SQUARE}. It drives away from the wall, turns {count} times round to the right, and "
-            "drives back.",
+            f"{SQUARE}. The robot drives away from the wall, turns {count} full circles to the "
+            "right, and drives back.",
             (STOP, setup.ahead(OUT_M), STOP, around, STOP, setup.ahead(GAP_M - OUT_M), STOP),
             _corners("rear"),
             (Slant("angle", *REAR),),
@@ -227,12 +236,12 @@ def side_of_square(setup: Setup) -> float:
 
 def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     edge = side_of_square(setup)
-    marks = "How far ahead of its mark is the middle of its {} side (behind it: less than 0)?"
+    marks = "How far ahead of its mark is the middle of its {} side (negative if behind it)?"
     ends = (
         Ask(marks.format("left"), "mm", -1500, 1500, name="left"),
         Ask(marks.format("right"), "mm", -1500, 1500, name="right"),
         Ask(
-            "How far to the left of its marks is the robot (to the right: less than 0)?",
+            "How far to the left of its marks is the robot (negative if to the right)?",
             "mm", -1500, 1500, name="aside",
         ),
     )  # fmt: skip
@@ -241,10 +250,10 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
         corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
         return Leg(
             f"square to the {to}",
-            f"Set the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far from "
-            f"the {other} one, looking to the far edge. Mark on the floor exactly beside the "
-            f"middle of its left and of its right side. It drives a square of {edge:.2f} m, round "
-            f"to the {to}, and ends about where it began.",
+            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far "
+            f"from the {other} edge, facing the far edge. Make a mark on the floor exactly beside "
+            "the middle of its left side and of its right side. The robot drives a square of "
+            f"{edge:.2f} m with turns to the {to}, and ends about where it started.",
             (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
             ends,
             (
@@ -257,19 +266,19 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     return (
         Leg(
             "ahead",
-            f"{_at_the_edge(setup)} Mark where one wheel stands. It drives {setup.length:.2f} m "
-            "straight ahead.",
+            f"{_at_the_edge(setup)} Mark where one wheel stands. The robot drives "
+            f"{setup.length:.2f} m straight ahead.",
             (STOP, setup.ahead(setup.length), STOP),
             (FROM_MARK,),
             (DISTANCE,),
         ),
         once_round(
             setup,
-            "just when it has turned once round and looks as before; what it rolls on behind that "
-            "is asked for.",
+            "exactly when it has turned one full circle and faces as before; the tool asks how far "
+            "it turns on after that.",
             (
                 Ask(
-                    "How many degrees past once round does it look (short of it: less than 0)?",
+                    "How many degrees past a full circle did it turn (negative if less)?",
                     "deg", -90, 90, name="past",
                 ),
             ),
@@ -304,9 +313,9 @@ STRAIGHT = "straight"
 def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
     return Leg(
         STRAIGHT,
-        f"{_at_the_edge(setup)} Mark on the floor where one of its wheels stands. Do not move it "
-        f"by hand until all is done. It stands for {STANDING.seconds:g} s, then drives "
-        f"{setup.length:.2f} m straight ahead.",
+        f"{_at_the_edge(setup)} Mark on the floor where one of its wheels stands. Do not move the "
+        "robot by hand until the calibration is done. The robot stands for "
+        f"{STANDING.seconds:g} s, then drives {setup.length:.2f} m straight ahead.",
         (STANDING, setup.ahead(setup.length), PAUSE),
         asks,
     )
@@ -326,8 +335,8 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
         _straight(setup, (far,)),
         Leg(
             "turns",
-            "It drives back to the middle, turns on the spot to both sides, fast and slowly, and "
-            "drives three curves there and back.",
+            "The robot drives back to the middle, turns on the spot to both sides, fast and "
+            "slowly, and drives three curves there and back.",
             (*moves, PAUSE),
         ),
     )
@@ -343,8 +352,8 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
         _straight(setup),
         Leg(
             "turns",
-            "It drives back to the middle; then, again and again, it turns a part on the spot and "
-            "drives a curve there and back.",
+            "The robot drives back to the middle. Then it repeatedly turns a part of a circle on "
+            "the spot and drives a curve there and back.",
             tuple(moves),
         ),
     )
@@ -364,7 +373,9 @@ REAR_WIDTH = Ask(
     "How far apart are the robot's rear corners, where they touch the wall?", "mm", 50, 2000,
     name="rear width",
 )  # fmt: skip
-FRONT_WIDTH = Ask("And its front corners?", "mm", 50, 2000, name="front width")
+FRONT_WIDTH = Ask(
+    "How far apart are the robot's front corners?", "mm", 50, 2000, name="front width"
+)
 WIDTH = Ask("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
 
 WAYS: dict[str, Way] = {

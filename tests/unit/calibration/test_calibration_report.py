@@ -38,6 +38,6 @@ def test_of_a_scale_that_nothing_measured_nothing_is_written() -> None:
 def test_people_are_told_what_it_improves_and_what_remains() -> None:
     told = plain(*parts(REPORT, FOUND, "acsard.toml"), width=SENTENCES)
     assert "wheel_separation_multiplier   " in told
-    assert f"a turn of 360 deg ends {REPORT.turn_error_before:.0f} deg off now" in told
+    assert f"error of a turn of 360 deg: {REPORT.turn_error_before:.0f} deg now" in told
     assert "what remains" in told
     assert "--distance METRES" in told

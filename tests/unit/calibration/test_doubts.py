@@ -71,7 +71,7 @@ WRONG = {
         ("latitude", False, True, "latitude and longitude"),
         ("another clock", True, False, "times of one clock"),
         ("another clock", True, True, "times of one clock"),
-        ("later", True, False, "does not follow what the wheels do"),
+        ("later", True, False, "does not follow the wheels"),
     ],
 )
 def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: str) -> None:
@@ -102,7 +102,7 @@ def odometry(robot: Drive) -> Drive:
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
 def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> None:
     log = odometry(DRIVE).csv(gyro=gyro, places=places)
-    assert any("made of the same wheels" in note for note in calibrated(log).notes)
+    assert any("computed from the same wheels" in note for note in calibrated(log).notes)
     usual_log = DRIVE.csv(gyro=gyro, places=places)
     assert not any("same wheels" in note for note in calibrated(usual_log).notes)
 

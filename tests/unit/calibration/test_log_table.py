@@ -114,13 +114,13 @@ def test_runs_are_told_apart_by_any_name() -> None:
         (b"", "it is empty"),
         (b"# only this\n", "it is empty"),
         (LOG_HEADER, "no rows below the header"),
-        (b"1,2,3,4\n", "line 1 is numbers"),
+        (b"1,2,3,4\n", "line 1 contains numbers"),
         (b"t,left,right\n1,2,3\n", "nothing to compare the wheels with"),
         (b"t,fr,fl,rr,yaw_rate\n1,2,3,4,5\n", "no column left, right"),
         (b"t,left,right,yawrate\n1,2,3,4\n", "is yawrate it?"),
         (b"timestamp,left,right,yaw_rate\n1,2,3,4\n", "is timestamp it? rename it t"),
         (b"t left right yaw_rate\n1 2 3 4\n", "without commas"),
-        (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left is there twice"),
+        (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left exists twice"),
         (LOG_HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is no number'),
         (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
         (b"SQLite format 3\0\0\0", "not text"),
@@ -207,7 +207,7 @@ def test_what_others_write_is_the_same_table(how: str) -> None:
     [
         (written(point=",").encode(), "write numbers with a point"),
         (written(";").replace(".", "'").encode(), "write numbers with a point"),
-        (written().replace("0.", "12:00:00.").encode(), "a date, and t is in s"),
+        (written().replace("0.", "12:00:00.").encode(), "a date, but t must be in s"),
         (written(" ").encode(), "without commas"),
         (written().replace("yaw_rate", "gyro_z").encode(), "it must name yaw_rate"),
         (written().replace("t,l", "time_ms,l").encode(), "is time_ms it? rename it t, in s"),
@@ -287,8 +287,8 @@ def test_a_spike_counts_as_missing_and_a_fast_drive_does_not() -> None:
     assert np.flatnonzero(np.isnan(columns["yaw_rate"])).tolist() == [70]
     assert not np.isnan(columns["right"]).any()
     assert notes == [
-        "1 cell of left left out as impossible, like 900",
-        "1 cell of yaw_rate left out as impossible, like -40",
+        "1 cell of left left out because no robot has such a value, like 900",
+        "1 cell of yaw_rate left out because no robot has such a value, like -40",
     ]
 
 
@@ -296,7 +296,9 @@ def test_a_spike_is_found_between_rows_of_other_sensors() -> None:
     columns = table()
     columns["yaw_rate"][1::2] = np.nan
     columns["yaw_rate"][100] = 40.0
-    assert list(bounded(columns)) == ["1 cell of yaw_rate left out as impossible, like 40"]
+    assert list(bounded(columns)) == [
+        "1 cell of yaw_rate left out because no robot has such a value, like 40"
+    ]
 
 
 def mostly_standing(rng: np.random.Generator) -> dict[str, Floats]:
@@ -359,5 +361,5 @@ def test_the_keys_are_of_the_table() -> None:
 
 @pytest.mark.parametrize("message", [JointState(), ServiceReply(True, "")])
 def test_what_tells_nothing_of_wheels_or_turns_is_no_row(message: Message) -> None:
-    with pytest.raises(ValueError, match="no part of a log"):
+    with pytest.raises(ValueError, match="cannot be in a log"):
         row(message, 0)

@@ -93,7 +93,7 @@ def test_a_pause_of_a_day_parts_two_drives() -> None:
 
 
 def test_a_column_without_any_number_is_named() -> None:
-    with pytest.raises(LogError, match="column right has a number in no row"):
+    with pytest.raises(LogError, match="column right has no number in any row"):
         of([f"{i},1,,{i}," for i in range(100)])
 
 
@@ -104,8 +104,8 @@ FOUR = "t,fr,fl,rl,rr,yaw_rate\n"
     ("wheels", "words"),
     [
         ("0,9,9,9", "fr hardly turns while rr does"),
-        ("9,9,-9,9", "fl and rl turn opposite ways"),
-        ("9,9,-9,-9", "turn opposite ways"),
+        ("9,9,-9,9", "fl and rl turn in opposite directions"),
+        ("9,9,-9,-9", "turn in opposite directions"),
         ("9,9,0.1,9", "rl hardly turns while fl does"),
     ],
 )
@@ -121,7 +121,7 @@ def test_front_and_rear_that_differ_are_told() -> None:
 
 
 def test_a_run_for_each_row_is_none() -> None:
-    with pytest.raises(LogError, match="tells drives apart, not rows"):
+    with pytest.raises(LogError, match="must name drives, not rows"):
         of([f"{i / 100},{i},{i},{i},{i}" for i in range(2000)])
 
 
@@ -138,7 +138,7 @@ def test_wheels_of_few_counts_do_not_contradict_each_other() -> None:
 
 
 def test_a_log_without_wheels_is_refused() -> None:
-    with pytest.raises(LogError, match="column left has a number in no row"):
+    with pytest.raises(LogError, match="column left has no number in any row"):
         of([f"{i},,,{i}," for i in range(100)])
     with pytest.raises(LogError, match="no run has 20 rows"):
         of([f"{i},{i},{i},{i},{i}" for i in range(100)])
@@ -160,7 +160,7 @@ def test_positions_that_a_logger_says_again_until_the_next_one_are_taken_once() 
     moving = run.place_t >= 3.3
     assert np.diff(run.place_t[moving]) == pytest.approx(0.2)
     assert (run.place_t < 3.0).sum() == 1, "many of one sample would outweigh those on the way"
-    assert any("x y stay between samples" in note for note in log.notes)
+    assert any("x y repeat their value between samples" in note for note in log.notes)
 
 
 def test_a_position_of_the_way_is_none_of_the_rest_after_it() -> None:

@@ -32,7 +32,7 @@ def test_positions_that_know_better_give_way_little() -> None:
     assert made.values == pytest.approx(FOUND.values, rel=1e-3)
 
 
-@pytest.mark.parametrize(("run", "words"), [("turns", "from where it began"), ("no", "no run")])
+@pytest.mark.parametrize(("run", "words"), [("turns", "from its start"), ("no", "no run")])
 def test_a_run_that_gets_nowhere_is_refused(run: str, words: str) -> None:
     with pytest.raises(RefusedError, match=words):
         scaled(FOUND, Tape(5.0, run), NAMES, follow, known=False)

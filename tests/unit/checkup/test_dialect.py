@@ -143,7 +143,7 @@ def test_no_setting_is_advised_that_would_be_refused(period_s: float) -> None:
         rate = dialect.rate(board)
     assert (rate.verdict, rate.keys) == ("FAIL", {})
     assert "mcu.reply_period" not in rate.mend
-    assert rate.mend.endswith("every 0.25 s or sooner")
+    assert rate.mend.endswith("at least every 0.25 s")
 
 
 def test_what_is_advised_is_never_rounded_above_the_limit() -> None:

@@ -96,7 +96,7 @@ def test_a_wrong_key_is_found_by_the_speeds_alone_and_mended(configured: int) ->
         finding = encoder_counts.finding(board, [0])
     assert (finding.verdict, finding.keys) == ("FAIL", {"mcu.encoder_counts": 3200})
     assert finding.figure == f"3200, not {configured}"
-    assert "every distance would be off by" in finding.text
+    assert "every distance would be wrong by" in finding.text
 
 
 def test_counts_that_stand_while_the_wheels_turn_are_to_be_left_unused() -> None:

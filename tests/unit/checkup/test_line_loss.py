@@ -76,7 +76,7 @@ def test_plain_lines_that_come_damaged_turn_no_motor() -> None:
         known(board)
         with pytest.raises(StoppedError) as end:
             line_loss.finding(board)
-    assert "came damaged from the board, the last `" in end.value.finding.text
+    assert "arrived damaged from the board, the last `" in end.value.finding.text
     assert "ground" in end.value.finding.mend
     assert robot.mcu.vehicle.angles == [0.0] * 4
 
@@ -125,7 +125,7 @@ def found(board: Board, motors: list[int], lost: float = 0.2) -> Finding | None:
     [
         (5, 0, "0 back", "the computer's TX to the board's RX"),
         (0, 5, "0 of", "the board's TX to the computer's RX"),
-        (4, 3, "", "the ground of board and computer first"),
+        (4, 3, "", "first the ground of board and computer"),
     ],
 )
 def test_the_way_is_told_by_what_the_motors_did(

@@ -59,7 +59,7 @@ def test_a_motor_bears_its_name_and_the_figures_are_as_they_are_written() -> Non
     assert (found.name, found.verdict) == ("motor d (rear right)", "PASS")
     found = find("runaway: along", letter="a", told=3, seen=9.04, most=6.0, motor="motor a")
     assert found.figure == "a: told 3.0, seen 9.0 rad/s"
-    assert found.text == "the encoder of motor a says more than 6 rad/s"
+    assert found.text == "the encoder of motor a reports more than 6 rad/s"
 
 
 def test_a_runaway_against_the_command_is_crossed_leads() -> None:

@@ -500,7 +500,7 @@ def test_an_mcu_that_says_nothing_good_is_never_driven(fault: str) -> None:
 def test_mute_noise_and_half_lines_are_three_mends_with_what_was_heard() -> None:
     found = {fault: check(fault)["baud rate"] for fault in ("mute", "noise", "partial_line")}
     assert len({finding.mend for finding in found.values()}) == 3
-    assert "TX and RX crossed" in found["mute"].mend
+    assert "TX and RX swapped" in found["mute"].mend
     assert "nothing was received" in found["mute"].text
     assert "ground" in found["noise"].mend
     assert r"`\x00\xff~ap00.00,bp00.00" in found["noise"].text
@@ -541,7 +541,7 @@ def test_what_it_does_is_said_before_it_takes_time() -> None:
     procedure.run(robot, Listener(), robot.config, lambda finding: said.append(finding.name))
     told = [n for n, text in enumerate(said) if text in ("baud rate", "lost lines", "watchdog")]
     assert all(said[n - 1] not in procedure.STEPS for n in told)
-    turned = [text.split()[1] for text in said if " turns: a moment first" in text]
+    turned = [text.split()[1] for text in said if " turns: briefly" in text]
     assert turned == list(MOTORS)
 
 
@@ -624,11 +624,9 @@ def test_a_computer_that_is_late_blames_no_board_and_proposes_nothing(
     assert set(checked.changes) <= {"mcu.link_check", "mcu.encoder_counts"}
     for finding in checked.findings:
         if finding.figure == "not judged":
-            assert (
-                finding.text
-                == f"this computer was late by up to {1000 * late_s:.0f} ms: not judged"
-            )
-            assert "real-time rights" in finding.mend
+            late = f"this computer was late by up to {1000 * late_s:.0f} ms"
+            assert finding.text == f"{late}, so the check does not judge this"
+            assert "real-time priority" in finding.mend
     assert not checked.left_turning
 
 

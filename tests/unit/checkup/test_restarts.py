@@ -177,7 +177,7 @@ def test_a_board_that_does_not_come_back_is_said_not_to_have() -> None:
         ("brown-out", "a supply for the board alone"),
         ("power", "a supply for the board alone"),
         ("watchdog", "where does the firmware wait"),
-        ("pin", "a second program that opens the port"),
+        ("pin", "does a second program open the port"),
         ("unknown", "a weak supply"),
     ],
 )
@@ -221,7 +221,7 @@ def test_its_name_is_a_restart_unless_it_was_asked_for() -> None:
     restarts = heard(reply(0.0, 0))
     restarts.asked(1.0)
     assert restarts.look(NAME, 1.0 + ASKED_S, None) is None
-    assert sign(restarts.look(NAME, 1.1 + ASKED_S, None)) == "it named itself, unasked"
+    assert sign(restarts.look(NAME, 1.1 + ASKED_S, None)) == "it sent its name without a request"
 
 
 def test_a_text_is_a_restart_after_a_silence_and_a_debug_print_before_one() -> None:

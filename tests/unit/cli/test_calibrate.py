@@ -34,7 +34,7 @@ def test_people_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert called(tmp_path, GOOD) == 0
     out = capsys.readouterr().out
     assert "wheel_separation_multiplier" in out
-    assert "a turn of 360 deg ends" in out
+    assert "error of a turn of 360 deg" in out
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
 

@@ -108,7 +108,10 @@ def test_what_the_simulator_shows_is_not_offered_for_a_robot_s_file(
         found = json.loads(out)
         assert (found["changes"], found["toml"]) == ({}, "")
     else:
-        assert f"nothing is for {tmp_path / 'acsard.toml'}: the simulator was checked" in out
+        assert (
+            f"nothing to write into {tmp_path / 'acsard.toml'}: the tool checked the simulator"
+            in out
+        )
         assert "encoder_counts =" not in out
 
 
@@ -228,7 +231,7 @@ def test_a_person_is_asked_until_the_answer_is_one(
     out, err = capsys.readouterr()
     assert out == ""
     assert "which? [fr/rl/q]" in err
-    assert "please type fr or rl; q leaves" in err
+    assert "please type fr or rl; q quits" in err
 
 
 def on_terminal(columns: int, do: Callable[[], object], monkeypatch: pytest.MonkeyPatch) -> str:
@@ -295,7 +298,7 @@ def test_who_is_asked_whether_the_wheels_are_lifted_is_told_the_way_out(
     robot = Robot()
     with pytest.raises(KeyboardInterrupt):
         procedure.run(robot, TerminalPrompt(), robot.config, lambda finding: None)
-    assert "q or Ctrl-C leaves" in capsys.readouterr().err
+    assert "q or Ctrl-C quits" in capsys.readouterr().err
     assert not any(robot.later())
 
 

@@ -199,7 +199,7 @@ def test_a_time_of_day_is_found_over_midnight_for_a_table_and_for_pictures(
     assert abs(rows["old"] + rows["new"] - rows["all"]) <= 1
     assert 1.2 < rows["new"] / rows["old"] < 1.8  # 3 s and 2 s, and one start
     assert log(capsys, tmp_path, "report", "1", "new.html", "--from", "00:00")[0] == 0
-    assert re.search(r"<dt>How long</dt><dd>(2\.9|3) s", (tmp_path / "new.html").read_text())
+    assert re.search(r"<dt>Duration</dt><dd>(2\.9|3) s", (tmp_path / "new.html").read_text())
 
 
 @pytest.mark.parametrize("cut", [False, True])

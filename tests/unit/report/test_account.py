@@ -13,14 +13,14 @@ from tests.unit.report.driven import course_of, drive_of_two
 def test_the_summary_says_how_far_how_fast_and_who_stopped_it() -> None:
     course, _ = drive_of_two()
     text = summary(course)
-    assert text.startswith(f"It drove {course.metres:.2f} m in ")
+    assert text.startswith(f"The robot drove {course.metres:.2f} m in ")
     assert f"at most {course.fastest.linear:.2f} m/s and {course.fastest.angular:.2f} rad/s" in text
     assert text.endswith("There were no faults, 1 stop (by unnamed (native)).")
 
 
 def test_a_robot_that_stood_did_not_drive() -> None:
     course, _ = course_of(lambda world: world.run(0.5))
-    assert summary(course).startswith("It did not drive in these 0.5 s.")
+    assert summary(course).startswith("The robot did not drive in these 0.5 s.")
 
 
 def test_a_fault_is_told_with_its_time_and_its_words() -> None:

@@ -47,7 +47,7 @@ def test_no_two_signs_of_a_picture_look_alike() -> None:
 
 
 def test_a_curve_that_another_may_hide_is_seen_beneath_it(figures: dict[str, Figure]) -> None:
-    for name, beneath in (("speeds", "limited"), ("wheels", "asked"), ("link", "sent")):
+    for name, beneath in (("speeds", "limited"), ("wheels", "commanded"), ("link", "sent")):
         widths = {one["name"]: one["line"]["width"] for one in figures[name].data}
         below = [one["name"] for one in figures[name].data].index(beneath)
         above = figures[name].data[below + 1]["name"]

@@ -43,7 +43,7 @@ BEFORE = replace(
 )
 INFO = Info("acsar", "0.1.0", 7, "/dev/acsar", False, 100.0, [], [])
 SEEN = ScreenData(
-    "acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q leaves", passed=1.05
+    "acsar", "tcp/127.0.0.1:7448", STATE, BEFORE, 0.05, INFO, 0, "q quits", passed=1.05
 )
 
 

@@ -29,7 +29,7 @@ It clears the screen, sets the title, is markup, reverses direction, colours and
 
 def test_the_head_says_who_where_and_how_fresh() -> None:
     head = lines_of(SEEN)[0]
-    for told in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q leaves"):
+    for told in ("acsar", "tcp/127.0.0.1:7448", "0.1.0", "seen 0.1 s ago", "q quits"):
         assert told in head
 
 
@@ -189,7 +189,7 @@ def test_any_state_fits_any_terminal_and_is_harmless_there(
     width: int,
     height: int,
 ) -> None:
-    seen = ScreenData(robot_id, endpoint, state, before, age, INFO, 0, "q leaves")
+    seen = ScreenData(robot_id, endpoint, state, before, age, INFO, 0, "q quits")
     told = lines_of(seen, width, height)
     assert len(told) <= height
     assert max(map(cell_len, told)) <= width

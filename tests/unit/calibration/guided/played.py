@@ -117,7 +117,7 @@ class Player:
             if told in words:
                 return value
         for told, value in (
-            ("Front left wheel", 0.3 - LENGTH * half), ("Rear left", 0.3 + LENGTH * half),
+            ("front left wheel", 0.3 - LENGTH * half), ("rear left wheel", 0.3 + LENGTH * half),
             ("rear left corner", 0.3 - WIDTH * half), ("rear right corner", 0.3 + WIDTH * half),
             ("front left corner", 0.3 + WIDTH * half), ("front right corner", 0.3 - WIDTH * half),
             ("its left side", self.place.real - WIDTH * half),

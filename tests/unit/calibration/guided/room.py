@@ -42,7 +42,7 @@ def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
     drive: list[Leg] = []
     for leg in reversed(WAYS[way].legs(setup, track)):
         drive.insert(0, leg)
-        if any(words in leg.words for words in ("Push", "Set the robot")):
+        if any(words in leg.words for words in ("Push", "Place the")):
             edge = setup.reach + (0.0 if way == "wall" else 0.1)
             yield starts.get(leg.name, (complex(edge, SIDE / 2), 0.0)), drive
             drive = []

@@ -31,7 +31,7 @@ def test_people_read_it_and_the_configuration_takes_it() -> None:
     made = calibrated("a tape", readings(), DRIVE)
     told = plain(*parts(report("the drive", made, DRIVE, ""), made, "acsard.toml"))
     assert "compared with a tape" in told
-    assert "a turn of 360 deg ends" in told
+    assert "error of a turn of 360 deg" in told
     config = parse("\n".join(excerpt(keys(made))).encode())
     assert config.drive.wheel_separation_multiplier == pytest.approx(1.5, rel=0.02)
     assert 0 < config.odometry.wheel_separation_multiplier_std < 0.2
@@ -39,5 +39,5 @@ def test_people_read_it_and_the_configuration_takes_it() -> None:
 
 def test_readings_that_tell_too_little_are_refused() -> None:
     vague = [Reading(one.rides, one.what, one.value, 100 * one.deviation) for one in readings()]
-    with pytest.raises(RefusedError, match="of no use"):
+    with pytest.raises(RefusedError, match="too inaccurate"):
         calibrated("a tape", vague, DRIVE)

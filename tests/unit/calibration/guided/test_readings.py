@@ -164,5 +164,5 @@ def test_one_turn_tells_the_track_whatever_is_configured(chi: float, multiplier:
 
 def test_a_turn_that_was_no_whole_one_is_told() -> None:
     half = once(2.4)
-    with pytest.raises(GuideError, match="one whole turn"):
+    with pytest.raises(GuideError, match="one full circle"):
         effective(Reading(half.rides, "turned", math.pi, 0.01), DriveConfig())

@@ -176,7 +176,7 @@ class Hasty(Player):
 
 
 def test_a_first_turn_that_was_ended_half_way_is_found_out() -> None:
-    with pytest.raises(GuideError, match="one whole turn"):
+    with pytest.raises(GuideError, match="one full circle"):
         play("tape", Hasty(Robot(chi=1.7)))
 
 
