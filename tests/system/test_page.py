@@ -912,7 +912,7 @@ def test_a_list_of_settings_has_no_space_and_says_why(page: Phone) -> None:
     until(lambda: len(browser.js(lists)) >= 2, 10.0, "the lists")
     assert not any(" " in one for one in browser.js(lists))
     labels = f"{fields}.filter(one => one.value.includes(',')).map(one => one.labels[0].innerText)"
-    assert all("no space, which is STOP" in one for one in browser.js(labels))
+    assert all("because Space is STOP" in one for one in browser.js(labels))
     browser.js(f"{fields}.find(one => one.value.includes(',')).focus()")
     browser.key("Down", "Space", " ")
     browser.key("Up", "Space", " ")

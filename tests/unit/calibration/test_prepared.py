@@ -66,7 +66,7 @@ def test_one_movement_only_is_refused_with_what_to_drive(
 def test_little_of_it_is_refused() -> None:
     with pytest.raises(RefusedError, match="57 deg"):
         turns_enough(np.array([0.5, -0.5]))
-    with pytest.raises(RefusedError, match="8 s only"):
+    with pytest.raises(RefusedError, match="only 8 s"):
         drives_enough([Block(0, 0, 4)] * 2)
 
 

@@ -37,7 +37,7 @@ def test_repeated_times_are_taken_once_and_told() -> None:
 def test_a_time_that_begins_anew_begins_a_run() -> None:
     names, ends, notes = of(rows(0, 500) + rows(0, 300))
     assert (names, len(ends)) == (["1", "2"], 2)
-    assert any("begins anew" in note for note in notes)
+    assert any("time restarts" in note for note in notes)
 
 
 def test_halves_of_a_drive_in_the_wrong_order_stay_one_run() -> None:

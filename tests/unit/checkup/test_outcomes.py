@@ -58,7 +58,7 @@ def test_a_motor_bears_its_name_and_the_figures_are_as_they_are_written() -> Non
     found = find("motor: right", name="motor d (rear right)", figure="+3.00 -3.00 rad/s")
     assert (found.name, found.verdict) == ("motor d (rear right)", "PASS")
     found = find("runaway: along", letter="a", told=3, seen=9.04, most=6.0, motor="motor a")
-    assert found.figure == "a: told 3.0, seen 9.0 rad/s"
+    assert found.figure == "a: commanded 3.0, measured 9.0 rad/s"
     assert found.text == "the encoder of motor a reports more than 6 rad/s"
 
 

@@ -135,8 +135,8 @@ TEN: list[tuple[str, str, str, str, str, dict[str, object]]] = [
      "trailing_comma = true", {"mcu.trailing_comma": True}),
     ("no_watchdog", "watchdog", "FAIL", "run on", "300 ms", {}),
     ("watchdog_fed_by_bad_lines", "watchdog", "FAIL", "half-broken cable", "whole valid line", {}),
-    ("late_watchdog", "watchdog", "FAIL", "1.0 s after", "300 ms", {}),
-    ("stuck_encoder=b", "motor b", "FAIL", "a dead encoder", "look whether", {}),
+    ("late_watchdog", "watchdog", "FAIL", "drives on for 1.0 s", "300 ms", {}),
+    ("stuck_encoder=b", "motor b", "FAIL", "the encoder is dead", "watch the wheel", {}),
     ("wrong_baud=57600", "baud rate", "FAIL", "at 57600", "baud_rate = 57600",
      {"mcu.baud_rate": 57600}),
     ("sparse_replies", "reply rate", "FAIL", "one reply in", "reply_period = 0.1",
@@ -227,7 +227,7 @@ def test_a_dead_motor_is_told_from_a_dead_encoder_by_who_sees_the_wheel(
 ) -> None:
     checked = check("plain_only", f"{part}={letter}", person=True)
     assert len(checked.failed) == 1
-    says = "does not turn" if part == "dead_motor" else "a dead encoder"
+    says = "does not turn" if part == "dead_motor" else "the encoder is dead"
     assert says in checked[f"motor {letter}"].text
 
 
@@ -769,7 +769,7 @@ def test_what_a_later_step_could_judge_is_told_though_an_earlier_one_could_not()
 
     class Sees(Nobody):
         def doing(self, text: str) -> None:
-            if "once more" not in text:
+            if "runs again" not in text:
                 robot.looked = text.startswith("trying the comma")
 
     robot = Refuses("plain_only", late_s=0.05, every=3)

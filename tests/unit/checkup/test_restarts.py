@@ -63,7 +63,7 @@ def test_a_board_that_starts_anew_fails_by_that_and_nothing_else_is_blamed(
 ) -> None:
     checked = Checked(Restarting([at_s], *faults))
     assert checked.failed == ["restarts"]
-    assert checked["restarts"].figure == "started anew"
+    assert checked["restarts"].figure == "restarted"
     assert f"while {when}" in checked["restarts"].text
     assert "supply" in checked["restarts"].mend
     assert "DTR" in checked["restarts"].mend
@@ -88,7 +88,7 @@ def test_all_else_is_found_as_if_it_had_not_started_anew(
 def test_new_starts_are_counted_and_told_with_what_was_going_on(faults: tuple[str, ...]) -> None:
     checked = Checked(Restarting([1.0, 9.0, 20.0], *faults))
     assert checked.failed == ["restarts"]
-    assert checked["restarts"].figure == "started anew, 3 times"
+    assert checked["restarts"].figure == "restarted, 3 times"
     assert "everything stood" in checked["restarts"].text
     assert "motor " in checked["restarts"].text
     assert not checked.left_turning
@@ -126,7 +126,7 @@ def test_a_supply_that_gives_in_each_time_a_motor_turns_is_named_and_not_tried_f
     assert checked["motor a"].verdict == "PASS"
     assert robot.starts == 1 + AGAIN
     found = checked["restarts"]
-    assert found.figure == "started anew, twice"
+    assert found.figure == "restarted, twice"
     assert "while motor b (front left) turned, twice" in found.text
     assert found.mend.startswith("a supply for the board alone")
 
@@ -255,7 +255,7 @@ def test_a_clock_that_began_again_is_a_restart(before_ms: int) -> None:
     restarts = heard(reply(10.0, before_ms))
     again = reply(12.1, 100)
     gone_ms = (100 - before_ms) % CLOCK
-    assert ("began again" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
+    assert ("restarted" in sign(restarts.look(b"", again.at_s, again))) == (gone_ms > 4100)
 
 
 def test_it_is_told_what_turned_and_for_how_long_nothing_was_sent_when_it_was_heard_last() -> None:
