@@ -207,7 +207,7 @@ def rate(board: Board) -> Finding:
         f"reply rate: {outcome}",
         keys if 3 * gap_s > 1.1 * unset_s and not rare else {},
         rate=1 / gap_s,
-        way="by its own clock" if board.own_clock else "as answers",
+        way="by its own clock" if board.own_clock else "as answers to lines",
         longest=max(gaps) * 1000,
         answered=answered,
         gap=gap_s * 1000,
