@@ -99,7 +99,7 @@ def test_a_number_that_a_sign_spoils_is_none() -> None:
     assert table.columns["t"].tolist() == [1.0, 3.0]
     assert np.isnan(table.columns["left"][1])
     assert np.isnan(table.columns["right"][1])
-    assert "no number" in table.notes[0]
+    assert "not a number" in table.notes[0]
 
 
 def test_runs_are_told_apart_by_any_name() -> None:
@@ -115,13 +115,13 @@ def test_runs_are_told_apart_by_any_name() -> None:
         (b"# only this\n", "it is empty"),
         (LOG_HEADER, "no rows below the header"),
         (b"1,2,3,4\n", "line 1 contains numbers"),
-        (b"t,left,right\n1,2,3\n", "nothing to compare the wheels with"),
+        (b"t,left,right\n1,2,3\n", "no column with which to compare the wheels"),
         (b"t,fr,fl,rr,yaw_rate\n1,2,3,4,5\n", "no column left, right"),
         (b"t,left,right,yawrate\n1,2,3,4\n", "is yawrate it?"),
         (b"timestamp,left,right,yaw_rate\n1,2,3,4\n", "is timestamp it? rename it t"),
         (b"t left right yaw_rate\n1 2 3 4\n", "no commas between"),
         (b"t,left,right,left,x,y\n1,2,3,4,5,6\n", "left exists twice"),
-        (LOG_HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is no number'),
+        (LOG_HEADER + b"1,2,three,4\n", 'line 2, column right: "three" is not a number'),
         (LOG_HEADER + b"1,2,3,4,5\n", "line 2 has 5 cells, the header 4"),
         (b"SQLite format 3\0\0\0", "not text"),
     ],
@@ -135,7 +135,7 @@ def test_a_refusal_says_where_and_what(data: bytes, words: str) -> None:
 def test_few_bad_rows_are_left_out_and_told() -> None:
     table = read(LOG_HEADER + b"1,2,3,4\n" * 50 + b"1,2,3,x\n" + b"1,2")
     assert len(table.columns["t"]) == 51
-    assert table.notes == ('1 row left out: line 52, column yaw_rate: "x" is no number',)
+    assert table.notes == ('1 row left out: line 52, column yaw_rate: "x" is not a number',)
 
 
 def test_many_bad_rows_refuse_the_file() -> None:

@@ -76,5 +76,5 @@ def test_what_comes_out_of_no_use_is_refused() -> None:
         sure_enough(unsure, 0.01)
     with pytest.raises(RefusedError, match="effective track"):
         sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
-    with pytest.raises(RefusedError, match="told apart"):
+    with pytest.raises(RefusedError, match="cannot be separated"):
         told_apart(np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]]))

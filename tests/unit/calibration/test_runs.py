@@ -60,14 +60,14 @@ def test_rows_without_a_time_are_told() -> None:
 
 @pytest.mark.parametrize("rate", [20, 100, 500, 1000])
 def test_milliseconds_are_told_from_seconds(rate: int) -> None:
-    with pytest.raises(LogError, match="t is in seconds"):
+    with pytest.raises(LogError, match="t must be in seconds"):
         of(rows(0, step=1000.0 / rate))
 
 
 @pytest.mark.parametrize("per_second", [1e6, 1e9])
 def test_stamps_in_ns_and_us_since_1970_are_told_from_seconds(per_second: float) -> None:
     lines = [f"{(1.7e9 + i / 100) * per_second:.0f},{i},{i},{i}," for i in range(100)]
-    with pytest.raises(LogError, match="t is in seconds"):
+    with pytest.raises(LogError, match="t must be in seconds"):
         of(lines)
 
 

@@ -128,7 +128,7 @@ def test_a_supply_that_gives_in_each_time_a_motor_turns_is_named_and_not_tried_f
     found = checked["restarts"]
     assert found.figure == "restarted, twice"
     assert "while motor b (front left) turned, twice" in found.text
-    assert found.mend.startswith("a supply for the board alone")
+    assert found.mend.startswith("use a supply for the board alone")
 
 
 class Resetting(Robot):
@@ -174,11 +174,11 @@ def test_a_board_that_does_not_come_back_is_said_not_to_have() -> None:
 @pytest.mark.parametrize(
     ("cause", "mend"),
     [
-        ("brown-out", "a supply for the board alone"),
-        ("power", "a supply for the board alone"),
+        ("brown-out", "use a supply for the board alone"),
+        ("power", "use a supply for the board alone"),
         ("watchdog", "where does the firmware wait"),
         ("pin", "does a second program open the port"),
-        ("unknown", "a weak supply"),
+        ("unknown", "is the supply weak"),
     ],
 )
 def test_what_the_board_says_that_it_booted_for_is_taken(cause: str, mend: str) -> None:
@@ -194,7 +194,7 @@ def test_what_the_board_says_that_it_booted_for_is_taken(cause: str, mend: str) 
 
 def test_causes_that_differ_leave_it_open() -> None:
     starts = [Restart("a sign", cause=one) for one in ("pin", "watchdog")]
-    assert finding(Config().mcu, starts).mend.startswith("a weak supply")
+    assert finding(Config().mcu, starts).mend.startswith("is the supply weak")
 
 
 def reply(at_s: float, mcu_ms: int) -> Reply:

@@ -57,7 +57,7 @@ class Player:
     drives: list[Drive] = field(default_factory=list)
 
     def ride(self, leg: Leg) -> Run:
-        if any(words in leg.words for words in ("Push", "Mark", "Set")):
+        if any(words in leg.words for words in ("Push", "Mark", "Place")):
             rng = self.robot.rng
             self.yaw = math.atan2(float(rng.normal(0, READ_M * math.sqrt(2))), LENGTH)
             self.place = 0j
