@@ -75,4 +75,4 @@ def test_what_it_was_started_with_is_not_asked_for_again(tmp_path: Path) -> None
     with Daemon(tmp_path, before=[*as_a_service, *without]) as daemon:
         assert os.sched_getparam(daemon.pid).sched_priority == 5
         (event,) = daemon.events("real_time")
-    assert "no permission for locked memory:" in event["text"]
+    assert "no permission for locked memory," in event["text"]
