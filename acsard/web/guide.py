@@ -127,8 +127,7 @@ class Guide:
         """Start a child. Return "" or the reason for a refusal."""
         if self._errand is not None:
             return (
-                f"{self._errand.by} is doing a {self._errand.name} already; only one can run "
-                "at a time"
+                f"{self._errand.name} already runs ({self._errand.by}); only one can run at a time"
             )
         self._errand = _Errand(viewer, by, asked.begin, self._viewers[viewer])
         self._tell_all()

@@ -94,7 +94,7 @@ export class Guide {
   }
 
   #runs({ running, by, yours }) {
-    const busy = running && !yours ? `${NAMES[running]} is running, started by ${by}. Only one can run at a time.` : "";
+    const busy = running && !yours ? `${NAMES[running]} is running (${by}). Only one can run at a time.` : "";
     for (const id of ["check", "calibrate"]) [$(id).disabled, $(id).title] = [Boolean(running), busy];
     if (busy !== this.#busy) text("guide-note", (this.#busy = busy));
     if (!running || !yours) return;
