@@ -15,8 +15,6 @@ and that is known.
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
@@ -31,6 +29,10 @@ Floats = npt.NDArray[np.float64]
 
 TOGETHER = 0.8
 """Share of lines with equal values from which two wheels are assumed to have the same error."""
+
+
+LEAST_VALUES = 3
+"""Distinct speeds that are needed to find a quantization step. One or two prove nothing."""
 
 
 class Rounding(Struct, frozen=True):
@@ -83,10 +85,11 @@ def _runs(values: Floats) -> Floats:
 
 def _quantum(speeds: Floats) -> float:
     """Return the speed in rad/s of which all speeds are multiples, or 0 if there is none."""
-    seen = Counter(np.abs(speeds[speeds != 0.0]).tolist())
-    if not seen:
+    # A value that is held for a whole drive is no more evidence than one line of it.
+    seen = np.unique(np.abs(speeds[speeds != 0.0])).tolist()
+    if len(seen) < LEAST_VALUES:
         return 0.0
-    search = Search(seen)
+    search = Search(dict.fromkeys(seen, 1))
     while not search.go_on():
         pass
     return search.found.quantum if search.found is not None else 0.0
