@@ -19,7 +19,7 @@ from acsard.core.config.settings import Config
 from acsard.core.values import ROLES
 from acsard.daemon.bus.tls import CA
 from acsard.host.errors import Exit, ExitError
-from acsard.host.extras import install
+from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses
 
 if TYPE_CHECKING:
@@ -97,9 +97,7 @@ def _maker() -> type[Authority]:
     try:
         from acsard.certificates.authority import Authority
     except ImportError:
-        raise ExitError(
-            Exit.FAILURE, f"needs the library cryptography; run: {install('tls')}"
-        ) from None
+        raise missing("cryptography", "tls") from None
     return Authority
 
 

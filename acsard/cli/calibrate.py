@@ -1,6 +1,15 @@
-"""`acsard calibrate`: find wheel radii and effective track from a guided or a recorded drive.
-
-The package `calibration` computes them; `calibrate_drive.py` runs the guided drive.
+"""Measure the wheel radii and the effective track width, each with its standard deviation, and say
+how much they improve the odometry. Without --log the tool drives the robot and guides a person at
+this terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
+starts each leg with Enter, stops it with any key, and types the tape measurements that the tool
+asks for. The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box
+recording of a robot with a gyro, or a CSV file with a header. The CSV file has the column t (s) and
+the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro),
+or x and y (m, from any source of positions) with or without yaw (rad), or both. The column run (any
+name) separates several drives. The columns may be in any order, and a cell is empty if its sensor
+has no value then. A good log begins with 3 s of standing still. It contains straight drives, turns
+to both sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the
+values. Otherwise it is 1, and a message says what to do instead.
 """
 
 from __future__ import annotations
@@ -9,33 +18,28 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import msgspec
+
+from acsard.calibration.calibration_report import Refusal, keys, parts, report
+from acsard.calibration.doubts import RefusedError
+from acsard.calibration.guided.legs import GuideError
+from acsard.calibration.log_table import AS_CSV, LogError, noted, read
+from acsard.calibration.runs import runs
+from acsard.calibration.solve import Calibration, calibrate
+from acsard.calibration.tape_distance import Tape
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
-from acsard.cli.common import JSON_LINES, add_bus, load
+from acsard.cli.common import JSON_LINES, load
+from acsard.cli.connection import add_bus
+from acsard.core.config.settings import DriveConfig
 from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, ExitError, UsageError
-
-if TYPE_CHECKING:
-    from acsard.calibration.solve import Calibration
-    from acsard.calibration.tape_distance import Tape
-    from acsard.core.config.settings import DriveConfig
-    from acsard.prompts.json_prompt import JsonPrompt
-
-DESCRIPTION = """\
-Measure the wheel radii and the effective track width, each with its standard deviation, and say how
-much they improve the odometry. Without --log the tool drives the robot and guides a person at this
-terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m, starts
-each leg with Enter, stops it with any key, and types the tape measurements that the tool asks for.
-The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box recording
-of a robot with a gyro, or a CSV file with a header. The CSV file has the column t (s) and the wheel
-speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
-y (m, from any source of positions) with or without yaw (rad), or both. The column run (any name)
-separates several drives. The columns may be in any order, and a cell is empty if its sensor has no
-value then. A good log begins with 3 s of standing still. It contains straight drives, turns to both
-sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the values.
-Otherwise it is 1, and a message says what to do instead.
-"""
+from acsard.host.errors import Exit, ExitError, RecordingError, UsageError
+from acsard.prompts.json_prompt import JsonPrompt
+from acsard.prompts.prompt import NobodyError
+from acsard.recording.export import measured
+from acsard.recording.file import Recording
+from acsard.recording.mcap_records import MAGIC
+from acsard.terminal.output import SENTENCES, plain, show
 
 DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""
@@ -44,14 +48,8 @@ MOST_BYTES = 1 << 30
 """Largest log in bytes. The whole log is read into memory."""
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "calibrate",
-        help="measure wheel radii and effective track width, by a guided drive or from a "
-        "recorded one",
-        description=DESCRIPTION,
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_bus(parser)
     add_options(parser)
     parser.add_argument(
@@ -90,22 +88,12 @@ def main(args: argparse.Namespace) -> int:
             "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
             "asks them through a program. Leave one out"
         )
-    from acsard.prompts.json_prompt import JsonPrompt
 
     with JsonPrompt() as lines:
         return _calibrate(args, lines)
 
 
 def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
-    import msgspec
-
-    from acsard.calibration.calibration_report import Refusal, keys, parts, report
-    from acsard.calibration.doubts import RefusedError
-    from acsard.calibration.guided.legs import GuideError
-    from acsard.calibration.log_table import LogError
-    from acsard.prompts.prompt import NobodyError
-    from acsard.terminal.output import SENTENCES, plain, show
-
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
@@ -163,11 +151,6 @@ def _no_log(args: argparse.Namespace) -> argparse.Namespace:
 
 
 def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
-    from acsard.calibration.log_table import AS_CSV, LogError, noted, read
-    from acsard.calibration.runs import runs
-    from acsard.calibration.solve import calibrate
-    from acsard.recording.mcap_records import MAGIC
-
     if log.is_dir():
         raise LogError(f"it is a directory (perhaps a ROS bag): {AS_CSV}")
     try:
@@ -196,11 +179,6 @@ def _measured(log: Path) -> bytes:
 
     Raises `LogError` if the file is not a recording or if the recording has no gyro.
     """
-    from acsard.calibration.log_table import AS_CSV, LogError
-    from acsard.host.errors import RecordingError
-    from acsard.recording.export import measured
-    from acsard.recording.file import Recording
-
     try:
         recording = Recording(log)
     except RecordingError as error:
@@ -212,8 +190,6 @@ def _measured(log: Path) -> bytes:
 
 
 def _distance(text: str) -> Tape:
-    from acsard.calibration.tape_distance import Tape
-
     run, _, metres = text.rpartition("=")
     try:
         value = float(metres)

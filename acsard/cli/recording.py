@@ -1,4 +1,7 @@
-"""`acsard recording`: list, show, replay and export the recordings of the black box."""
+"""Work with the recordings that the daemon has made. Without a verb, list them, oldest first, with
+the main events of each. FILE is a recording or its number in that list (default: the newest
+recording).
+"""
 
 from __future__ import annotations
 
@@ -8,32 +11,39 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import msgspec
 
 from acsard.cli import recording_export, recording_report, recording_span
 from acsard.cli.common import load
 from acsard.cli.recording_progress import telling
 from acsard.core.formatting import json_line, many, printable
-from acsard.host.errors import Exit, ExitError
-
-if TYPE_CHECKING:
-    from acsard.recording.end_record import EndRecord
-    from acsard.recording.file import Recording
-    from acsard.recording.timeline import TimelineEntry
+from acsard.core.ros.shapes import how_often
+from acsard.host.errors import Exit, ExitError, RecordingError
+from acsard.recording.atomic_output import beside
+from acsard.recording.directory import listed
+from acsard.recording.end_record import EndRecord, closing, how_it_ends
+from acsard.recording.file import Gist, Recording, event_of, rewrite
+from acsard.recording.replayed import (
+    because,
+    compared,
+    config_of,
+    differs,
+    live,
+    otherwise,
+    steps,
+    verdict,
+)
+from acsard.recording.timeline import TimelineEntry, TimelineWriter
+from acsard.terminal.output import show
+from acsard.terminal.tables import table
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
 
-DESCRIPTION = """\
-Work with the recordings that the daemon has made. Without a verb, list them, oldest first, with the
-main events of each. FILE is a recording or its number in that list (default: the newest recording).
-"""
 
-
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb, its actions and their options."""
-    parser = verbs.add_parser("recording", help="list, show, replay, export and draw recordings",
-                              description=DESCRIPTION)  # fmt: skip
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions and their options."""
     _directory(parser, None)
     parser.set_defaults(main=list_all)
     inner = parser.add_subparsers(title="verbs", metavar="VERB")
@@ -91,12 +101,6 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 
 def list_all(args: argparse.Namespace) -> int:
     """Print a line for each recording."""
-    from acsard.host.errors import RecordingError
-    from acsard.recording.end_record import closing
-    from acsard.recording.file import Recording
-    from acsard.terminal.output import show
-    from acsard.terminal.tables import table
-
     where, files = _files(args)
     if not files:
         print(f"no recordings in {where}")
@@ -113,8 +117,6 @@ def list_all(args: argparse.Namespace) -> int:
 
 
 def _row(path: Path, last: EndRecord, note: str = "") -> tuple[str, ...]:
-    from acsard.recording.end_record import how_it_ends
-
     began = _clock(last.wall_ns / 1e9, day=True)
     seconds, size = (last.last_ns - last.wall_ns) / 1e9, path.stat().st_size / 1000
     said = last.said + _bracketed(how_it_ends(last.cut, last.why)) + note
@@ -123,9 +125,6 @@ def _row(path: Path, last: EndRecord, note: str = "") -> tuple[str, ...]:
 
 def _row_of_all(recording: Recording) -> tuple[str, ...]:
     """Return the row of a recording without an end. The whole recording must be read for it."""
-    from acsard.host.errors import RecordingError
-    from acsard.recording.file import Gist, event_of
-
     gist = Gist(recording.about)
     for topic, wall_ns, data in recording.messages():
         gist.message(topic, wall_ns, data)
@@ -148,8 +147,6 @@ def _state(recording: Recording) -> str:
 
 def _ending(recording: Recording) -> str:
     """Return why the recording ended other than by a normal end of the daemon, or ""."""
-    from acsard.recording.end_record import how_it_ends
-
     if not recording.ended:
         return "no end: cut off, or still being recorded"
     return how_it_ends(recording.cut, recording.why)
@@ -157,9 +154,6 @@ def _ending(recording: Recording) -> str:
 
 def show_one(args: argparse.Namespace) -> int:
     """Print the timeline of a recording."""
-    from acsard.recording.replayed import steps
-    from acsard.recording.timeline import TimelineEntry, TimelineWriter
-
     recording = _recording(args)
     begin, end = recording_span.span(args, recording)
     story, last = TimelineWriter(), recording.about.wall_ns / 1e9
@@ -181,8 +175,6 @@ def show_one(args: argparse.Namespace) -> int:
 
 
 def _tell(one: TimelineEntry, as_json: bool) -> None:
-    import msgspec
-
     if as_json:
         print(json_line(msgspec.json.encode(one).decode()))
     else:
@@ -194,16 +186,6 @@ def replay_one(args: argparse.Namespace) -> int:
 
     Returns 1 if they differ; with --config a difference is expected and it returns 0.
     """
-    from acsard.recording.replayed import (
-        because,
-        compared,
-        config_of,
-        differs,
-        live,
-        otherwise,
-        verdict,
-    )
-
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with telling(recording) as tell:
@@ -225,9 +207,6 @@ def replay_one(args: argparse.Namespace) -> int:
 
 def recover_one(args: argparse.Namespace) -> int:
     """Rewrite an unfinished or damaged recording as a finished file."""
-    from acsard.recording.atomic_output import beside
-    from acsard.recording.file import rewrite
-
     recording, new = _recording(args), Path(args.new)
     try:
         with beside(new, args.force) as part:
@@ -261,8 +240,6 @@ def report_one(args: argparse.Namespace) -> int:
 
 
 def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
-    from acsard.recording.directory import listed
-
     where = Path(args.directory or load(None)[1].record.directory or SERVICE)
     try:
         return where, listed(where)
@@ -282,8 +259,6 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
 
 
 def _recording(args: argparse.Namespace) -> Recording:
-    from acsard.recording.file import Recording
-
     name = args.file
     if name is not None and not re.fullmatch(r"\d{1,9}", name):
         return Recording(Path(name))
@@ -297,8 +272,6 @@ def _recording(args: argparse.Namespace) -> Recording:
 
 
 def _sentence(one: TimelineEntry) -> str:
-    from acsard.core.ros.shapes import how_often
-
     by = f" (by {one.by})" if one.by else ""
     times = how_often(one.text, one.count)
     mark = {"warning": "! ", "error": "!! "}.get(one.level, "")

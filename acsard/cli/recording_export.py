@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from acsard.cli import recording_span
 from acsard.cli.common import load
 from acsard.cli.recording_progress import telling
 from acsard.host.errors import Exit, ExitError
-
-if TYPE_CHECKING:
-    from acsard.recording.export import Kind
-    from acsard.recording.file import Recording
+from acsard.recording.export import SUFFIX, Kind, Span, export
+from acsard.recording.file import Recording
 
 DESCRIPTION = """\
 Write the messages of a recorded robot as a file for Foxglove, Lichtblick, PlotJuggler and `ros2 bag
@@ -65,8 +62,6 @@ def add(inner: argparse._SubParsersAction[argparse.ArgumentParser]) -> argparse.
 
 def export_one(recording: Recording, args: argparse.Namespace) -> str:
     """Write the file, print a summary, and return why it ends early, or "" if it is complete."""
-    from acsard.recording.export import Span, export
-
     kind: Kind = args.kind
     new = Path(args.new) if args.new else _name(recording.path, kind)
     span = Span(*recording_span.span(args, recording))
@@ -88,6 +83,4 @@ def _name(path: Path, kind: Kind) -> Path:
 
     The directory of the recordings belongs to the service.
     """
-    from acsard.recording.export import SUFFIX
-
     return Path(path.name.partition(".")[0] + SUFFIX[kind])

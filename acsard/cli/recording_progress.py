@@ -5,10 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from acsard.recording.file import Recording
+from acsard.recording.end_record import closing
+from acsard.recording.file import Recording
 
 
 @contextmanager
@@ -17,8 +16,6 @@ def telling(recording: Recording) -> Iterator[Callable[[int], None]]:
 
     The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
     """
-    from acsard.recording.end_record import closing
-
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
         return

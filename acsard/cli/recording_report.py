@@ -9,16 +9,21 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from acsard.cli import recording_span
 from acsard.cli.recording_progress import telling
 from acsard.core.values import NS_PER_S
+from acsard.host.child import end_with_parent
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import install
-
-if TYPE_CHECKING:
-    from acsard.recording.file import Recording
+from acsard.recording.atomic_output import beside
+from acsard.recording.end_record import closing
+from acsard.recording.file import Recording
+from acsard.recording.replayed import EVERY, Onlooker, verdict
+from acsard.report.account import Origin, notes
+from acsard.report.course import Course
+from acsard.report.page import page
 
 DESCRIPTION = """\
 Draw a recording as one HTML file that needs no network. Needs the library plotly; if it is missing,
@@ -71,8 +76,6 @@ def report_one(
     recording: Recording, args: argparse.Namespace, plotly: str, words: Words
 ) -> list[str]:
     """Write the report, print a summary, and return notes about the recording."""
-    from acsard.recording.atomic_output import beside
-
     if args.supervised:
         return _held(recording, args, plotly, words)
     new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
@@ -94,9 +97,6 @@ def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Wo
 
     The progress in percent goes to standard error.
     """
-    from acsard.host.child import end_with_parent
-    from acsard.recording.end_record import closing
-
     end_with_parent(signal.SIGKILL)
     last, began = closing(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
@@ -125,11 +125,6 @@ def _drawn(
 
     `tell` is called with the wall-clock time reached, in ns.
     """
-    from acsard.recording.replayed import EVERY, Onlooker, verdict
-    from acsard.report.account import Origin, notes
-    from acsard.report.course import Course
-    from acsard.report.page import page
-
     about, looked = recording.about, Onlooker(recording)
     began, (begin, end) = about.wall_ns / NS_PER_S, recording_span.span(args, recording)
     course = Course(looked.config, began + begin, began + end)

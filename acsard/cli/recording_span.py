@@ -12,12 +12,11 @@ import math
 import re
 import time
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from acsard.core.values import NS_PER_S, Instant
-
-if TYPE_CHECKING:
-    from acsard.recording.file import Recording
+from acsard.recording.file import Recording
+from acsard.recording.rows import BatchError, decode
 
 FILE_HELP = "a recording, or its number in the list of `acsard recording` (default: the newest)"
 """The help text of the recording that most actions of `acsard recording` take."""
@@ -116,8 +115,6 @@ def _from(recording: Recording, now: Instant) -> Stretch:
 
 def _instants(data: bytes) -> list[Instant]:
     """Return the time of each step in a message."""
-    from acsard.recording.rows import BatchError, decode
-
     try:
         return [step.inputs.now for step in decode(data)]
     except BatchError:
