@@ -38,10 +38,11 @@ from mcap.records import (
 )
 from msgspec import Struct
 
+from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import GROWING, Growing, Message
-from acsard.recording.end_record import END, EndRecord, Ns, fields
+from acsard.recording.end_record import END, EndRecord, Ns, fields, how_it_ends
 from acsard.recording.mcap_records import MAGIC, walk
 from acsard.recording.recorded_steps import UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, first_of
@@ -326,6 +327,30 @@ class Recording:
     def whole(self) -> bool:
         """True if the file has an end and nothing before it is damaged."""
         return self.ended and not self.damaged
+
+    @property
+    def ending(self) -> str:
+        """Why it ended other than by a normal end of the daemon, or "". Read it before."""
+        if not self.ended:
+            return "no end: cut off, or still being recorded"
+        return how_it_ends(self.cut, self.why)
+
+    @property
+    def missing(self) -> str:
+        """The damaged places and the ending in words, or "". Read it before."""
+        places = many(self.damaged, "damaged place is", "damaged places are")
+        damaged = f"{places} left out" if self.damaged else ""
+        return "; ".join(filter(None, [damaged, self.ending]))
+
+    def gist(self) -> EndRecord:
+        """Read the recording, and return the end record that it lacks."""
+        gist = Gist(self.about)
+        for topic, wall_ns, data in self.messages():
+            gist.message(topic, wall_ns, data)
+            if topic == "events":
+                with suppress(RecordingError):  # omit only the event that cannot be decoded
+                    gist.event(event_of(self, data))
+        return gist.closing()
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the topic, the wall-clock time in ns and the bytes of each message.

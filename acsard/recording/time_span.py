@@ -1,15 +1,12 @@
-"""`--from` and `--to` of `acsard recording`: a part of one, in seconds or by the time of day.
+"""A part of a recording, given in seconds or by the time of day.
 
 A recording may cross midnight, and its clock may be set in the middle of it. The time of day is
-therefore looked up in every stretch between two clock steps. The result is in seconds from the
-beginning of the recording.
+therefore looked up in every stretch between two clock steps.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
-import re
 import time
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,8 +15,24 @@ from acsard.core.values import NS_PER_S, Instant
 from acsard.recording.file import Recording
 from acsard.recording.rows import BatchError, decode
 
-FILE_HELP = "a recording, or its number in the list of `acsard recording` (default: the newest)"
-"""The help text of the recording that most actions of `acsard recording` take."""
+
+class Span(NamedTuple):
+    """A part of a recording, s after its beginning by the monotonic clock."""
+
+    begin: float = -math.inf
+    end: float = math.inf
+
+
+WHOLE = Span()
+
+
+def clock(seconds: float, day: bool = False) -> str:
+    """Return a time in s since 1970 as local time, to the ms or with the date."""
+    local = time.localtime(seconds)
+    if day:
+        return time.strftime("%Y-%m-%d %H:%M:%S", local)
+    return time.strftime("%H:%M:%S", local) + f".{int(seconds % 1 * 1000):03}"
+
 
 SET_NS = 5 * NS_PER_S
 """Difference between wall clock and monotonic clock that counts as a clock step, ns."""
@@ -35,28 +48,13 @@ class Stretch(NamedTuple):
     """End of the stretch, s since 1970, as is `begin`."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Add `--from` and `--to`."""
-    when = "seconds after the beginning of the recording, or the time of day: HH:MM, HH:MM:SS"
-    parser.add_argument("--from", dest="begin", type=_when, metavar="TIME", help=when)
-    parser.add_argument("--to", dest="end", type=_when, metavar="TIME", help=when)
-
-
-def _when(text: str) -> str:
-    if not re.fullmatch(r"\d+(\.\d+)?|\d\d:\d\d(:\d\d(\.\d+)?)?", text):
-        raise argparse.ArgumentTypeError(f"{text} is neither seconds nor HH:MM:SS")
-    return text
-
-
-def span(args: argparse.Namespace, recording: Recording) -> tuple[float, float]:
-    """Return the begin and the end of the part, s after the beginning of the recording.
-
-    An end that was not given is infinite.
-    """
-    texts = (args.begin, args.end)
-    found = stretches(recording) if any(":" in text for text in texts if text) else []
-    begin, end = (None if text is None else _seconds(text, found) for text in texts)
-    return -math.inf if begin is None else begin, math.inf if end is None else end
+def span(recording: Recording, begin: str | None, end: str | None) -> Span:
+    """Return the part of a recording between two times, each in seconds or as HH:MM:SS."""
+    found = stretches(recording) if any(":" in text for text in (begin, end) if text) else []
+    return Span(
+        -math.inf if begin is None else _seconds(begin, found),
+        math.inf if end is None else _seconds(end, found),
+    )
 
 
 def _seconds(text: str, found: list[Stretch]) -> float:
