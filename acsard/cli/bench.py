@@ -27,7 +27,7 @@ import msgspec
 
 from acsard.bench.measure import bench_config, measure
 from acsard.bench.results_table import parts
-from acsard.cli.common import Overrides, add_config, load, seconds
+from acsard.cli.common import add_config, load, seconds
 from acsard.daemon.serial.device import require
 from acsard.terminal.output import show
 
@@ -61,8 +61,7 @@ def main(args: argparse.Namespace) -> int:
     port = "" if args.port in (None, "sim") else args.port
     if port:
         require(port)
-    given: Overrides = {"control": {"rate": args.rate}} if args.rate is not None else {}
-    _, config = load(args.config, given)
+    _, config = load(args.config, {"control.rate": args.rate})
     # However this process is ended, the daemon and the far end of the port must end with it.
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)

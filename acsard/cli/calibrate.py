@@ -24,28 +24,20 @@ import msgspec
 from acsard.calibration.calibration_report import Refusal, keys, parts, report
 from acsard.calibration.doubts import RefusedError
 from acsard.calibration.guided.legs import GuideError
-from acsard.calibration.log_table import AS_CSV, LogError, noted, read
-from acsard.calibration.runs import runs
-from acsard.calibration.solve import Calibration, calibrate
+from acsard.calibration.log_table import LogError
+from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.tape_distance import Tape
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
-from acsard.cli.common import JSON_LINES, load
+from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus
-from acsard.core.config.settings import DriveConfig
 from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, ExitError, RecordingError, UsageError
+from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.prompts.json_prompt import JsonPrompt
 from acsard.prompts.prompt import NobodyError
-from acsard.recording.export import measured
-from acsard.recording.file import Recording
-from acsard.recording.mcap_records import MAGIC
 from acsard.terminal.output import SENTENCES, plain, show
 
 DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""
-
-MOST_BYTES = 1 << 30
-"""Largest log in bytes. The whole log is read into memory."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -66,16 +58,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "tape measure. It determines how large the wheels are. Without RUN it applies to "
         "the straightest run",
     )
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print one JSON object")
-    how.add_argument("--json-lines", action="store_true", help=JSON_LINES)
-    parser.add_argument(
-        "--write",
-        action="store_true",
-        help="also write the result into the configuration file and keep its comments (needs "
-        "the library tomlkit; if it is missing, a message gives the command that installs "
-        "it)",
-    )
+    add_outcome(parser, "the result")
     parser.set_defaults(main=main)
 
 
@@ -83,12 +66,7 @@ def main(args: argparse.Namespace) -> int:
     """Run the calibration and print its result."""
     if not args.json_lines or args.log:
         return _calibrate(args, None)
-    if args.yes:
-        raise UsageError(
-            "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
-            "asks them through a program. Leave one out"
-        )
-
+    require_asking(args)
     with JsonPrompt() as lines:
         return _calibrate(args, lines)
 
@@ -100,7 +78,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:
-            found, config = _calibrated(_only_log(args), mine.drive, args.distance), mine
+            found, config = calibrated(_only_log(args), mine.drive, args.distance), mine
         else:
             found, config = guided(_no_log(args), mine, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
@@ -148,45 +126,6 @@ def _no_log(args: argparse.Namespace) -> argparse.Namespace:
             "--distance goes with --log: a guided drive asks for the distances that it needs"
         )
     return args
-
-
-def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
-    if log.is_dir():
-        raise LogError(f"it is a directory (perhaps a ROS bag): {AS_CSV}")
-    try:
-        if log.stat().st_size > MOST_BYTES:
-            raise ExitError(
-                Exit.FAILURE, f"{log} is larger than 1 GiB: cut it; ten minutes are enough"
-            )
-        data = log.read_bytes()
-    except OSError as error:
-        raise ExitError(
-            Exit.FAILURE, f"cannot read {log}: {error.strerror}; correct --log"
-        ) from None
-    if data.startswith(MAGIC):
-        data = _measured(log)
-    table = read(data)
-    try:
-        driven = runs(table)
-    except LogError as error:
-        noted(error, table.notes)
-        raise
-    return calibrate(driven, drive, tape)
-
-
-def _measured(log: Path) -> bytes:
-    """Return the measurements of a black-box recording as a CSV table.
-
-    Raises `LogError` if the file is not a recording or if the recording has no gyro.
-    """
-    try:
-        recording = Recording(log)
-    except RecordingError as error:
-        raise LogError(f"{error}; {AS_CSV}") from None
-    try:
-        return measured(recording)
-    except RecordingError as error:
-        raise LogError(str(error)) from None
 
 
 def _distance(text: str) -> Tape:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
@@ -14,9 +14,7 @@ from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import RECORD, Config
 from acsard.core.formatting import many
 from acsard.host.config_file import find
-from acsard.host.errors import Exit, ExitError
-
-Overrides = dict[str, dict[str, object]]
+from acsard.host.errors import Exit, ExitError, UsageError
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -29,11 +27,32 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-JSON_LINES = (
-    "for a program that asks the operator: this tool writes its messages and questions to "
-    "standard output as JSON, one object per line, and reads the answers from standard "
-    "input in the same form (deploy/web/README.md)"
-)
+def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
+    """Add the options of a verb that asks a person and has a result for the configuration."""
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print one JSON object")
+    form.add_argument(
+        "--json-lines",
+        action="store_true",
+        help="for a program that asks the operator: this tool writes its messages and questions to "
+        "standard output as JSON, one object per line, and reads the answers from standard "
+        "input in the same form (deploy/web/README.md)",
+    )
+    parser.add_argument(
+        "--write",
+        action="store_true",
+        help=f"also write {result} into the configuration file and keep its comments (needs the "
+        "library tomlkit; if it is missing, a message gives the command that installs it)",
+    )
+
+
+def require_asking(args: argparse.Namespace) -> None:
+    """Raise `UsageError` if both `--yes` and `--json-lines` are given."""
+    if args.yes and args.json_lines:
+        raise UsageError(
+            "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines asks "
+            "them through a program. Leave one out"
+        )
 
 
 def count(text: str) -> int:
@@ -67,7 +86,7 @@ def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
     return number
 
 
-def by_environment() -> Overrides:
+def by_environment() -> dict[str, dict[str, object]]:
     """Return the configuration keys that the environment sets.
 
     `ACSARD_TLS` sets `bus.tls`: for example, systemd puts a service's credentials there.
@@ -75,14 +94,26 @@ def by_environment() -> Overrides:
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
 
-def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
+def tables(
+    options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
+) -> dict[str, dict[str, object]]:
+    """Return the tables of `before` with these values by dotted key; None leaves a key as it is."""
+    given = {table: dict(values) for table, values in before.items()}
+    for key, value in options.items():
+        if value is not None:
+            table, _, name = key.partition(".")
+            given.setdefault(table, {})[name] = value
+    return given
+
+
+def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
     """Return the path of the configuration and the configuration itself.
 
-    Prints every problem in it and raises `ExitError` if there are any.
+    `options` are values by dotted key, such as "mcu.port"; None leaves a key as it is. Prints every
+    problem in the configuration and raises `ExitError` if there are any.
     """
     where, text = find(path)
-    given = dict(overrides or {})
-    given["bus"] = {**by_environment().get("bus", {}), **given.get("bus", {})}
+    given = tables(options or {}, by_environment())
     try:
         return where, configuration.parse(text, given)
     except ConfigError as error:

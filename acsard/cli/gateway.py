@@ -33,9 +33,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the gateway until a signal ends it or until it must be restarted."""
-    given: dict[str, dict[str, object]] = {"robot": {"id": args.id}} if args.id else {}
-    if args.namespace is not None:
-        given["ros"] = {"namespace": args.namespace}
+    given = {"robot.id": args.id or None, "ros.namespace": args.namespace}
     where, config = load(args.config, given)
     if not config.bus.outside:
         raise UsageError(

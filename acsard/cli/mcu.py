@@ -13,7 +13,7 @@ from acsard.checkup import checkup_report, procedure
 from acsard.checkup.board import Wire
 from acsard.checkup.checkup_report import report, summary, withheld
 from acsard.checkup.findings import Finding
-from acsard.cli.common import JSON_LINES, Overrides, add_config, load
+from acsard.cli.common import add_config, add_outcome, load, require_asking
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
@@ -65,25 +65,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="with --yes: confirm that no wheel touches anything and that you watch the robot",
     )
-    how = check.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print one JSON object")
-    how.add_argument("--json-lines", action="store_true", help=JSON_LINES)
-    check.add_argument(
-        "--write",
-        action="store_true",
-        help="also write the found lines, and --port, into the configuration file and keep its "
-        "comments (needs the library tomlkit; if it is missing, a message gives the "
-        "command that installs it)",
-    )
+    add_outcome(check, "the found lines, and --port,")
     check.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the check and print its result."""
-    given: Overrides = {}
-    for key, value in (("port", args.port), ("baud_rate", args.baud_rate)):
-        if value is not None:
-            given.setdefault("mcu", {})[key] = value
+    given = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
     where, config = load(args.config, given)
     if args.write:
         writable(args.config)
@@ -143,11 +131,7 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
             "DEVICE`; `--port sim` checks the built-in simulator",
         )
     if args.json_lines:
-        if args.yes:
-            raise UsageError(
-                "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
-                "asks them through a program. Leave one out",
-            )
+        require_asking(args)
         return JsonPrompt()
     if not args.yes:
         if not sys.stdin.isatty():
@@ -158,7 +142,6 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
         return TerminalPrompt(args.json)
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
         return NoPrompt(args.json)
-
     master = master_of(port)
     if master is None or master.name != "acsard":
         what = f"a pty of {master.name}" if master else "no simulator of acsard's"
@@ -174,5 +157,4 @@ def _wire(config: Config) -> Wire:
     """Return the port, or the simulator in virtual time, with which no check has to wait."""
     if config.mcu.port == SIMULATOR:
         return VirtualWire(FakeMcu(config))
-
     return BlockingPort(config.mcu.port)

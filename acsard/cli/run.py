@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from acsard import __version__
-from acsard.cli.common import Overrides, add_config, load, recorded
+from acsard.cli.common import add_config, load, recorded
 from acsard.core.config.contradictions import warnings
 from acsard.core.config.settings import Config
 from acsard.core.values import ROOT, Event
@@ -70,26 +70,22 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(main=main)
 
 
-def overrides(args: argparse.Namespace) -> Overrides:
-    """Return the configuration keys given on the command line."""
-    given: Overrides = {}
-    for section, key, value in (
-        ("mcu", "port", args.port),
-        ("mcu", "baud_rate", args.baud_rate),
-        ("robot", "id", args.id),
-        ("ros", "namespace", args.namespace),
-        ("record", "directory", args.record),
-        ("bus", "listen", [args.listen] if args.listen else None),
-        ("bus", "connect", [args.connect] if args.connect else None),
-    ):
-        if value is not None:
-            given.setdefault(section, {})[key] = value
-    return given
+def options(args: argparse.Namespace) -> dict[str, object]:
+    """Return the configuration keys of the command line; None for one that is not given."""
+    return {
+        "mcu.port": args.port,
+        "mcu.baud_rate": args.baud_rate,
+        "robot.id": args.id,
+        "ros.namespace": args.namespace,
+        "record.directory": args.record,
+        "bus.listen": [args.listen] if args.listen else None,
+        "bus.connect": [args.connect] if args.connect else None,
+    }
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the daemon until a signal."""
-    where, config = load(args.config, overrides(args))
+    where, config = load(args.config, options(args))
     config = recorded(config)
     log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import Overrides, load, recorded, whole
+from acsard.cli.common import load, recorded, whole
 from acsard.cli.connection import add_bus
 from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
@@ -93,8 +93,7 @@ def main(args: argparse.Namespace) -> int:
         raise ExitError(
             Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
-    given: Overrides = {"record": {"directory": args.record}} if args.record else {}
-    where, loaded = load(args.config, given)
+    where, loaded = load(args.config, {"record.directory": args.record or None})
     config = recorded(loaded)
     if args.invite:
         return _invite(args, config, where)

@@ -108,7 +108,7 @@ def test_a_file_here_that_cannot_be_read_is_an_error_and_not_passed_over(places:
 
 def test_a_good_file_is_decoded_with_the_command_line_on_top(places: Places) -> None:
     places.option.write_text('[robot]\nid = "r1"\n[mcu]\nport = "/dev/a"\n')
-    where, config = load(str(places.option), {"robot": {"id": "r2"}})
+    where, config = load(str(places.option), {"robot.id": "r2"})
     assert where == str(places.option)
     assert (config.robot.id, config.mcu.port) == ("r2", "/dev/a")
 
