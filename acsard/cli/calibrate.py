@@ -32,9 +32,9 @@ from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, ExitError, UsageError
-from acsard.prompts.json_prompt import JsonPrompt
-from acsard.prompts.prompt import NobodyError
+from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.output import SENTENCES, plain, show
+from acsard.terminal.prompt import NobodyError
 
 DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""

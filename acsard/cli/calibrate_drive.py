@@ -23,9 +23,9 @@ from acsard.daemon.bus.address import address_of
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UsageError
 from acsard.host.terminal_modes import one_by_one
-from acsard.prompts.json_prompt import JsonPrompt
-from acsard.prompts.prompt import Prompt, ended_by_signals
-from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
+from acsard.terminal.json_prompt import JsonPrompt
+from acsard.terminal.prompt import Prompt, ended_by_signals
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 

@@ -15,8 +15,8 @@ from rich.text import Text
 from acsard.cli.common import by_environment
 from acsard.cli.connection import add_bus, require_one
 from acsard.daemon.bus.address import address_of
-from acsard.doctor.examination import examine
 from acsard.host.config_file import find
+from acsard.machine.examination import examine
 from acsard.terminal.output import show_whole
 
 MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}

@@ -21,9 +21,9 @@ from acsard.daemon.serial.blocking import BlockingPort
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.processes import master_of
-from acsard.prompts.json_prompt import JsonPrompt
-from acsard.prompts.prompt import Prompt, ended_by_signals
-from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
+from acsard.terminal.json_prompt import JsonPrompt
+from acsard.terminal.prompt import Prompt, ended_by_signals
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 SIMULATOR = "sim"
 

@@ -10,7 +10,7 @@ import sys
 
 import msgspec
 
-from acsard.host.serial_ports import serial_devices
+from acsard.machine.serial_ports import serial_devices
 
 
 def add(parser: argparse.ArgumentParser) -> None:

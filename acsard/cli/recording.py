@@ -34,8 +34,7 @@ from acsard.recording.replayed import (
 )
 from acsard.recording.time_span import clock, span
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
-from acsard.terminal.output import show
-from acsard.terminal.tables import table
+from acsard.terminal.output import show, table
 
 SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""

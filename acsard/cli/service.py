@@ -9,12 +9,11 @@ import os
 import sys
 from collections.abc import Iterable
 
-from acsard.host import service_installation as service
 from acsard.host.errors import Exit, ExitError, MendableError
-from acsard.host.installation_steps import Step
-from acsard.host.service_installation import misplaced
-from acsard.terminal.output import show
-from acsard.terminal.tables import table
+from acsard.machine import service_installation as service
+from acsard.machine.installation_steps import Step
+from acsard.machine.service_installation import misplaced
+from acsard.terminal.output import show, table
 
 
 def add(parser: argparse.ArgumentParser) -> None:

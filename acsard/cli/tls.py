@@ -10,7 +10,6 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from acsard.certificates import identities
 from acsard.cli.common import add_config, load, whole
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import write
@@ -18,10 +17,11 @@ from acsard.core.values import ROLES
 from acsard.daemon.bus.address import require_id
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.daemon.gateway.fleet_router import router_file
-from acsard.host import service_installation as service
 from acsard.host.config_file import change, require_changeable, require_tomlkit
 from acsard.host.errors import UsageError
-from acsard.host.service_installation import TLS, source
+from acsard.machine import certificates
+from acsard.machine import service_installation as service
+from acsard.machine.service_installation import TLS, source
 
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
@@ -127,22 +127,22 @@ def main_init(args: argparse.Namespace) -> int:
 
     def keys(config: Config) -> dict[str, object]:
         robots.append(config.robot.id)
-        return identities.keys(config, directory)
+        return certificates.keys(config, directory)
 
     if args.write:
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
     else:
         robots.append(load(None)[1].robot.id)
-    names = identities.init(args.directory, args.address, args.days, force=args.force)
+    names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
         _configure(args.write, keys)
     _admit_service(directory)
     host, robot = socket.gethostname(), robots[-1]
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
-    lines = "" if args.write else _LINES.format(directory=directory, port=identities.PORT)
+    lines = "" if args.write else _LINES.format(directory=directory, port=certificates.PORT)
     print(_certified(names))
-    where = f"tls/{host}.local:{identities.PORT}"
+    where = f"tls/{host}.local:{certificates.PORT}"
     print(_NEXT.format(directory=directory, robot=robot, where=where, lines=lines, **files))
     return 0
 
@@ -165,7 +165,7 @@ def main_add(args: argparse.Namespace) -> int:
             )
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
-    place = identities.add(args.directory, args.name, args.address, args.days)
+    place = certificates.add(args.directory, args.name, args.address, args.days)
     if not args.role:
         print(f"{place} is for {args.name}")
         return 0
@@ -186,7 +186,7 @@ def main_add(args: argparse.Namespace) -> int:
 
 def main_renew(args: argparse.Namespace) -> int:
     """Replace the robot's own certificate."""
-    names = identities.renew(args.directory, args.address, args.days)
+    names = certificates.renew(args.directory, args.address, args.days)
     print(_certified(names))
     print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
     return 0
@@ -237,7 +237,7 @@ def _name(text: str) -> str:
 
 
 def _address(text: str) -> str:
-    if not identities.ADDRESS.match(text):
+    if not certificates.ADDRESS.match(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a host name or an IP address")
     return text
 

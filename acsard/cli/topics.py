@@ -13,8 +13,7 @@ from acsard.core.messages.topics import by_key
 from acsard.core.ros.names import full_name
 from acsard.core.ros.parameters import SETTING
 from acsard.core.ros.transports import left_out, ros_names
-from acsard.terminal.output import show
-from acsard.terminal.tables import table
+from acsard.terminal.output import show, table
 
 
 def add(parser: argparse.ArgumentParser) -> None:

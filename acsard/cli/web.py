@@ -23,8 +23,7 @@ from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
 from acsard.host.logs import Log
-from acsard.terminal.output import show
-from acsard.terminal.tables import table
+from acsard.terminal.output import show, table
 
 if TYPE_CHECKING:
     from acsard.web.listen import Listen

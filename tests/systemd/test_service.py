@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from tests.system.harness import ROOT, until
 from tests.systemd.container import GATEWAY, PAGE, UNIT, Container, UnavailableError, unavailable
 

@@ -23,7 +23,7 @@ from acsard.calibration.guided.legs import (
     Way,
 )  # fmt: skip
 from acsard.calibration.tape_distance import LEAST_M
-from acsard.prompts.prompt import Ask
+from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
 """Standard deviation of the long distance, including the position of its ends, m."""

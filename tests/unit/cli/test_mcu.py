@@ -24,8 +24,8 @@ from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
-from acsard.prompts.prompt import ended_by_signals
-from acsard.prompts.terminal_prompt import TerminalPrompt
+from acsard.terminal.prompt import ended_by_signals
+from acsard.terminal.terminal_prompt import TerminalPrompt
 from tests.unit.checkup.robots import Busy, Robot
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from acsard.certificates.authority import Authority
 from acsard.cli import parser, web
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
+from acsard.machine.authority import Authority
 from acsard.web.listen import (
     Listen,
     bound,

@@ -23,7 +23,7 @@ from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses
 
 if TYPE_CHECKING:
-    from acsard.certificates.authority import Authority
+    from acsard.machine.authority import Authority
 
 PORT = 7449
 CA_KEY = "ca-key.pem"
@@ -95,7 +95,7 @@ def keys(config: Config, directory: Path) -> dict[str, object]:
 
 def _maker() -> type[Authority]:
     try:
-        from acsard.certificates.authority import Authority
+        from acsard.machine.authority import Authority
     except ImportError:
         raise missing("cryptography", "tls") from None
     return Authority

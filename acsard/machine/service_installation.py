@@ -17,8 +17,8 @@ from pathlib import Path
 
 import acsard
 from acsard.host.errors import Exit, ExitError
-from acsard.host.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
 from acsard.host.processes import called
+from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
 
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from acsard.host.errors import ExitError
-from acsard.host.installation_steps import File, Keep, Remove, RemoveAll, Run, Write
-from acsard.host.service_installation import (
+from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Write
+from acsard.machine.service_installation import (
     GATEWAY,
     GONE,
     INSTALLED,

@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from acsard.certificates.identities import CA_KEY
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
+from acsard.machine.certificates import CA_KEY
 
 SLACK = timedelta(hours=1)
 """Time by which a certificate is valid before its creation, because a robot's clock may be slow

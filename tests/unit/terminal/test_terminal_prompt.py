@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from acsard.checkup.findings import Finding
 from acsard.host.terminal_modes import one_by_one
-from acsard.prompts.prompt import Ask, NobodyError
-from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
+from acsard.terminal.output import plain
+from acsard.terminal.prompt import Ask, NobodyError
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt, row
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
@@ -105,3 +107,11 @@ def test_the_subject_is_left_out_of_the_output_of_one_object(
 ) -> None:
     TerminalPrompt(as_json).begin("robot acsar", simulated=False)
     assert capsys.readouterr().out == shown
+
+
+def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
+    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
+    head, *rest = plain(row(finding), width=100).splitlines()
+    assert head == "FAIL    watchdog               none"
+    assert all(line.startswith(" " * 8) for line in rest)
+    assert rest[-1] == "        -> give it one"

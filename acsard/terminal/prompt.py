@@ -11,14 +11,12 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from msgspec import Struct
 
+from acsard.checkup.findings import Finding
 from acsard.core.values import AcsardError
-
-if TYPE_CHECKING:
-    from acsard.checkup.findings import Finding
 
 
 class NobodyError(AcsardError):

@@ -7,8 +7,8 @@ import resource
 
 import pytest
 
-from acsard.doctor.examination import scheduling
 from acsard.host import real_time
+from acsard.machine.examination import scheduling
 
 WANTED = True
 

@@ -16,9 +16,9 @@ from acsard.core.motion.gyro import WORDS
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import reachable
-from acsard.doctor.finding import LEVELS, Finding, Level
-from acsard.doctor.running import Running, answers, asked
 from acsard.host.errors import NoAnswerError
+from acsard.machine.finding import LEVELS, Finding, Level
+from acsard.machine.running import Running, answers, asked
 
 LOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""

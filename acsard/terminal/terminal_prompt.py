@@ -9,20 +9,26 @@ from __future__ import annotations
 import os
 import select
 import sys
+import termios
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
-from acsard.prompts.prompt import Ask, NobodyError
+from rich.table import Table
+from rich.text import Text
 
-if TYPE_CHECKING:
-    from acsard.checkup.findings import Finding
+from acsard.checkup.findings import Finding
+from acsard.terminal.output import SENTENCES, show, table
+from acsard.terminal.prompt import Ask, NobodyError
 
 COLUMNS = 88
 BAR = 30
 
 LEAVES = "q"
+
+
+COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
 
 
 class Screen:
@@ -63,9 +69,6 @@ class Screen:
 
     def found(self, finding: Finding) -> None:
         """Print a finding."""
-        from acsard.checkup.checkup_report import row
-        from acsard.terminal.output import SENTENCES, show
-
         if not self._as_json:
             self._clear()
             show(row(finding), most=SENTENCES)
@@ -140,8 +143,6 @@ class TerminalPrompt(Screen):
 
     def start(self, text: str, by_key: bool = False) -> None:
         """Return when Enter is pressed."""
-        import termios
-
         self.say(text)
         # Keys that were pressed before the text appeared must not start anything.
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
@@ -155,8 +156,6 @@ class TerminalPrompt(Screen):
 
     def number(self, ask: Ask) -> float:
         """Return the typed number."""
-        import termios
-
         with _lines():
             termios.tcflush(sys.stdin, termios.TCIFLUSH)
             while True:
@@ -181,6 +180,14 @@ class TerminalPrompt(Screen):
             self._print(f"\r[{bar}] any key stops {'' if share < 1.0 else chr(10)}")
 
 
+def row(finding: Finding) -> Table:
+    """Return the verdict with name and figure, then the meaning and the remedy."""
+    verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
+    below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
+    head = f"{finding.name:<22} {finding.figure}"
+    return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
+
+
 def _read() -> str:
     read = os.read(sys.stdin.fileno(), 256)
     # The terminal has been closed.
@@ -192,8 +199,6 @@ def _read() -> str:
 @contextmanager
 def _lines() -> Iterator[None]:
     """Read whole lines from the terminal, and echo them while they are typed."""
-    import termios
-
     before = termios.tcgetattr(sys.stdin)
     cooked = termios.tcgetattr(sys.stdin)
     cooked[3] |= termios.ICANON | termios.ECHO

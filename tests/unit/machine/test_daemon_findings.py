@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.messages.schema import DiagnosticStatus, Time
-from acsard.doctor.daemon_findings import (
+from acsard.machine.daemon_findings import (
     clocks,
     gateway,
     gone,
@@ -20,10 +20,10 @@ from acsard.doctor.daemon_findings import (
     lost,
     refused,
 )
-from acsard.doctor.finding import Finding
-from acsard.doctor.running import Running
+from acsard.machine.finding import Finding
+from acsard.machine.running import Running
 from tests.each import each
-from tests.unit.doctor.test_running import INFO, STATE
+from tests.unit.machine.test_running import INFO, STATE
 
 NOW = 1_800_000_000_000_000_000
 S = 10**9

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.errors import ExitError
-from acsard.host.installation_steps import File, Remove, RemoveAll, Run, Write
+from acsard.machine.installation_steps import File, Remove, RemoveAll, Run, Write
 
 
 def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:

@@ -23,15 +23,15 @@ from acsard.core.messages.expiry import expiry
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.address import Address, address_of
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
-from acsard.doctor.daemon_findings import daemon, found, gateway, routers
-from acsard.doctor.finding import LEVELS, Finding, Level
-from acsard.doctor.running import Running, compared
 from acsard.host import clock, real_time
 from acsard.host.clock import now
 from acsard.host.errors import MendableError
 from acsard.host.extras import install
 from acsard.host.processes import holders, running
-from acsard.host.serial_ports import BOARDS, serial_devices
+from acsard.machine.daemon_findings import daemon, found, gateway, routers
+from acsard.machine.finding import LEVELS, Finding, Level
+from acsard.machine.running import Running, compared
+from acsard.machine.serial_ports import BOARDS, serial_devices
 
 
 def certificates(tls: str) -> Iterator[Finding]:

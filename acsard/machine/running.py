@@ -20,9 +20,9 @@ from acsard.core.messages.schema import DiagnosticStatus, Info, RobotState
 from acsard.core.values import AcsardError
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import no_endpoint, reachable
-from acsard.doctor.finding import Finding, Level
 from acsard.host import clock
 from acsard.host.processes import name_of
+from acsard.machine.finding import Finding, Level
 
 WATCHED_S = 1.0
 """Time over which lines are counted, s: about a hundred lines."""

@@ -17,14 +17,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import Self, TypeVar
 
 import msgspec
 from msgspec import Struct
 
+from acsard.checkup.findings import Finding
 from acsard.host.config_file import change, require_changeable, writable
 from acsard.host.errors import MendableError
-from acsard.prompts.json_messages import (
+from acsard.terminal.json_messages import (
     Doing,
     Found,
     JobMessage,
@@ -33,10 +34,7 @@ from acsard.prompts.json_messages import (
     Result,
     Subject,
 )  # fmt: skip
-from acsard.prompts.prompt import Ask
-
-if TYPE_CHECKING:
-    from acsard.checkup.findings import Finding
+from acsard.terminal.prompt import Ask
 
 T = TypeVar("T")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from acsard.host.serial_ports import BOARDS
+from acsard.machine.serial_ports import BOARDS
 
 RULES = Path(__file__).parents[3] / "deploy" / "udev" / "70-acsar.rules"
 

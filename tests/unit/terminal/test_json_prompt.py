@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from acsard.checkup.findings import Finding
-from acsard.prompts import json_prompt
-from acsard.prompts.json_prompt import LINE_BYTES, JsonPrompt
-from acsard.prompts.prompt import Ask, ended_by_signals
+from acsard.terminal import json_prompt
+from acsard.terminal.json_prompt import LINE_BYTES, JsonPrompt
+from acsard.terminal.prompt import Ask, ended_by_signals
 
 DISTANCE = Ask("How far?", "m", 0.5, 3.0)
 OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)

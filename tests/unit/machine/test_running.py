@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import BusConfig, Config, DriveConfig, McuConfig, RobotConfig
 from acsard.core.messages.schema import Info, RobotState, Time
-from acsard.doctor.running import SHOWN, Running, compared, differences
+from acsard.machine.running import SHOWN, Running, compared, differences
 
 INFO = Info("acsar", "1.2", 77, "/dev/pts/3", False, 100.0, [], [])
 STATE = RobotState(
