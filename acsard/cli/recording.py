@@ -92,7 +92,7 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 def list_all(args: argparse.Namespace) -> int:
     """Print a line for each recording."""
     from acsard.host.errors import RecordingError
-    from acsard.recording.end_record import closing
+    from acsard.recording.end_record import read_end
     from acsard.recording.file import Recording
     from acsard.terminal.output import show
     from acsard.terminal.tables import table
@@ -103,7 +103,7 @@ def list_all(args: argparse.Namespace) -> int:
     rows: list[tuple[str, ...]] = []
     for path in files:
         try:
-            last = closing(path)
+            last = read_end(path)
             rows.append(_row(path, last) if last else _row_of_all(Recording(path)))
         except RecordingError as error:
             rows.append((path.name, "", "", "", printable(str(error))))
@@ -124,15 +124,15 @@ def _row(path: Path, last: EndRecord, note: str = "") -> tuple[str, ...]:
 def _row_of_all(recording: Recording) -> tuple[str, ...]:
     """Return the row of a recording without an end. The whole recording must be read for it."""
     from acsard.host.errors import RecordingError
-    from acsard.recording.file import Gist, event_of
+    from acsard.recording.file import EndRecordBuilder, event_of
 
-    gist = Gist(recording.about)
+    builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
-        gist.message(topic, wall_ns, data)
+        builder.message(topic, wall_ns, data)
         if topic == "events":
             with suppress(RecordingError):  # omit only the event that cannot be decoded
-                gist.event(event_of(recording, data))
-    return _row(recording.path, gist.closing(), _state(recording))
+                builder.event(event_of(recording, data))
+    return _row(recording.path, builder.end_record(), _state(recording))
 
 
 def _bracketed(text: str) -> str:
@@ -157,7 +157,7 @@ def _ending(recording: Recording) -> str:
 
 def show_one(args: argparse.Namespace) -> int:
     """Print the timeline of a recording."""
-    from acsard.recording.replayed import steps
+    from acsard.recording.file_replay import steps
     from acsard.recording.timeline import TimelineEntry, TimelineWriter
 
     recording = _recording(args)
@@ -194,43 +194,43 @@ def replay_one(args: argparse.Namespace) -> int:
 
     Returns 1 if they differ; with --config a difference is expected and it returns 0.
     """
-    from acsard.recording.replayed import (
-        because,
-        compared,
-        config_of,
-        differs,
-        live,
-        otherwise,
+    from acsard.recording.file_replay import config_of, replay_file
+    from acsard.recording.replay_text import (
+        describe_difference,
+        describe_outcome,
+        explain_settings,
+        explain_verdict,
         verdict,
     )
 
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with telling(recording) as tell:
-        tally, trouble, again = live(recording, other, tell)
-    print(f"{verdict(tally)}\n{compared(other is not None)}")
+        comparison, trouble, failed_step = replay_file(recording, other, tell)
+    print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")
     began_ns, rows = recording.about.mono_ns, list[str]()
     if other is not None:
-        rows = because(config_of(recording), other, tally, began_ns)
-    if tally.first is not None:
-        rows = [*differs(tally.first, began_ns), *rows, *otherwise(tally)]
-    rows += [again] if again else []
+        rows = explain_settings(config_of(recording), other, comparison, began_ns)
+    if comparison.first is not None:
+        difference = describe_difference(comparison.first, began_ns)
+        rows = [*difference, *rows, *describe_outcome(comparison)]
+    rows += [failed_step] if failed_step else []
     for row in rows:
         print(printable(row))
     note = trouble or _state(recording).strip()
     if note:
         print(f"{recording.path}: {note}", file=sys.stderr)
-    return int(Exit.OK if tally.same or other is not None else Exit.FAILURE)
+    return int(Exit.OK if comparison.same or other is not None else Exit.FAILURE)
 
 
 def recover_one(args: argparse.Namespace) -> int:
     """Rewrite an unfinished or damaged recording as a finished file."""
-    from acsard.recording.atomic_output import beside
+    from acsard.recording.atomic_output import replacing
     from acsard.recording.file import rewrite
 
     recording, new = _recording(args), Path(args.new)
     try:
-        with beside(new, args.force) as part:
+        with replacing(new, args.force) as part:
             count = rewrite(recording, part)
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None

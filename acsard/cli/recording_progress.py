@@ -17,12 +17,12 @@ def telling(recording: Recording) -> Iterator[Callable[[int], None]]:
 
     The progress line is erased at the end. If standard error is not a terminal, nothing is shown.
     """
-    from acsard.recording.end_record import closing
+    from acsard.recording.end_record import read_end
 
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
         return
-    began_ns, last = recording.about.wall_ns, closing(recording.path)
+    began_ns, last = recording.about.wall_ns, read_end(recording.path)
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
 
     def tell(wall_ns: int) -> None:

@@ -71,13 +71,13 @@ def report_one(
     recording: Recording, args: argparse.Namespace, plotly: str, words: Words
 ) -> list[str]:
     """Write the report, print a summary, and return notes about the recording."""
-    from acsard.recording.atomic_output import beside
+    from acsard.recording.atomic_output import replacing
 
     if args.supervised:
         return _held(recording, args, plotly, words)
     new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
     try:
-        with beside(new, args.force) as part, telling(recording) as tell:
+        with replacing(new, args.force) as part, telling(recording) as tell:
             text, known = _drawn(recording, args, plotly, words, tell)
             part.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -95,10 +95,10 @@ def _held(recording: Recording, args: argparse.Namespace, plotly: str, words: Wo
     The progress in percent goes to standard error.
     """
     from acsard.host.child import end_with_parent
-    from acsard.recording.end_record import closing
+    from acsard.recording.end_record import read_end
 
     end_with_parent(signal.SIGKILL)
-    last, began = closing(recording.path), recording.about.wall_ns / 1e9
+    last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0
 
@@ -125,16 +125,17 @@ def _drawn(
 
     `tell` is called with the wall-clock time reached, in ns.
     """
-    from acsard.recording.replayed import EVERY, Onlooker, verdict
+    from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay
+    from acsard.recording.replay_text import verdict
     from acsard.report.account import Origin, notes
     from acsard.report.course import Course
     from acsard.report.page import page
 
-    about, looked = recording.about, Onlooker(recording)
+    about, looked = recording.about, DisplayReplay(recording)
     began, (begin, end) = about.wall_ns / NS_PER_S, recording_span.span(args, recording)
     course = Course(looked.config, began + begin, began + end)
     for number, (step, outputs, robot) in enumerate(looked.steps()):
-        if number % EVERY == 0:
+        if number % PROGRESS_STEPS == 0:
             tell(step.inputs.now.wall_ns)
         course.step(step, outputs, robot)
         if course.over:
@@ -146,11 +147,11 @@ def _drawn(
         raise ExitError(Exit.FAILURE, message)
     course.end()
     said = [*filter(None, [words.state(recording).strip(" []")]), *looked.notes]
-    tally = looked.replay.tally
-    if not (tally.same or looked.notes or course.missing):
+    comparison = looked.replay.comparison
+    if not (comparison.same or looked.notes or course.missing):
         said.append(
             "this version of acsard computes other results than the recorded ones: "
-            f"{verdict(tally)}"
+            f"{verdict(comparison)}"
         )
     origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
     offset_s = time.localtime(course.began).tm_gmtoff
