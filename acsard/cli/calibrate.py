@@ -100,9 +100,9 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     import msgspec
 
     from acsard.calibration.calibration_report import Refusal, keys, parts, report
-    from acsard.calibration.doubts import RefusedError
-    from acsard.calibration.guided.legs import GuideError
+    from acsard.calibration.guided.drive_plan import GuideError
     from acsard.calibration.log_table import LogError
+    from acsard.calibration.plausibility import RefusedError
     from acsard.prompts.prompt import NobodyError
     from acsard.terminal.output import SENTENCES, plain, show
 

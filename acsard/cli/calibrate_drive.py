@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
-from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.equipment import NEEDS
 from acsard.host.errors import UsageError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def guided(
     A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
     `RefusedError`.
     """
-    from acsard.calibration.guided.legs import GuideError, setup
+    from acsard.calibration.guided.drive_plan import GuideError, setup
     from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
     from acsard.calibration.guided.runner import guide
     from acsard.cli.common import require_one
@@ -141,7 +141,7 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
     """
     import msgspec
 
-    from acsard.calibration.guided.legs import GuideError
+    from acsard.calibration.guided.drive_plan import GuideError
     from acsard.core.config.settings import Config
 
     config = msgspec.convert(client.get("config"), Config)
