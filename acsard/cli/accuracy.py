@@ -70,8 +70,8 @@ def main(args: argparse.Namespace) -> int:
             feed = Feed(config, robot.get("state"))
             while True:
                 _follow(feed, queues, args.seconds)
-                heard = feed.heard(robot.get("state"), robot.get("diagnostics"))
-                _print(budget(heard, config), args.json)
+                received = feed.received(robot.get("state"), robot.get("diagnostics"))
+                _print(budget(received, config), args.json)
                 if not args.follow:
                     return int(Exit.OK)
         except KeyboardInterrupt:
