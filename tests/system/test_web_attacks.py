@@ -17,8 +17,9 @@ import aiohttp
 import pytest
 from yarl import URL
 
+from acsard.web.acceptor import REQUEST_S
 from acsard.web.app import BODY_S
-from acsard.web.gate import REQUEST_S, SOCKETS_OF_ONE
+from acsard.web.limits import SOCKETS_OF_ONE
 from tests.system.browser import NAME, Hands, Page, hands, run
 from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
 
