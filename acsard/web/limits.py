@@ -54,6 +54,10 @@ MESSAGES = Rate(200.0, 400.0)
 """Limit on messages per WebSocket. The burst allowance covers the messages a client sends when its
 network returns."""
 
+STOPS_ELSEWHERE = Rate(4.0, 16.0)
+"""Limit on the stops of one token to other robots that have never answered a stop here. They may
+not exist. A robot that has answered one is stopped whenever a client asks."""
+
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens: from one address, and in all."""
 
