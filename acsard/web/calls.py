@@ -33,7 +33,7 @@ ELSEWHERE_AT_ONCE = 8
 """Limit on concurrent stops of other robots that wait for an answer. A stop beyond the limit is
 still sent to its robot, but without waiting for the answer."""
 
-MERGE_S = 0.05
+MERGE_S = 0.02
 """Shortest interval between two stops of one client to one robot. A stop within it is sent at its
 end, together with all others of that interval."""
 
