@@ -23,7 +23,7 @@ from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
 from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, until, wheels
 from tests.system.hosts import Hosts, inside, on
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 
 async def beside(call: Callable[[], Any]) -> Any:
