@@ -38,6 +38,7 @@ from acsard.core.config.settings import (
 )
 from acsard.core.config.writing import document
 from acsard.core.messages.schema import RobotState
+from acsard.host import real_time
 from acsard.host.errors import Exit, ExitError
 
 
@@ -124,8 +125,7 @@ def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
     state, pid = rig.state(), rig.process.pid
-    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
-    realtime = policy in (os.SCHED_FIFO, os.SCHED_RR)
+    realtime = bool(real_time.has(pid))
     resident = resident_mb(pid)
     record = rig.end()
     read = [sample.at.wall_ns - sample.stamp_ns for sample in record.samples]

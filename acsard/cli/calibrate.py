@@ -27,7 +27,7 @@ from acsard.calibration.guided.legs import GuideError
 from acsard.calibration.log_table import LogError
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.tape_distance import Tape
-from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
+from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differing, guided
 from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus
 from acsard.host.config_file import change, writable
@@ -40,10 +40,9 @@ DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
-    add_options(parser)
+    add_drive_options(parser)
     parser.add_argument(
         "--log",
         type=Path,
@@ -59,7 +58,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         "the straightest run",
     )
     add_outcome(parser, "the result")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

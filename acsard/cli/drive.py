@@ -16,8 +16,7 @@ from acsard.top.keyboard import Keyboard, Ride
 from acsard.top.teleop import HELP
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "\n".join(HELP)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     for name, speed, unit in (("--linear", 0.5, "M/S"), ("--angular", 1.0, "RAD/S")):
@@ -32,7 +31,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--source", default="teleop", help="command source to send as (default: teleop)"
     )
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

@@ -33,8 +33,7 @@ from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
     )
@@ -57,7 +56,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="end with exit code 1 if no message comes for S seconds",
     )
     add_bus(parser, MANY)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

@@ -18,11 +18,9 @@ from acsard.top.fleet import Fleet
 from acsard.top.roster import table
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="print one table and end")
     add_bus(parser, MANY + " (the default)")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
@@ -39,9 +37,9 @@ def main(args: argparse.Namespace) -> int:
             named = robot.where.tls and ids != (ALL,)
             silence = robot.like(ids[0]).whoami().silence if named else ""
             raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), silence))))
-    width = shutil.get_terminal_size((160, 24)).columns
-    # Flush now: nothing that delays our exit may hold back the table.
-    print("\n".join(table(rows, width)), flush=True)
+        width = shutil.get_terminal_size((160, 24)).columns
+        # Flush now: nothing that delays the end of the session may hold back the table.
+        print("\n".join(table(rows, width)), flush=True)
     for told in filter(None, (fleet.seen, fleet.more)):
         print(f"acsard: {told}", file=sys.stderr)
     return int(Exit.OK)

@@ -19,11 +19,9 @@ from acsard.daemon.bus.robot_discovery import present
 from acsard.host.errors import Exit
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("key", help="for example info, config, schema/Twist, state")
     add_bus(parser, MANY)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

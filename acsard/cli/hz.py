@@ -17,13 +17,11 @@ from acsard.cli.connection import add_bus, connected, require_followed
 from acsard.cli.waiting import explained, lost_by, waits_for
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("topic", help="for example odom")
     parser.add_argument("-n", type=count, metavar="N", help="end after N lines")
     parser.add_argument("--json", action="store_true", help="print JSON lines")
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

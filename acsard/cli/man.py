@@ -11,9 +11,8 @@ from acsard.cli import parser
 from acsard.host.extras import missing
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.set_defaults(main=main)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare none."""
 
 
 def main(args: argparse.Namespace) -> int:

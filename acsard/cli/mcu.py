@@ -41,8 +41,7 @@ to judge a test; in that case try again when the computer is idle.
 """
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the action and its options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
@@ -66,7 +65,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="with --yes: confirm that no wheel touches anything and that you watch the robot",
     )
     add_outcome(check, "the found lines, and --port,")
-    check.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

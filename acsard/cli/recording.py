@@ -40,10 +40,8 @@ SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
-    parser.set_defaults(main=main)
     actions = parser.add_subparsers(title="verbs", metavar="VERB")
     shown = actions.add_parser(
         "show",

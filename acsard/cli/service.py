@@ -16,8 +16,7 @@ from acsard.machine.service_installation import misplaced
 from acsard.terminal.output import show, table
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for name, main, text in (
         ("install", main_install, "write the files, enable and start the service"),

@@ -26,8 +26,7 @@ from acsard.machine.service_installation import TLS, source
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(
         "init",

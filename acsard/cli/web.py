@@ -36,8 +36,7 @@ USUAL_DAYS = 30
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"Needs an extra: {install('web')}."
     add_bus(parser)
     parser.add_argument(
@@ -80,7 +79,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         help=f"hours until the token expires, for a visitor: 1 to {MOST_HOURS}",
     )
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

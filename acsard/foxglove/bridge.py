@@ -34,9 +34,6 @@ GATHER_S = 0.015
 """Time to gather messages before a round. A screen shows 60 frames a second, and gathering for less
 than one frame makes the rounds a third cheaper. Commands do not wait for it."""
 
-ROUND_S = 0.5
-"""Longest time between two rounds."""
-
 GONE = "daemon"
 """Id of the status message that the daemon is gone."""
 
@@ -85,7 +82,7 @@ class Bridge:
         while not self._ended.is_set():
             if dead.done():
                 dead.result()
-            self._wake.wait(ROUND_S)
+            self._wake.wait(0.5)
             time.sleep(GATHER_S)
             self._wake.clear()
             self._round()

@@ -14,9 +14,6 @@ from acsard.host.processes import called
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
 """Directories that are removed with the last file in them."""
 
-RUN_S = 60.0
-"""Time limit of a command, s. A command that takes longer has hung."""
-
 
 class File(Struct, frozen=True):
     """One file of the service."""
@@ -141,7 +138,7 @@ class Run(Struct, frozen=True):
     def do(self) -> None:
         """Run the command; raise `ExitError` with its error output, unless it may fail."""
         try:
-            done = called(self.words, RUN_S)
+            done = called(self.words, 60.0)
             failed = done.stderr.strip() if done.returncode else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             failed = str(error)

@@ -100,9 +100,6 @@ STATES = {
 Found = Mapping[Path, bytes | None]
 """Present content of each file's path; None if it does not exist."""
 
-ASK_S = 10.0
-"""Time limit for a call of systemd, s: it answers at once, or it hangs."""
-
 RELOAD = (
     Run(("systemctl", "daemon-reload")),
     Run(("udevadm", "control", "--reload"), may_fail=True),
@@ -259,7 +256,7 @@ def state(unit: str) -> str:
     """Return systemd's report about a unit; "" if systemd does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
-        done = called(("systemctl", "show", unit, about), ASK_S)
+        done = called(("systemctl", "show", unit, about), 10.0)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() or done.stderr.strip()

@@ -51,16 +51,10 @@ hand, each command is a sign of life, and the source's timeout applies.
 
 LISTEN_S = 0.05
 
-LEAVING_S = 1.0
-"""Time to wait for the reader thread at the end, s, if the program does not read."""
-
 LINE_BYTES = 65536
 """Largest length of an input line. A longer one interrupts the verb, because the program is
 faulty.
 """
-
-CHECK_STEPS = 16
-"""Approximate number of findings in a complete check, for its progress."""
 
 KEY = " "
 
@@ -94,7 +88,7 @@ class JsonPrompt:
     def __exit__(self, *error: object) -> None:
         with self._news:
             self._left = True
-        self._reader.join(LEAVING_S)
+        self._reader.join(1.0)  # it does not end if the program does not read
 
     # Output
 
@@ -118,7 +112,8 @@ class JsonPrompt:
         """Send a finding as it is made, and the progress."""
         self._found += 1
         self._tell(Found(finding))
-        self.progress(min(0.99, self._found / CHECK_STEPS))
+        # A complete check has about 16 findings.
+        self.progress(min(0.99, self._found / 16))
 
     def result(self, text: str) -> None:
         """Send the result as a terminal shows it. From now on nothing moves."""

@@ -22,7 +22,6 @@ from acsard.checkup.findings import Finding
 from acsard.terminal.output import SENTENCES, show, table
 from acsard.terminal.prompt import Ask, NobodyError
 
-COLUMNS = 88
 BAR = 30
 
 LEAVES = "q"
@@ -210,4 +209,4 @@ def _lines() -> Iterator[None]:
 
 
 def _wrapped(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, COLUMNS))
+    return "\n".join(textwrap.wrap(text, 88))

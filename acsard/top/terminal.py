@@ -28,17 +28,11 @@ from acsard.top.view import screen
 
 PERIOD_S = 0.25
 
-KEYS_S = 0.05
-"""Interval at which the keys are read and the robot is driven."""
-
-ONCE_S = 0.5
-"""Time over which `--once` averages rates; a person waits for it."""
-
 
 def once(feed: Feed) -> str:
     """Return one screen as plain text."""
     feed.ask()
-    time.sleep(ONCE_S)
+    time.sleep(0.5)  # rates are averaged over this time
     feed.ask()
     _be_lenient()
     width = Console().width
@@ -141,7 +135,7 @@ def _steer(
     with keys() as read, screen as show:
         due = 0.0
         while not suspend:
-            typed = read(KEYS_S)
+            typed = read(0.05)
             if typed is None:
                 return False
             step(typed)
