@@ -86,7 +86,6 @@ def free_endpoint() -> str:
 
 
 def write(config: Config, where: Path) -> Path:
-    """Write the configuration to a file in the directory `where`."""
     file = where / "acsard.toml"
     file.write_text("\n".join(document(effective(config))) + "\n", encoding="utf-8")
     return file

@@ -84,7 +84,6 @@ class Result(Struct, frozen=True, omit_defaults=False):
 
 
 def this_machine() -> Machine:
-    """Return the description of this machine."""
     return Machine(
         cpu=_cpu_model(),
         cores=len(os.sched_getaffinity(0)),

@@ -295,7 +295,6 @@ class Rig:
         self._kept.undeclare()
 
     def state(self) -> RobotState:
-        """Return the daemon's `state`."""
         key = full_key(self._config.robot.id, "state")
         for reply in self._session.get(key, timeout=3.0) if self._session else ():
             if reply.ok is not None:
@@ -303,7 +302,6 @@ class Rig:
         raise NoAnswerError(f"no answer on {key}")
 
     def leave(self) -> None:
-        """End the program."""
         end(self.process, END_S)
 
     def end(self) -> Record:

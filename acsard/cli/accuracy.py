@@ -43,7 +43,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Follow the robot and print its error budget."""
     with connected(args) as robot, suppress(KeyboardInterrupt):
         for found in budgets(robot, _config(robot, args.config), args.seconds):
             _print(found, args.json)

@@ -55,7 +55,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the measurement and print its figures."""
     port = "" if args.port in (None, "sim") else args.port
     if port:
         require(port)

@@ -61,7 +61,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the calibration and print its result."""
     if not args.json_lines or args.log:
         return _calibrate(args, None)
     require_asking(args)

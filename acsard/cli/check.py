@@ -21,7 +21,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Check the configuration and print it."""
     where, config = load(args.config)
     plain = effective(config)
     if args.json:

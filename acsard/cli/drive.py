@@ -34,7 +34,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Drive until Ctrl-C."""
     if not sys.stdin.isatty():
         raise UsageError(
             "drive reads single keys and needs a terminal; a program uses acsard.client"

@@ -59,7 +59,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print messages until Ctrl-C, a count or a timeout ends it."""
     topic = args.topic[0]
     if args.csv:
         if named(args.id or ""):

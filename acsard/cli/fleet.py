@@ -24,7 +24,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show the robots until the operator leaves, or print one table."""
     with connected_to_many(args) as (robot, many):
         ids = (many or (robot.where.robot_id,)) if args.id else (ALL,)
         fleet = Fleet(robot, ids)

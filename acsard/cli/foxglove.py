@@ -37,7 +37,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Serve Foxglove until a signal ends it."""
     try:
         from acsard.foxglove.bridge import Bridge
     except ImportError:

@@ -30,7 +30,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the gateway until a signal ends it or until it must be restarted."""
     given = {"robot.id": args.id or None, "ros.namespace": args.namespace}
     where, config = load(args.config, given)
     if not config.bus.outside:

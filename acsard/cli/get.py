@@ -25,7 +25,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Query the key and print its answer, or one answer per robot."""
     require_asked(args.key)
     with connected_to_many(args) as (robot, many):
         if not many:

@@ -25,7 +25,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print a line every second until Ctrl-C or until `-n` lines."""
     require_followed(args.topic)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n

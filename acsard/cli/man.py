@@ -16,7 +16,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the man page."""
     try:
         from argparse_manpage.manpage import Manpage
     except ImportError:

@@ -68,7 +68,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the check and print its result."""
     given = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
     where, config = load(args.config, given)
     if args.write:

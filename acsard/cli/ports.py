@@ -18,7 +18,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """List the ports."""
     found = serial_devices()
     if args.json:
         print(msgspec.json.encode(found).decode())

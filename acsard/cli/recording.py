@@ -115,7 +115,6 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print a line for each recording."""
     where, files = _files(args)
     if not files:
         print(f"no recordings in {where}")
@@ -148,7 +147,6 @@ def _bracketed(text: str) -> str:
 
 
 def main_show(args: argparse.Namespace) -> int:
-    """Print the timeline of a recording."""
     recording = _recording(args)
     begin, end = span(recording, args.begin, args.end)
     story, last = TimelineWriter(), recording.about.wall_ns / 1e9
@@ -202,7 +200,6 @@ def main_replay(args: argparse.Namespace) -> int:
 
 
 def main_recover(args: argparse.Namespace) -> int:
-    """Rewrite an unfinished or damaged recording as a finished file."""
     recording, new = _recording(args), Path(args.new)
     try:
         with beside(new, args.force) as part:
@@ -214,7 +211,6 @@ def main_recover(args: argparse.Namespace) -> int:
 
 
 def main_export(args: argparse.Namespace) -> int:
-    """Export a recording for other programs."""
     recording = _recording(args)
     trouble = recording_files.export(recording, args)
     _note(recording, trouble or _bracketed(recording.missing))
@@ -222,7 +218,6 @@ def main_export(args: argparse.Namespace) -> int:
 
 
 def main_report(args: argparse.Namespace) -> int:
-    """Draw a recording as an HTML file."""
     plotly = recording_files.library()
     recording = _recording(args)
     for note in recording_files.report(recording, args, plotly):

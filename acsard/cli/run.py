@@ -82,7 +82,6 @@ def options(args: argparse.Namespace) -> dict[str, object]:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the daemon until a signal."""
     where, config = load(args.config, options(args))
     config = recorded(config)
     log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)

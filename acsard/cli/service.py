@@ -46,7 +46,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main_install(args: argparse.Namespace) -> int:
-    """Write the files, reload systemd, and enable and start the service."""
     _ready(args)
     trouble = misplaced()
     if trouble:
@@ -62,7 +61,6 @@ def main_install(args: argparse.Namespace) -> int:
 
 
 def main_uninstall(args: argparse.Namespace) -> int:
-    """Stop and disable the service and remove its files."""
     _ready(args)
     files = [*service.files(), *map(service.lan_drop_in, service.ALL)]
     steps = service.uninstalling(

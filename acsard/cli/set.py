@@ -48,7 +48,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Set the settings, or list them if none is given."""
     settings = pairs(args.settings)
     file = _file(args.config, settings) if args.write else None
     if file is not None:

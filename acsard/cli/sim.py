@@ -45,7 +45,6 @@ def fault(text: str) -> NamedFault:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Simulate the microcontroller until a signal."""
     _, config = load(args.config)
     return asyncio.run(_play(config, args))
 

@@ -119,7 +119,6 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 
 def main_init(args: argparse.Namespace) -> int:
-    """Make the authority, the robot's certificate and one client certificate per role."""
     directory = args.directory.resolve()
 
     robots: list[str] = []
@@ -147,7 +146,6 @@ def main_init(args: argparse.Namespace) -> int:
 
 
 def main_add(args: argparse.Namespace) -> int:
-    """Make one more client certificate."""
     listed = f"{args.role}s"
 
     def keys(config: Config) -> dict[str, object]:
@@ -184,7 +182,6 @@ def main_add(args: argparse.Namespace) -> int:
 
 
 def main_renew(args: argparse.Namespace) -> int:
-    """Replace the robot's own certificate."""
     names = certificates.renew(args.directory, args.address, args.days)
     print(_certified(names))
     print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
@@ -192,7 +189,6 @@ def main_renew(args: argparse.Namespace) -> int:
 
 
 def main_router(args: argparse.Namespace) -> int:
-    """Print the configuration of a fleet's router."""
     for robot in args.robots:
         require_id(robot)
     template = (source() / "zenoh" / "router.json5").read_text()

@@ -18,7 +18,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show the robot until the operator leaves, or print one screen."""
     with connected(args) as robot:
         feed = Feed(robot)
         if args.once or not has_screen():

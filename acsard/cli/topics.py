@@ -23,7 +23,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the table."""
     _, config = load(args.config)
     topics = ros_table(config) if args.ros else topic_table(config)
     if args.json:

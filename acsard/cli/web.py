@@ -82,7 +82,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Serve the page, or manage its tokens."""
     try:
         import aiohttp  # noqa: F401
         import segno  # noqa: F401
@@ -172,7 +171,6 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
 
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:
-    """Return the tokens of the robot that the options name."""
     from acsard.web.tokens import Vault, place
 
     return Vault(place(), address_of(config, args.connect, args.id, args.tls).robot_id)

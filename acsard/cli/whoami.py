@@ -19,7 +19,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Ask the robot for our role and print it. Return `NO_PERMISSION` without a role."""
     with connected(args) as robot:
         us = robot.whoami()
     if args.json:

@@ -150,12 +150,10 @@ class Bridge:
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
 
     def _timeout_s(self, facts: Facts) -> float:
-        """Return the timeout of the source as which viewers drive, s."""
         sources = facts.config.commands.sources
         return next((one.timeout for one in sources if one.name == self._robot.source), LONGEST_S)
 
     def _follow(self, driving: bool) -> None:
-        """Follow the robot's state while a viewer drives."""
         now = clock.mono_ns() / NS_PER_S
         if self._watch is not None and not driving:
             self._watch.end()

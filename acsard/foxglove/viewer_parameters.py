@@ -103,5 +103,4 @@ def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings whose value has changed."""
     return {key: value for key, value in now.items() if before.get(key) != value}

@@ -79,7 +79,6 @@ class JournalStream(io.StringIO):
             raise
 
     def write(self, text: str) -> int:
-        """Send one line of the log."""
         self._socket.send(text.encode(errors="replace"))
         return len(text)
 

@@ -76,7 +76,6 @@ class Remove(Struct, frozen=True):
         return f"remove  {self.path}"
 
     def do(self) -> None:
-        """Remove the file."""
         self.path.unlink()
         self.tidy(self.path)
 
@@ -102,7 +101,6 @@ class RemoveAll(Struct, frozen=True):
         return f"remove  {self.path}" + ("/ and everything in it" if self.path.is_dir() else "")
 
     def do(self) -> None:
-        """Remove the file or the directory."""
         if self.path.is_dir() and not self.path.is_symlink():
             shutil.rmtree(self.path)
             Remove.tidy(self.path)

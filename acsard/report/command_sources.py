@@ -100,7 +100,6 @@ class CommandSources:
         return None
 
     def look(self, step: Step, t: float, robot: Robot) -> None:
-        """Record the present state of each source."""
         for name, does, words in self._do(step, t, robot):
             self.bands[name].add(t, does, words)
 

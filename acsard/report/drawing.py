@@ -132,7 +132,6 @@ NOTED = {
 
 
 def path(course: Course) -> Figure:
-    """Draw the path with its events."""
     places = course.path.places()
     keys: list[Key] = []
     data: list[Trace] = []

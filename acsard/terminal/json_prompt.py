@@ -93,23 +93,18 @@ class JsonPrompt:
     # Output
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """Announce the subject; this is the first line."""
         self._tell(Subject(subject, simulated))
 
     def say(self, text: str) -> None:
-        """Send a text that stays visible."""
         self._tell(JobMessage(text))
 
     def doing(self, text: str) -> None:
-        """Send the present activity."""
         self._tell(Doing(text))
 
     def progress(self, share: float) -> None:
-        """Send the progress, 0 to 1."""
         self._tell(Progress(round(share, 3)))
 
     def found(self, finding: Finding) -> None:
-        """Send a finding as it is made, and the progress."""
         self._found += 1
         self._tell(Found(finding))
         # A complete check has about 16 findings.
@@ -122,16 +117,12 @@ class JsonPrompt:
         self._tell(Result(text.strip("\n")))
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Return one of the answers."""
         return self._choose(question, answers)
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Return when the leg may begin."""
         self._choose(text, ("start",), leg=True, by_key=by_key)
 
     def number(self, ask: Ask) -> float:
-        """Return the number that the person read off."""
-
         def read(value: str | float | None) -> float:
             return ask.number("" if value is None else str(value))
 

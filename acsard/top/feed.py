@@ -11,7 +11,7 @@ from acsard.client.watch import Watch
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host.errors import MendableError, ReplyError
-from acsard.top.screen_data import ScreenData
+from acsard.top.text import ScreenData
 
 
 class Feed:
