@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from acsard.cli.connection import add_bus, connected
+from acsard.cli.connection import add_bus, connected, require_one
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.terminal.output import has_screen
@@ -34,6 +34,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    require_one(args)
     if not sys.stdin.isatty():
         raise UsageError(
             "drive reads single keys and needs a terminal; a program uses acsard.client"
