@@ -22,9 +22,9 @@ from pathlib import Path
 import msgspec
 
 from acsard.calibration.calibration_report import Refusal, keys, parts, report
-from acsard.calibration.doubts import RefusedError
-from acsard.calibration.guided.legs import GuideError
+from acsard.calibration.guided.drive_plan import GuideError
 from acsard.calibration.log_table import LogError
+from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.tape_distance import Tape
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differing, guided

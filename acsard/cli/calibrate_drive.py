@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager
 import msgspec
 import zenoh
 
-from acsard.calibration.guided.legs import GuideError, setup
-from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.drive_plan import GuideError, setup
+from acsard.calibration.guided.equipment import NEEDS
 from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
 from acsard.calibration.guided.runner import guide
 from acsard.calibration.solve import Calibration

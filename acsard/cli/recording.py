@@ -18,18 +18,16 @@ from acsard.cli.recording_files import progress
 from acsard.core.formatting import json_line, many, printable
 from acsard.core.ros.shapes import how_often
 from acsard.host.errors import Exit, ExitError, RecordingError
-from acsard.recording.atomic_output import beside
+from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import listed
-from acsard.recording.end_record import EndRecord, closing, how_it_ends
+from acsard.recording.end_record import EndRecord, how_it_ends, read_end
 from acsard.recording.file import Recording, rewrite
-from acsard.recording.replayed import (
-    because,
-    compared,
-    config_of,
-    differs,
-    live,
-    otherwise,
-    steps,
+from acsard.recording.file_replay import config_of, replay_file, steps
+from acsard.recording.replay_text import (
+    describe_difference,
+    describe_outcome,
+    explain_settings,
+    explain_verdict,
     verdict,
 )
 from acsard.recording.time_span import clock, span
@@ -121,7 +119,7 @@ def main(args: argparse.Namespace) -> int:
     rows: list[tuple[str, ...]] = []
     for path in files:
         try:
-            last = closing(path)
+            last = read_end(path)
             rows.append(_row(path, last) if last else _row_of_unfinished(Recording(path)))
         except RecordingError as error:
             rows.append((path.name, "", "", "", printable(str(error))))
@@ -139,7 +137,7 @@ def _row(path: Path, last: EndRecord, note: str = "") -> tuple[str, ...]:
 
 def _row_of_unfinished(recording: Recording) -> tuple[str, ...]:
     """Return the row of a recording without an end. The whole recording must be read for it."""
-    return _row(recording.path, recording.gist(), _bracketed(recording.missing))
+    return _row(recording.path, recording.compute_end_record(), _bracketed(recording.missing))
 
 
 def _bracketed(text: str) -> str:
@@ -185,24 +183,25 @@ def main_replay(args: argparse.Namespace) -> int:
     recording = _recording(args)
     other = None if args.config is None else load(args.config)[1]
     with progress(recording) as tell:
-        tally, trouble, again = live(recording, other, tell)
-    print(f"{verdict(tally)}\n{compared(other is not None)}")
+        comparison, trouble, failed_step = replay_file(recording, other, tell)
+    print(f"{verdict(comparison)}\n{explain_verdict(other is not None)}")
     began_ns, rows = recording.about.mono_ns, list[str]()
     if other is not None:
-        rows = because(config_of(recording), other, tally, began_ns)
-    if tally.first is not None:
-        rows = [*differs(tally.first, began_ns), *rows, *otherwise(tally)]
-    rows += [again] if again else []
+        rows = explain_settings(config_of(recording), other, comparison, began_ns)
+    if comparison.first is not None:
+        difference = describe_difference(comparison.first, began_ns)
+        rows = [*difference, *rows, *describe_outcome(comparison)]
+    rows += [failed_step] if failed_step else []
     for row in rows:
         print(printable(row))
     _note(recording, trouble or _bracketed(recording.missing))
-    return int(Exit.OK if tally.same or other is not None else Exit.FAILURE)
+    return int(Exit.OK if comparison.same or other is not None else Exit.FAILURE)
 
 
 def main_recover(args: argparse.Namespace) -> int:
     recording, new = _recording(args), Path(args.new)
     try:
-        with beside(new, args.force) as part:
+        with replacing(new, args.force) as part:
             count = rewrite(recording, part)
     except OSError as error:
         raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None

@@ -14,8 +14,8 @@ from acsard.host.child import end_with_parent
 from acsard.host.errors import Exit, ExitError
 from acsard.host.extras import missing
 from acsard.recording import export as exports
-from acsard.recording.atomic_output import beside
-from acsard.recording.end_record import closing
+from acsard.recording.atomic_output import replacing
+from acsard.recording.end_record import read_end
 from acsard.recording.file import Recording
 from acsard.recording.time_span import span
 from acsard.report.page import drawn
@@ -42,7 +42,7 @@ def progress(recording: Recording) -> Iterator[Callable[[int], None]]:
     if not sys.stderr.isatty():
         yield lambda wall_ns: None
         return
-    began_ns, last = recording.about.wall_ns, closing(recording.path)
+    began_ns, last = recording.about.wall_ns, read_end(recording.path)
     whole = f" of {(last.last_ns - began_ns) / 1e9:.0f}" if last else ""
 
     def tell(wall_ns: int) -> None:
@@ -133,7 +133,7 @@ def report(recording: Recording, args: argparse.Namespace, plotly: str) -> list[
         sys.stdout.buffer.write(text.encode())
         return []
     new = Path(args.new or f"{recording.path.name.partition('.')[0]}.html")
-    with _written(new), beside(new, args.force) as file, progress(recording) as tell:
+    with _written(new), replacing(new, args.force) as file, progress(recording) as tell:
         text, notes = drawn(recording, plotly, part, tell)
         file.write_text(text, encoding="utf-8")
     print(f"{new}: {len(text) / 1e6:.1f} MB; open it in any browser")
@@ -145,7 +145,7 @@ def _percent(recording: Recording) -> Callable[[int], None]:
 
     The page's server reads it.
     """
-    last, began = closing(recording.path), recording.about.wall_ns / 1e9
+    last, began = read_end(recording.path), recording.about.wall_ns / 1e9
     end = last.last_ns / 1e9 if last else recording.path.stat().st_mtime
     told = 0
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from acsard.core.config.settings import LogConfig
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.daemon.gateway.fleet_router import Router
-from acsard.daemon.gateway.supervision import Watched
+from acsard.daemon.gateway.listener_process import ListenerProcess
 from acsard.daemon.supervisor import ROUTER, keep_running
 from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
@@ -38,7 +38,7 @@ def main(args: argparse.Namespace) -> int:
             return asyncio.run(_kept(str(args.file), log))
         log_from_environment()
         manager = Systemd({}, os.getpid())
-        return int(Watched(router, log, manager, sys.stdin.fileno()).run())
+        return int(ListenerProcess(router, log, manager, sys.stdin.fileno()).run())
     finally:
         log.close()
 

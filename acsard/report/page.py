@@ -20,7 +20,8 @@ from acsard.core.formatting import lasting, printable
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.recording.file import Recording
-from acsard.recording.replayed import EVERY, Onlooker, Progress, quietly, verdict
+from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
+from acsard.recording.replay_text import verdict
 from acsard.recording.time_span import WHOLE, Span, clock
 from acsard.report.account import Clock, Origin, differences, notes, reasons, rows, summary
 from acsard.report.course import Course
@@ -165,18 +166,18 @@ def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: f
 
 
 def drawn(
-    recording: Recording, library: str, span: Span = WHOLE, progress: Progress = quietly
+    recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
 ) -> tuple[str, list[str]]:
     """Replay a part of a recording; return the text of the file and notes about the recording.
 
     `progress` is called with the wall-clock time reached, in ns. Raises `RecordingError` if nothing
     was recorded in that time.
     """
-    about, looked = recording.about, Onlooker(recording)
+    about, looked = recording.about, DisplayReplay(recording)
     began = about.wall_ns / NS_PER_S
     course = Course(looked.config, began + span.begin, began + span.end)
     for number, (step, outputs, robot) in enumerate(looked.steps()):
-        if number % EVERY == 0:
+        if number % PROGRESS_STEPS == 0:
             progress(step.inputs.now.wall_ns)
         course.step(step, outputs, robot)
         if course.over:
@@ -189,11 +190,11 @@ def drawn(
         )
     course.end()
     said = [*filter(None, [recording.missing]), *looked.notes]
-    tally = looked.replay.tally
-    if not (tally.same or looked.notes or course.missing):
+    comparison = looked.replay.comparison
+    if not (comparison.same or looked.notes or course.missing):
         said.append(
             "this version of acsard computes other results than the recorded ones: "
-            f"{verdict(tally)}"
+            f"{verdict(comparison)}"
         )
     origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
     offset_s = time.localtime(course.began).tm_gmtoff

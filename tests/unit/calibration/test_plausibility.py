@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.doubts import RefusedError, in_range, remarks, turn_units
+from acsard.calibration.plausibility import RefusedError, in_range, remarks, turn_units
 from tests.unit.calibration.cut import BASE, calibrated, usual
 from tests.unit.calibration.robots import Drive
 

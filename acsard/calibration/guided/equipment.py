@@ -1,6 +1,7 @@
-"""The equipment that each way of calibration in `ways.py` needs, in words.
+"""The equipment that each method of calibration needs, in words.
 
-It stands apart so that the command line and the page can name the ways without loading numpy.
+This module is separate from `methods.py` so that the command line and the page can name the methods
+without loading numpy.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ NEEDS: dict[str, str] = {
     "wall": "a straight wall and a tape measure",
     "umbmark": "a tape measure and marks",
 }
+"""Equipment by the name of the method, as `--method` takes it."""
 
 SIMULATED = (
     "positions",
@@ -19,4 +21,4 @@ SIMULATED = (
     "position, or gyro if [odometry] gyro is on, with its distance left empty. tape, wall and "
     "umbmark are for a real robot.",
 )
-"""The way to begin with on the simulator, and why."""
+"""The method to use first on the simulator, and the reason."""

@@ -12,12 +12,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from acsard.calibration.doubts import RefusedError
-from acsard.calibration.guided.legs import MOST_S, WIDEST, GuideError, Slant, setup
-from acsard.calibration.guided.needs import NEEDS
+from acsard.calibration.guided.drive_plan import MOST_S, WIDEST, GuideError, Slant, setup
+from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.methods import METHODS, side_of_square
 from acsard.calibration.guided.runner import guide
-from acsard.calibration.guided.ways import WAYS, side_of_square
 from acsard.calibration.log_table import LogError
+from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.terminal.prompt import Ask
@@ -28,7 +28,7 @@ from tests.unit.calibration.test_solve import off
 
 FEW, MANY = 1, 20
 
-each_way = pytest.mark.parametrize("way", WAYS)
+each_way = pytest.mark.parametrize("way", METHODS)
 so_many = pytest.mark.parametrize("count", [FEW, pytest.param(MANY, marks=pytest.mark.soak)])
 
 
@@ -51,7 +51,7 @@ def robots(way: str, count: int) -> list[tuple[Robot, Calibration, Player, Drive
 @each_way
 def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> None:
     before = np.array([off(d, np.ones(3)) for _, _, _, d in robots(way, count)])
-    after = np.array([off(d, c.found.values) for _, c, _, d in robots(way, count)])
+    after = np.array([off(d, c.multipliers.values) for _, c, _, d in robots(way, count)])
     better = before / after
     rms = float(np.sqrt(np.mean(before**2) / np.mean(after**2)))
     print(f"{way}: heading {rms:.1f} times better, from {min(better):.1f} to {max(better):.1f}")
@@ -65,7 +65,7 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
 def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     z = []
     for robot, found, _, _ in robots(way, count):
-        values, std = found.found.values, found.found.std
+        values, std = found.multipliers.values, found.multipliers.std
         z += [(values[0] - robot.chi * (1 + robot.rate * w)) / std[0] for w in (0, 0.5, 1)]
         z += [(values[1] - robot.left) / std[1], (values[2] - robot.right) / std[2]]
     rms = np.sqrt(np.mean(np.square(z)))
@@ -88,14 +88,14 @@ def test_ninety_seconds_of_driving_are_enough(way: str, count: int) -> None:
 def test_no_track_makes_it_longer_than_it_may_be(way: str, separation: float) -> None:
     made = setup(Config(drive=DriveConfig(wheel_separation=separation)))
     tracks = [1.0 + 0.05 * step for step in range(31)]
-    longest = max(sum(leg.seconds for leg in WAYS[way].legs(made, track)) for track in tracks)
-    assert WAYS[way].longest_s(made) == longest <= MOST_S
+    longest = max(sum(leg.seconds for leg in METHODS[way].legs(made, track)) for track in tracks)
+    assert METHODS[way].longest_s(made) == longest <= MOST_S
 
 
 @each_way
 def test_what_it_improves_is_told(way: str) -> None:
     for _, found, _, _ in robots(way, FEW):
-        now, then = found.gain.turn.now, found.gain.turn.then
+        now, then = found.improvement.turn.before, found.improvement.turn.after
         assert now is not None
         assert then is not None
         assert then < now / 5
@@ -135,14 +135,14 @@ def talk(way: str) -> Talk:
 def test_a_person_reads_what_is_needed_and_how_long_each_leg_takes(way: str) -> None:
     first, *legs = talk(way).shown
     assert first.startswith(f"Calibration with {NEEDS[way]}. The robot drives for at most ")
-    assert f" {WAYS[way].longest_s(usual_setup()):.0f} s in all." in first
+    assert f" {METHODS[way].longest_s(usual_setup()):.0f} s in all." in first
     assert [text.split(".")[0] for text in legs] == [str(n + 1) for n in range(len(legs))]
     assert all(text.endswith(" s)") for text in legs)
 
 
 @each_way
 def test_the_names_of_a_table_are_its_own(way: str) -> None:
-    table = WAYS[way]
+    table = METHODS[way]
     legs = table.legs(usual_setup(), 1.6)
     names = [leg.name for leg in legs]
     assert len(set(names)) == len(names)
@@ -161,10 +161,10 @@ def test_the_names_of_a_table_are_its_own(way: str) -> None:
 
 @each_way
 def test_legs_before_the_track_is_known_do_not_depend_on_it(way: str) -> None:
-    narrow, wide = (WAYS[way].legs(usual_setup(), track) for track in (1.0, WIDEST))
+    narrow, wide = (METHODS[way].legs(usual_setup(), track) for track in (1.0, WIDEST))
     for one, other in zip(narrow, wide, strict=True):
         assert one == other
-        if any(measure.what == "turned" for measure in one.measures):
+        if any(measure.quantity == "turned" for measure in one.measures):
             break
 
 
@@ -189,7 +189,7 @@ def test_short_lengths_are_asked_in_mm_and_the_long_one_in_m() -> None:
 def test_left_and_right_come_apart_by_what_is_driven_between_two_half_turns() -> None:
     robot = anyone(1)
     robot.left, robot.right = 1.005, 0.995
-    found = play("wall", Player(robot)).found
+    found = play("wall", Player(robot)).multipliers
     ratio = found.values[1] / found.values[2]
     assert ratio == pytest.approx(1.01, abs=0.006)
 
@@ -224,7 +224,7 @@ def test_for_small_errors_it_is_what_borenstein_and_feng_have() -> None:
     """
     robot = replace(Robot(chi=1.3, left=0.999, right=1.001), **IDEAL)  # type: ignore[arg-type]
     player = Exact(robot)
-    found = play("umbmark", player).found
+    found = play("umbmark", player).multipliers
     side = side_of_square(usual_setup())
     left, right = player.ends
     # Left is counter-clockwise. In the frame of their paper the first side is along x, and y is to
@@ -253,13 +253,13 @@ def test_a_tape_beside_the_gyro_measures_the_wheels() -> None:
     robot = replace(anyone(3), left=0.95, right=0.952)
     found = play("gyro", Player(robot, gyro=True))
     assert found.scale == "distance"
-    assert found.found.values[1] == pytest.approx(0.95, rel=0.02)
+    assert found.multipliers.values[1] == pytest.approx(0.95, rel=0.02)
 
 
 def test_without_a_tape_the_size_of_the_wheels_stays_as_configured() -> None:
     found = play("gyro", Blind(anyone(3), gyro=True))
     assert found.scale == ""
-    assert found.found.values[1:].mean() == pytest.approx(1.0, abs=1e-6)
+    assert found.multipliers.values[1:].mean() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_gyro_that_says_one_and_the_same_is_refused() -> None:

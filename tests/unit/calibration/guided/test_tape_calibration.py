@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 
 from acsard.calibration.calibration_report import keys, parts, report
-from acsard.calibration.doubts import RefusedError
-from acsard.calibration.guided.measured import calibrated
-from acsard.calibration.guided.readings import Reading
+from acsard.calibration.guided.tape_calibration import calibrated
+from acsard.calibration.guided.tape_readings import Reading
+from acsard.calibration.plausibility import RefusedError
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
 from acsard.terminal.output import plain
-from tests.unit.calibration.guided.test_readings import readings
+from tests.unit.calibration.guided.test_tape_readings import readings
 
 DRIVE = DriveConfig()
 
 
 def test_errors_are_those_of_what_is_configured_and_of_what_was_found() -> None:
     made = calibrated("a tape", readings(), DRIVE)
-    assert made.gain.turn.now == pytest.approx(180, rel=0.05)
-    assert made.gain.turn.then is not None
-    assert made.gain.turn.then < 10
+    assert made.improvement.turn.before == pytest.approx(180, rel=0.05)
+    assert made.improvement.turn.after is not None
+    assert made.improvement.turn.after < 10
     assert made.drives.runs == 3
     assert made.drives.turns == pytest.approx(15 * 1.2 / 1.5 / 2 / np.pi, rel=0.15)
 
@@ -38,6 +38,6 @@ def test_people_read_it_and_the_configuration_takes_it() -> None:
 
 
 def test_readings_that_tell_too_little_are_refused() -> None:
-    vague = [Reading(one.rides, one.what, one.value, 100 * one.deviation) for one in readings()]
+    vague = [Reading(one.rides, one.quantity, one.value, 100 * one.deviation) for one in readings()]
     with pytest.raises(RefusedError, match="too inaccurate"):
         calibrated("a tape", vague, DRIVE)

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.guided.legs import (
+from acsard.calibration.guided.drive_plan import (
     FASTEST_WHEEL,
-    SLOW,
+    USUAL_SPEED,
     GuideError,
     Leg,
     Move,
     setup,
 )
-from acsard.calibration.guided.ways import WAYS
+from acsard.calibration.guided.methods import METHODS
 from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
 from tests.unit.calibration.guided.room import beyond
 
@@ -45,7 +45,7 @@ def test_no_command_is_beyond_the_limits_or_faster_than_slow(
     limits = LimitsConfig(linear_speed=linear, angular_speed=angular, wheel_speed=wheel)
     made = setup(robot(separation, multiplier, limits))
     ahead, spin = made.ahead(1.0), made.spin(rate, 1.0)
-    assert ahead.linear <= min(SLOW, linear) + 1e-12
+    assert ahead.linear <= min(USUAL_SPEED, linear) + 1e-12
     assert abs(spin.angular) <= angular * (1 + 1e-12)
     rolls = abs(spin.angular) * multiplier * separation / 2
     assert rolls <= min(FASTEST_WHEEL, wheel * 0.05) * (1 + 1e-12)
@@ -61,7 +61,7 @@ def test_a_turn_by_the_true_track_is_the_angle_whatever_is_configured(
     assert move.angular * multiplier / track * move.seconds == pytest.approx(angle)
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", METHODS)
 @pytest.mark.parametrize("separation", [0.15, 0.3, 0.6])
 @pytest.mark.parametrize("multiplier", [1.0, 1.6])
 def test_every_point_of_the_robot_stays_in_the_room(

@@ -1,59 +1,60 @@
-"""The table of the ways of calibration by a guided drive, and the legs of each.
+"""The table of the methods of calibration by a guided drive, and the legs of each.
 
 UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
-Robots (1995): the robot drives a square in both directions, and a person measures how far its end
-is from its start. They use two formulas for small errors. Here the same measurements go into the
-general fit, because the effective track of a robot that skids is not a small error.
+Robots (1995): the robot drives a square in both directions, and a person measures the distance
+between its start and its end. The paper evaluates this distance with two formulas for small errors.
+Here the same measurements go into the fit of `tape_readings.py` instead, because the track of a
+robot that skids is far from the configured one.
 """
 
 from __future__ import annotations
 
 import math
 
-from acsard.calibration.guided.legs import (
+from acsard.calibration.guided.drive_plan import (
     EDGE,
     ROOM,
     WIDEST,
     Leg,
     Mean,
     Measure,
+    Method,
     Move,
     Setup,
     Slant,
-    Way,
 )  # fmt: skip
 from acsard.calibration.tape_distance import LEAST_M
 from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
-"""Standard deviation of the long distance, including the position of its ends, m."""
+"""Standard deviation of the length of the straight drive by tape, m, both ends included."""
 
 BY_EYE = 0.07
 """Standard deviation of a heading that a person judges by eye, rad."""
 
 END_M = 0.003
-"""Standard deviation of the end of a square relative to the marks, m.
+"""Standard deviation of the distance between the marks and the end of a square, m.
 
-It includes the error of placing the robot on them.
+It includes the error with which the person placed the robot beside the marks.
 """
 
-FIRST = 1.2
+FIRST_TURN = 1.2
 """Rate of the first turn as it would be without skidding, rad/s."""
 
-LATE = 1.1
-"""Timeout of the first turn, as a multiple of the duration with the widest track.
+MISSED = 1.1
+"""Timeout of the first turn, as a multiple of the time that the widest track needs.
 
-Beyond it, the person has missed the end of the turn.
+After the timeout, the person has missed the moment at which the circle was full.
 """
 
 MOST_SPIN_S = 24.0
 """Longest time for several turns on the spot, s."""
 
 STOP, SETTLE = Move(0.6), Move(1.0)
-"""Pauses before and after a move."""
+"""Pauses before and after a move: to come to rest, and to let the robot stop shaking."""
 
 ROUND = "once round"
-"""Name of the leg that a person ends with a key."""
+"""Name of the leg of the first turn, which a person ends with a key."""
 
 FROM_MARK = Ask(
     "How far is that wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
@@ -70,20 +71,28 @@ def _at_the_edge(setup: Setup) -> str:
 
 
 def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
-    """Return a leg that turns to the left until a key is pressed."""
-    longest = LATE * 2 * math.pi * WIDEST
-    rate = abs(setup.command(FIRST)) * setup.drive.wheel_separation_multiplier
+    """Return the leg in which the robot turns to the left until the person presses a key.
+
+    `until` ends the sentence that begins with "Press SPACE".
+    """
+    longest = MISSED * 2 * math.pi * WIDEST
+    rate = abs(setup.command(FIRST_TURN)) * setup.drive.wheel_separation_multiplier
     words = f"The robot turns to the left on the spot. Press SPACE {until}"
-    return Leg(ROUND, words, (setup.spin(FIRST, longest / rate),), asks, measures, by_key=True)
+    turn = setup.spin(FIRST_TURN, longest / rate)
+    return Leg(ROUND, words, (turn,), asks, measures, by_key=True)
 
 
 def turns(setup: Setup, rate: float, track: float, most: int) -> int:
-    """Return the number of whole turns that fit into `MOST_SPIN_S`, from 1 to `most`."""
+    """Return the number of whole turns on the spot that fit into `MOST_SPIN_S`, from 1 to `most`.
+
+    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
+    separation.
+    """
     one = setup.turn(2 * math.pi, rate, track).seconds
     return max(1, min(most, int(MOST_SPIN_S / one)))
 
 
-# A tape measure beside a straight line.
+# The method "tape": a tape measure, and a straight line on the floor.
 
 TO_LINE = (
     Ask(
@@ -96,6 +105,7 @@ TO_LINE = (
     Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
 )
 LINE = "front", "rear", "wheelbase"
+"""Names of the answers `near`, `far` and `apart` of a `Slant`, for a line on the robot's left."""
 
 
 def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -138,7 +148,7 @@ def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
     )
 
 
-# A tape measure and a wall that the robot is set square against.
+# The method "wall": a tape measure, and a wall that a person sets the robot's back against.
 
 GAP_M = 0.2
 """Distance from the wall to which the robot returns, m."""
@@ -147,7 +157,7 @@ OUT_M = 0.9
 """Distance that the robot drives before the turns on the spot, m."""
 
 HALF_RATE, ROUND_RATE = 0.8, 1.2
-"""True rates of the half turns and of the whole turns, rad/s."""
+"""True turn rates for half turns and for whole turns, rad/s."""
 
 SQUARE = (
     "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
@@ -161,8 +171,8 @@ def _corners(end: str) -> tuple[Ask, Ask]:
     )
 
 
-# A turn to the left brings the left corner closer to the wall if the robot's back faces the wall,
-# and the right corner if its front does.
+# A turn to the left moves the rear left corner towards a wall behind the robot, and the front right
+# corner towards a wall in front of it.
 REAR, FRONT = ("left", "right", "rear width"), ("right", "left", "front width")
 
 
@@ -221,17 +231,15 @@ def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
     )  # fmt: skip
 
 
-# UMBmark: squares in both directions.
-
-SIDE_M = 1.2
+# The method "umbmark": squares in both directions, and marks on the floor.
 
 CORNER_RATE = 0.9
 """True turn rate at the corners, rad/s."""
 
 
 def side_of_square(setup: Setup) -> float:
-    """Return the length of the square's side, m."""
-    return min(SIDE_M, ROOM - 2 * (setup.from_edge + 2 * EDGE))
+    """Return the length of the square's side, m: 1.2 m, or less if the robot is large."""
+    return min(1.2, ROOM - 2 * (setup.from_edge + 2 * EDGE))
 
 
 def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
@@ -289,25 +297,26 @@ def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
     )  # fmt: skip
 
 
-# Sensors: a gyro or positions. The legs go there and back, whatever the track is.
+# The methods "gyro" and "positions". Each drive goes there and back, so the robot stays on the
+# floor although its effective track is unknown.
 
 FAST, SLOW, CURVE = 1.5, 0.75, 0.8
-"""Rates of turns and curves as they would be without skidding, rad/s."""
+"""Rates of fast turns, slow turns and curves as they would be without skidding, rad/s."""
 
 SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
 """Duration of a turn for a gyro, length of a curve, and angle of a turn for positions."""
 
 PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
-"""Rates of each turn on the spot and of the curve after it, rad/s, without skidding."""
+"""Rates of each turn on the spot and of the curve after it, rad/s, as without skidding."""
 
 STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
-"""Pauses: at first, in between, and where the robot only has to stop.
+"""Pauses: before the first drive, between drives, and where the robot only has to stop.
 
-The gyro bias is measured in the longer ones.
+`STANDING` and `PAUSE` are long enough to measure the gyro bias in them.
 """
 
 STRAIGHT = "straight"
-"""Name of the leg that the tape measures."""
+"""Name of the leg whose length the person measures by tape."""
 
 
 def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
@@ -343,11 +352,11 @@ def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
-    # Positions show a turn on the spot only by the curve that follows it.
+    # Positions show a turn on the spot only through the direction of the curve that follows it.
     moves = [SHORT, setup.ahead(-setup.to_middle), SHORT]
-    for rate, bend in PETALS:
-        moves += [setup.spin(rate, TURN_RAD / abs(rate)), SHORT]
-        moves += _there_and_back(setup, bend)
+    for turn_rate, curve_rate in PETALS:
+        moves += [setup.spin(turn_rate, TURN_RAD / abs(turn_rate)), SHORT]
+        moves += _there_and_back(setup, curve_rate)
     return (
         _straight(setup),
         Leg(
@@ -360,7 +369,10 @@ def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
 
 
 def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
-    """Return a curve from the middle that stays on the floor in any direction, and its way back."""
+    """Return a curve from the middle of the floor and the same curve backwards.
+
+    The curve stays on the floor whatever the robot's heading is.
+    """
     metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
     return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
 
@@ -378,10 +390,10 @@ FRONT_WIDTH = Ask(
 )
 WIDTH = Ask("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
 
-WAYS: dict[str, Way] = {
-    "gyro": Way(_gyro),
-    "positions": Way(_positions),
-    "tape": Way(_tape, (WHEELBASE,), "a tape"),
-    "wall": Way(_wall, (REAR_WIDTH, FRONT_WIDTH), "a wall"),
-    "umbmark": Way(_umbmark, (WIDTH,), "UMBmark"),
+METHODS: dict[str, Method] = {
+    "gyro": Method(_gyro),
+    "positions": Method(_positions),
+    "tape": Method(_tape, (WHEELBASE,), "a tape"),
+    "wall": Method(_wall, (REAR_WIDTH, FRONT_WIDTH), "a wall"),
+    "umbmark": Method(_umbmark, (WIDTH,), "UMBmark"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from acsard.calibration.paths import blocks, gaps, inside, rests, wheels
+from acsard.calibration.wheel_angles import angles_of, blocks, gaps, inside, rests
 from tests.unit.calibration.cut import log_of
 
 HEADER = "t,left,right,yaw_rate\n"
@@ -19,14 +19,14 @@ def drive(*parts: tuple[float, float, float]) -> str:
 
 
 def test_angles_are_sums_of_speeds() -> None:
-    turned = wheels(log_of(drive((0, 10, 2.0))).runs[0])
+    turned = angles_of(log_of(drive((0, 10, 2.0))).runs[0])
     left, right = turned.angles(np.array([0.0, 5.0, 9.0]))
     assert np.allclose(left, [0, 10, 18])
     assert np.allclose(right, [0, -10, -18])
 
 
 def test_nothing_is_known_of_a_gap() -> None:
-    turned = wheels(log_of(drive((0, 5, 2.0), (8, 10, 2.0))).runs[0])
+    turned = angles_of(log_of(drive((0, 5, 2.0), (8, 10, 2.0))).runs[0])
     assert turned.gaps.shape == (1, 2)
     left, _ = turned.angles(np.array([4.99, 8.0]))
     assert left[0] == left[1]
@@ -48,7 +48,7 @@ def test_a_rest_is_where_all_wheels_stand_long_enough() -> None:
 
 def test_blocks_leave_out_standstills_and_gaps() -> None:
     runs = log_of(drive((0, 100, 0.0), (100, 140, 1.0), (160, 200, 1.0))).runs
-    angles = [wheels(run) for run in runs]
+    angles = [angles_of(run) for run in runs]
     parts = blocks(runs, angles, 4.0)
     assert 14 <= len(parts) <= 18
     assert all(part.end > 100 and not part.begin < 150 < part.end for part in parts)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
-from acsard.daemon.kept_latches import (
+from acsard.daemon.latch_rules import (
     ANSWER_NS,
     MAX_BYTES,
     Handover,

@@ -9,18 +9,18 @@ from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.core.values import Received
-from acsard.recording.chunks import MOST_IN_MESSAGE
+from acsard.recording.chunks import MAX_MESSAGE_BYTES
 from acsard.recording.directory import listed
-from acsard.recording.disk import BATCH, OnDisk
 from acsard.recording.file import Recording
-from acsard.recording.replayed import steps
+from acsard.recording.file_replay import steps
+from acsard.recording.step_writer import BATCH, StepWriter
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
 
 def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: Path) -> None:
     """The reader refuses larger messages, and with one the rest of its chunk."""
-    tape, dice, each = Tape(), random.Random(1), MOST_IN_MESSAGE // 40
+    tape, dice, each = Tape(), random.Random(1), MAX_MESSAGE_BYTES // 40
     World(recorder=tape).run(0.5)
     items = [
         taken._replace(
@@ -32,10 +32,10 @@ def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: P
     ]
     assert len(items) < BATCH
     config = replace(Config(), record=RecordConfig(str(tmp_path), 100.0))
-    disk = OnDisk(config, lambda event: None, lambda: None, 0)
-    disk.round([*items], False)
-    disk.round([*tape.taken[50:]], True)
-    assert disk.missing == 0
+    writer = StepWriter(config, lambda event: None, lambda: None, 0)
+    writer.write([*items], False)
+    writer.write([*tape.taken[50:]], True)
+    assert writer.lost == 0
     (path,) = listed(tmp_path)
     read = list(steps(Recording(path)))
     assert [step.number for step in read] == list(range(len(tape.taken)))

@@ -1,7 +1,7 @@
-"""Validation of a log: signs, sides, units and times.
+"""Checks whether a log and its calibration are plausible: signs, sides, units and times.
 
-Errors that would corrupt the calibration are refused, with their probable cause. Deviations that
-the calibration corrects are reported as remarks.
+A log with an error that would spoil the calibration is refused, and the message names the probable
+cause. Unusual facts that the calibration corrects or tolerates are reported as remarks.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base
+from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base
 from acsard.calibration.log_table import Floats
-from acsard.calibration.search import Begin
+from acsard.calibration.search import StartingPoint
 from acsard.core.values import AcsardError
 
 UNLIKE = 0.5
-"""Fraction of a sensor's motion that the wheels may leave unexplained."""
+"""Largest part of a sensor's motion that the wheels may leave unexplained, as squares."""
 
 UNITS = 8.0
 """Factor by which a result may be too large or too small. Beyond it, a unit must be wrong."""
@@ -28,7 +28,10 @@ A robot that skids turns further than this. If it turns less, its wheel speeds a
 """
 
 FAR_SIZE = 2e-3
-"""Ratio of radii below which the positions, not the wheel speeds, have a wrong unit."""
+"""Ratio of the measured radius to the configured one below which the positions have a wrong unit.
+
+Between it and 1 / `UNITS`, the wheel speeds have a wrong unit.
+"""
 
 FASTEST_TURN = 12.0
 """Fastest credible turn rate, rad/s.
@@ -39,33 +42,44 @@ A higher rate is in degrees, since no robot turns twice a second.
 LEAST_CHI = 0.4
 """Smallest ratio of effective track to wheel separation.
 
-Wheels that skid make the effective track larger, and nothing makes it this much smaller.
+WheelAngles that skid make the effective track larger, and nothing makes it this much smaller.
 """
 
 LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
 """Range of multipliers that the configuration accepts."""
 
-
 NOTABLE_S, FAR_S = 0.005, 0.5
+"""Delay of a sensor, s, from which it is reported, and above which the advice is to set clocks."""
+
 LARGE_BIAS = 0.05
-"""Gyro bias above which a remark is made, rad/s."""
+"""Gyro bias, rad/s, above which it is reported."""
+
 ONE_SIDED = 0.1
-"""Fraction of the turns below which the less frequent side is reported as missing."""
+"""Ratio of the turns to one side to those to the other below which this is reported."""
+
 ODD_SIZE = 1.25
+"""Ratio of the measured radius to the configured one from which it is reported."""
+
 LEAST_TRACK, MOST_TRACK = 0.85, 3.0
-"""Ratio of effective to configured track; values outside this range are reported."""
+"""Ratios of effective track to wheel separation that are usual. Others are reported."""
 
 
 class RefusedError(AcsardError):
-    """Refusal of a log that cannot be used for a calibration. The text says why and what to do."""
+    """The log cannot be used for a calibration. The text says why and what to do."""
 
 
 class UnlikeError(RefusedError):
-    """Refusal because positions do not follow the wheels over blocks of the length tried."""
+    """The positions do not follow the wheels in blocks of the length that was tried."""
 
 
 def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
-    """Raise `RefusedError` if the sensor does not show the turns of the wheels, of either sign."""
+    """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
+
+    Args:
+        source: the name of the heading sensor.
+        turned: the turn of each row by the sensor, rad.
+        by_wheels: the turn of each row by the wheels, rad, scaled to fit the sensor best.
+    """
     spread = float(turned @ turned)
     if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
         raise RefusedError(
@@ -75,8 +89,8 @@ def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
         )
 
 
-def places_follow(begun: Begin) -> None:
-    """Raise `RefusedError` if the positions do not show the path of the wheels."""
+def positions_follow(begun: StartingPoint) -> None:
+    """Raise `UnlikeError` if the positions do not follow the path of the wheels."""
     if begun.unexplained > UNLIKE:
         raise UnlikeError(
             "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
@@ -84,17 +98,17 @@ def places_follow(begun: Begin) -> None:
         )
 
 
-def turns_the_right_way(source: str, sides: Floats | None, begun: Begin | None) -> None:
+def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
     """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
 
     Args:
         source: the name of the heading sensor.
-        sides: g_l and g_r that the heading sensor gives, or None.
-        begun: the best starting point that the positions give, or None.
+        sides: the result of `heading.first`, or None without a heading sensor.
+        begun: the best starting point that the positions give, or None without positions.
     """
     left = right = 1.0
     if begun is not None:
-        left, right = np.sign(begun.parameters[[LEFT, RIGHT]] * begun.parameters[TURN])
+        left, right = np.sign(begun.parameters[[LEFT, RIGHT]] * begun.parameters[INVERSE_TRACK])
     by_places = {(1.0, 1.0): "", (-1.0, -1.0): "turn", (-1.0, 1.0): "left"}.get(
         (left, right), "right"
     )
@@ -119,25 +133,32 @@ def turns_the_right_way(source: str, sides: Floats | None, begun: Begin | None) 
             f"{other}"
         )
     if by_heading:
-        seen = source or "the positions"
-        also = "" if begun is not None and sides is not None else _ALSO[sides is not None]
-        raise RefusedError(
-            f"by {seen} the robot turns in the opposite direction than by the wheels: the columns "
-            f"of left and right are swapped, or ahead is negative on both sides{also}"
+        sensor = source or "the positions"
+        # If both sensors agree, the wheels are wrong. Otherwise the only sensor may be wrong.
+        or_sensor = (
+            ""
+            if begun is not None and sides is not None
+            else ", or x and y are swapped, or y is positive to the right"
+            if sides is None
+            else ", or the sensor is positive to the right (it must be positive to the left)"
         )
-
-
-_ALSO = {
-    True: ", or the sensor is positive to the right (it must be positive to the left)",
-    False: ", or x and y are swapped, or y is positive to the right",
-}
+        raise RefusedError(
+            f"by {sensor} the robot turns in the opposite direction than by the wheels: the "
+            "columns of left and right are swapped, or ahead is negative on both sides"
+            f"{or_sensor}"
+        )
 
 
 def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
     """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
 
-    If the wheel speeds have a wrong unit as well, one error may hide the other. `turned` is in rad
-    per row.
+    The wheels are not compared here: if their speeds are in degrees too, both errors hide each
+    other.
+
+    Args:
+        source: the name of the heading sensor.
+        turned: the turn of each row by the sensor, rad.
+        seconds: the length of each row, s.
     """
     rate = float(np.percentile(np.abs(turned) / seconds, 90))
     if rate > FASTEST_TURN:
@@ -148,7 +169,7 @@ def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
 
 
 def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
-    """Raise `RefusedError` if the turns are so much too large or too small that a unit is wrong.
+    """Raise `RefusedError` if the turns are so far from the wheels' that a unit must be wrong.
 
     Args:
         source: the name of the sensor of turns.
@@ -171,10 +192,10 @@ def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
     )
 
 
-def way_units(size: float, base: Base) -> None:
-    """Raise `RefusedError` if the way is so much too long or too short that a unit is wrong.
+def distance_units(size: float, base: Base) -> None:
+    """Raise `RefusedError` if distances are so far from the wheels' that a unit must be wrong.
 
-    `size` is the ratio of the radius found to the configured one.
+    `size` is the ratio of the measured radius to the configured one.
     """
     if 1 / UNITS < size < UNITS:
         return
@@ -205,19 +226,25 @@ def in_range(values: Floats) -> None:
 
 
 def remarks(
-    late: dict[str, float], bias: float, turned: Floats, values: Floats, base: Base, *, sized: bool
+    delays: dict[str, float],
+    bias: float,
+    turned: Floats,
+    values: Floats,
+    base: Base,
+    *,
+    sized: bool,
 ) -> Iterator[str]:
     """Yield a sentence for each unusual fact that the calibration corrects or tolerates.
 
     Args:
-        late: the delay of each sensor behind the wheels, s.
+        delays: the delay of each sensor behind the wheels, s.
         bias: the gyro bias, rad/s.
-        turned: the turns of all rows, rad, positive to the left.
+        turned: the turn of each row, rad, positive to the left.
         values: the multipliers of the track, the left and the right radius.
         base: the configured geometry.
         sized: whether the size of the wheels was measured.
     """
-    for source, seconds in late.items():
+    for source, seconds in delays.items():
         if abs(seconds) >= NOTABLE_S:
             word = "later" if seconds > 0 else "earlier"
             far = "; set the clocks" if abs(seconds) > FAR_S else ""

@@ -1,8 +1,9 @@
-"""Motion of the wheels in a run: angles over time, rests, and the blocks that the run is cut into.
+"""Angles of the wheels over time, the rests of a run, and the blocks that a run is cut into.
 
-A block is a few seconds of driving. All estimates are sums over blocks, and the standard deviations
-come from the disagreement between blocks. Errors within a block are correlated, since a skid lasts
-as long as its turn; errors of different blocks hardly are.
+A block is a few seconds of driving. Every estimate of the calibration is a sum over blocks, and the
+standard deviations come from the differences between blocks. The errors within a block are
+correlated, because a wheel skids throughout a turn. The errors of different blocks are nearly
+independent.
 """
 
 from __future__ import annotations
@@ -17,43 +18,50 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Run
 
 GAP_S, GAP_PERIODS = 0.3, 5.0
-"""Distance of samples, in s and in usual periods, above both of which there is a gap.
+"""Interval between two samples above which there is a gap: in s, and in usual periods.
 
-Nothing is known of the motion within a gap.
+A gap exceeds both. The motion within a gap is unknown.
 """
 
 STILL = 0.02
 """Speed below which a wheel stands, rad/s."""
 
 BLOCKS = 16
-SHORTEST_S, LONGEST_S = 4.0, 12.0
-"""Target length of blocks, s; `BLOCKS` is the target number."""
+"""Number of blocks that a log should have. Their length is limited by `LONGEST_S`."""
+
+LONGEST_S = 12.0
+"""Longest block, s, unless the caller asks for longer ones."""
 
 SMOOTH_S = 0.3
-"""Time over which a turn rate is averaged before it is squared, s.
+"""Time over which a wheel speed is averaged before it is squared, s.
 
-A coarse encoder otherwise shows 0 or far too much.
+Without it, the speeds of a coarse encoder would be 0 in some samples and far too large in others.
 """
 
 LEAST_TURN = 0.2
-"""Turn of the faster side, rad, below which a block is not used."""
+"""Angle of the faster side's wheels, rad, below which a block is not used."""
 
 
-class Wheels(Struct, frozen=True):
-    """Angle of each side in rad at times `t`. Motion within gaps is left out."""
+class WheelAngles(Struct, frozen=True):
+    """The angles that the left and the right wheels of a run have rolled. Gaps add nothing."""
 
     t: Floats
+    """Times of the samples, s."""
     left: Floats
+    """Angle of the left wheels at these times, rad."""
     right: Floats
     gaps: Floats
     """Gaps, one row (begin, end) each, in s."""
 
     def angles(self, t: Floats) -> tuple[Floats, Floats]:
-        """Return the angles of left and right at any times."""
+        """Return the angles of the left and the right wheels at these times, rad."""
         return np.interp(t, self.t, self.left), np.interp(t, self.t, self.right)
 
-    def apart(self, t: Floats) -> Floats:
-        """Return the speed of right minus left around these times, rad/s."""
+    def speed_difference(self, t: Floats) -> Floats:
+        """Return the speed of the right wheels minus that of the left at these times, rad/s.
+
+        It is an average over `SMOOTH_S`.
+        """
         begin, end = (np.clip(t + s / 2, self.t[0], self.t[-1]) for s in (-SMOOTH_S, SMOOTH_S))
         (left, right), (far_left, far_right) = self.angles(begin), self.angles(end)
         turned = far_right - right - (far_left - left)
@@ -61,10 +69,12 @@ class Wheels(Struct, frozen=True):
 
 
 class Block(Struct, frozen=True):
-    """A part of a run, in s."""
+    """A part of a run."""
 
     run: int
+    """Number of the run."""
     begin: float
+    """Time in s, like `end`."""
     end: float
 
 
@@ -78,30 +88,31 @@ def gaps(t: Floats) -> Floats:
 
 
 def inside(begin: Floats, end: Floats, holes: Floats) -> npt.NDArray[np.bool_]:
-    """Return a mask of the intervals that touch none of the gaps."""
+    """Return a mask of the intervals from `begin` to `end` that touch none of the gaps `holes`."""
     after = np.searchsorted(holes[:, 1], begin, side="right")
     before = np.searchsorted(holes[:, 0], end, side="left")
     return np.asarray(after == before)
 
 
-def wheels(run: Run) -> Wheels:
-    """Return the angles of a run, integrated from its speeds by the trapezoidal rule."""
+def angles_of(run: Run) -> WheelAngles:
+    """Return the wheel angles of a run, integrated from its speeds by the trapezoidal rule."""
     holes = gaps(run.t)
     steps = np.diff(run.t)
     steps[np.isin(run.t[:-1], holes[:, 0])] = 0.0
     angles = [cumulative((v[1:] + v[:-1]) / 2 * steps) for v in (run.left, run.right)]
-    return Wheels(run.t, angles[0], angles[1], holes)
+    return WheelAngles(run.t, angles[0], angles[1], holes)
 
 
 def cumulative(steps: Floats) -> Floats:
-    """Return the cumulative sums from 0 on, one element more than `steps` has."""
+    """Return 0 and the cumulative sums of `steps`: one element more than `steps` has."""
     return np.concatenate((np.zeros(1), np.cumsum(steps)))
 
 
 def rests(run: Run, least_s: float, edge_s: float) -> Floats:
-    """Return (begin, end) of each time in which all wheels stood.
+    """Return the rests of a run, one row (begin, end) each, in s. All wheels stand in a rest.
 
-    A margin of `edge_s` is cut off at both ends, and at least `least_s` must remain.
+    A margin of `edge_s` is cut off at both ends. Rests of which less than `least_s` remains are
+    left out.
     """
     moving = (np.abs(run.left) > STILL) | (np.abs(run.right) > STILL)
     changes = np.flatnonzero(np.diff(np.concatenate(([True], moving, [True])).astype(np.int8)))
@@ -110,18 +121,21 @@ def rests(run: Run, least_s: float, edge_s: float) -> Floats:
     return np.array(found, dtype=np.float64).reshape(-1, 2)
 
 
-def blocks(driven: Sequence[Run], angles: Sequence[Wheels], shortest_s: float) -> list[Block]:
-    """Return the blocks of all runs in which the robot moved."""
+def blocks(driven: Sequence[Run], angles: Sequence[WheelAngles], shortest_s: float) -> list[Block]:
+    """Return the blocks of all runs, without those in which the robot hardly moved.
+
+    A block is `shortest_s` long, or longer if the log would otherwise have over `BLOCKS` blocks.
+    """
     moved = sum(_moving_s(run) for run in driven)
     length = float(np.clip(moved / BLOCKS, shortest_s, max(LONGEST_S, shortest_s)))
     found = []
-    for number, (run, turned) in enumerate(zip(driven, angles, strict=True)):
-        ends = np.concatenate((turned.gaps[:, 0], run.t[-1:]))
-        begins = np.concatenate((run.t[:1], turned.gaps[:, 1]))
+    for number, (run, wheels) in enumerate(zip(driven, angles, strict=True)):
+        ends = np.concatenate((wheels.gaps[:, 0], run.t[-1:]))
+        begins = np.concatenate((run.t[:1], wheels.gaps[:, 1]))
         for begin, end in zip(begins, ends, strict=True):
             count = max(1, round((end - begin) / length))
             edges = np.linspace(begin, end, count + 1)
-            left, right = turned.angles(edges)
+            left, right = wheels.angles(edges)
             for at in range(count):
                 a, b = edges[at], edges[at + 1]
                 if b > a and _turned(run, a, b, left[at : at + 2], right[at : at + 2]):
@@ -130,7 +144,10 @@ def blocks(driven: Sequence[Run], angles: Sequence[Wheels], shortest_s: float) -
 
 
 def _turned(run: Run, begin: float, end: float, left: Floats, right: Floats) -> bool:
-    """Return whether the wheels turned enough there; turning back and forth counts as well."""
+    """Return whether the wheels turned enough from `begin` to `end`, back and forth included.
+
+    `left` and `right` are the angles at both times.
+    """
     if max(abs(left[1] - left[0]), abs(right[1] - right[0])) >= LEAST_TURN:
         return True
     a, b = np.searchsorted(run.t, (begin, end))

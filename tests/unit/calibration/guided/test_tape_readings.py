@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from acsard.calibration.doubts import RefusedError
-from acsard.calibration.evidence import LEFT, RIGHT, TURN
-from acsard.calibration.guided.legs import WIDEST, GuideError, What
-from acsard.calibration.guided.readings import (
+from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT
+from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Quantity
+from acsard.calibration.guided.methods import MOST_SPIN_S, once_round, turns
+from acsard.calibration.guided.tape_readings import (
     Reading,
-    effective,
-    found,
+    fit_readings,
     joined,
     predicted,
     slant,
+    track_ratio,
 )  # fmt: skip
-from acsard.calibration.guided.ways import MOST_SPIN_S, once_round, turns
+from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.runs import Run
 from acsard.core.config.settings import DriveConfig
 from tests.unit.calibration.cut import BASE, IDEAL, log_of
@@ -58,33 +58,33 @@ def readings() -> list[Reading]:
 
 
 def test_exact_readings_give_the_robot() -> None:
-    told = found(readings(), BASE)
-    assert 1 / told.parameters[TURN] == pytest.approx(1.5, rel=2e-3)
+    told = fit_readings(readings(), BASE)
+    assert 1 / told.parameters[INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
     assert told.parameters[LEFT] == pytest.approx(0.98, rel=1e-3)
     assert told.parameters[RIGHT] == pytest.approx(1.01, rel=1e-3)
-    assert np.all(np.abs(told.left) < 3e-3)
+    assert np.all(np.abs(told.residuals) < 3e-3)
 
 
 def test_whole_turns_that_were_not_counted_do_not_matter() -> None:
     given = readings()
     spin, _, turned = driven(SPIN)
     given.append(Reading((spin,), "angle", math.remainder(turned, 2 * math.pi), 0.01))
-    assert found(given, BASE).parameters == pytest.approx(
-        found(readings(), BASE).parameters, abs=3e-3
+    assert fit_readings(given, BASE).parameters == pytest.approx(
+        fit_readings(readings(), BASE).parameters, abs=3e-3
     )
 
 
 @pytest.mark.parametrize("what", ["turned", "distance", "ahead", "aside"])
-def test_slopes_are_those_of_small_steps(what: What) -> None:
-    """The computed slopes ignore a small second-order effect of the rate parameter."""
+def test_derivatives_are_those_of_small_steps(what: Quantity) -> None:
+    """The computed derivatives ignore a small second-order effect of the rate parameter."""
     steps = joined([driven(CURVE)[0]])
     start = np.array([0.99, 1.01, 0.7, 0.03, 0.0, 0.0, 0.0])
     told = predicted(steps, what, BASE, start)
     for index in range(4):
         more = start.copy()
         more[index] += 1e-6
-        slope = (predicted(steps, what, BASE, more).value - told.value) / 1e-6
-        assert told.slopes[index] == pytest.approx(slope, rel=0.02)
+        derivative = (predicted(steps, what, BASE, more).value - told.value) / 1e-6
+        assert told.derivatives[index] == pytest.approx(derivative, rel=0.02)
 
 
 def test_rides_that_follow_each_other_are_one() -> None:
@@ -105,20 +105,22 @@ def test_readings_that_contradict_each_other_are_less_sure() -> None:
     spin, _, turned = driven(SPIN)
     for measured, wrong in ((exact, 0.0), (worse, 0.6)):
         measured += [Reading((spin,), "turned", turned + side * wrong, 0.01) for side in (1, -1)]
-    sure, unsure = (found(one, BASE).covariance[TURN, TURN] for one in (exact, worse))
+    sure, unsure = (
+        fit_readings(one, BASE).covariance[INVERSE_TRACK, INVERSE_TRACK] for one in (exact, worse)
+    )
     assert unsure > 4 * sure
 
 
 def test_a_robot_that_never_turned_tells_nothing_of_the_track() -> None:
     with pytest.raises(RefusedError, match="hardly turned"):
-        found([one for one in readings() if one.what == "distance"], BASE)
+        fit_readings([one for one in readings() if one.quantity == "distance"], BASE)
 
 
 def test_a_turn_that_the_wheels_deny_is_refused() -> None:
     given = readings()
     given[0] = Reading(given[0].rides, "turned", -given[0].value, 0.01)
     with pytest.raises(RefusedError, match="to the left"):
-        found(given, BASE)
+        fit_readings(given, BASE)
 
 
 @given(angle=st.floats(-1.3, 1.3), apart=st.floats(0.1, 1.0))
@@ -159,10 +161,10 @@ def once(chi: float) -> Reading:
 @pytest.mark.parametrize("multiplier", [1.0, 1.6])
 def test_one_turn_tells_the_track_whatever_is_configured(chi: float, multiplier: float) -> None:
     drive = DriveConfig(wheel_separation_multiplier=multiplier)
-    assert effective(once(chi), drive) == pytest.approx(chi, rel=1e-3)
+    assert track_ratio(once(chi), drive) == pytest.approx(chi, rel=1e-3)
 
 
 def test_a_turn_that_was_no_whole_one_is_told() -> None:
     half = once(2.4)
     with pytest.raises(GuideError, match="one full circle"):
-        effective(Reading(half.rides, "turned", math.pi, 0.01), DriveConfig())
+        track_ratio(Reading(half.rides, "turned", math.pi, 0.01), DriveConfig())
