@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from acsard.web.calls import MERGE_S
 from tests.system.browser import Hands, Page
 from tests.system.bystander import lost
