@@ -39,7 +39,7 @@ from acsard.core.config.settings import (
 from acsard.core.config.writing import document
 from acsard.core.messages.schema import RobotState
 from acsard.host import real_time
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import MendableError
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
@@ -112,9 +112,8 @@ def _own(state: RobotState) -> dict[str, Summary]:
     }
 
 
-def _nothing_seen(sent: int, state: RobotState) -> ExitError:
-    return ExitError(
-        Exit.FAILURE,
+def _nothing_seen(sent: int, state: RobotState) -> MendableError:
+    return MendableError(
         f"none of the {sent} commands arrived at the port's far end, so nothing was measured; "
         f"the daemon says: {state.reason}",
     )

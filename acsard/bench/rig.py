@@ -40,7 +40,7 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from acsard.host.child import end, end_with_parent, environment, how_it_ended
-from acsard.host.errors import Exit, ExitError, NoAnswerError, UnreachableError
+from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError
 
 END_S = 5.0
 """Time limit for the end of a process, s. It usually takes 0.2 s."""
@@ -51,12 +51,12 @@ def end_with_us() -> None:
     end_with_parent(signal.SIGTERM)
 
 
-def ended(who: str, code: int, said: str = "") -> ExitError:
+def ended(who: str, code: int, said: str = "") -> MendableError:
     """Return an error that describes the unexpected end of a process."""
-    return ExitError(Exit.FAILURE, f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
+    return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
-def daemon_ended(code: int, log: Path) -> ExitError:
+def daemon_ended(code: int, log: Path) -> MendableError:
     """Return why the daemon ended by itself, with its own message and exit code if it gave them."""
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -206,7 +206,7 @@ class Rig:
             if found is not None:
                 return found
             if clock.mono_ns() > deadline_ns:
-                raise ExitError(Exit.FAILURE, f"no {what} within {START_S:g} s{self._why()}")
+                raise MendableError(f"no {what} within {START_S:g} s{self._why()}")
             time.sleep(0.01)
 
     def _why(self) -> str:

@@ -31,7 +31,7 @@ from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differi
 from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus
 from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.output import SENTENCES, plain, show
 from acsard.terminal.prompt import NobodyError
@@ -83,7 +83,7 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
         behind = "".join(f"\nnote: {note}" for note in notes)
-        raise ExitError(Exit.FAILURE, f"{source}: {error}{behind}") from None
+        raise MendableError(f"{source}: {error}{behind}") from None
     if args.write:
         change(Path(where), keys(found))
     told = report(source, found, config.drive, where if args.write else "")

@@ -11,7 +11,7 @@ import sys
 
 from acsard.cli.connection import MANY, add_bus, connected_to_many
 from acsard.daemon.bus.robot_discovery import ALL
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.fleet import Fleet
@@ -35,7 +35,7 @@ def main(args: argparse.Namespace) -> int:
             # Over TLS our certificate may not be permitted to see any of the named robots.
             named = robot.where.tls and ids != (ALL,)
             silence = robot.like(ids[0]).whoami().silence if named else ""
-            raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), silence))))
+            raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
         width = shutil.get_terminal_size((160, 24)).columns
         # Flush now: nothing that delays the end of the session may hold back the table.
         print("\n".join(table(rows, width)), flush=True)

@@ -119,7 +119,7 @@ def _checked(args: argparse.Namespace, config: Config, where: str, prompt: Promp
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
     """Return the prompt for these options.
 
-    Raises `ExitError` unless a person can answer, or nothing real can move.
+    Raises `UsageError` unless a person can answer, or nothing real can move.
     """
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(

@@ -17,7 +17,7 @@ from acsard.cli.common import load
 from acsard.cli.recording_files import progress
 from acsard.core.formatting import json_line, many, printable
 from acsard.core.ros.shapes import how_often
-from acsard.host.errors import Exit, ExitError, RecordingError
+from acsard.host.errors import Exit, ExitError, MendableError, RecordingError
 from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import listed
 from acsard.recording.end_record import EndRecord, how_it_ends, read_end
@@ -204,7 +204,7 @@ def main_recover(args: argparse.Namespace) -> int:
         with replacing(new, args.force) as part:
             count = rewrite(recording, part)
     except OSError as error:
-        raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
+        raise MendableError(f"cannot write {new}: {error.strerror}") from None
     print(f"{many(count, 'message')} in {new}{_bracketed(recording.missing)}")
     return int(Exit.OK)
 
@@ -229,8 +229,7 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     try:
         return where, listed(where)
     except FileNotFoundError:
-        raise ExitError(
-            Exit.FAILURE,
+        raise MendableError(
             f"nothing is recorded in {where}: the directory does not exist. The service records "
             "by itself; `acsard run --record DIRECTORY` records where you say. --directory "
             "reads another directory",
@@ -252,7 +251,7 @@ def _recording(args: argparse.Namespace) -> Recording:
         files = [path for path in files if int(path.name.partition("-")[0]) == int(name)]
     if not files:
         which = "recording" if name is None else f"recording {name}"
-        raise ExitError(Exit.FAILURE, f"no {which} in {where}; `acsard recording` lists them")
+        raise MendableError(f"no {which} in {where}; `acsard recording` lists them")
     return Recording(files[-1])
 
 

@@ -115,7 +115,7 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 
 
 def library() -> str:
-    """Return plotly's script; raise `ExitError` with the command that installs it."""
+    """Return plotly's script; raise `MendableError` with the command that installs it."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:

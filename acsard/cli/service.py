@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Iterable
 
-from acsard.host.errors import Exit, ExitError, MendableError
+from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
 from acsard.machine.installation_steps import Step
 from acsard.machine.service_installation import misplaced
@@ -89,9 +89,7 @@ def main_status(args: argparse.Namespace) -> int:
 
 def _ready(args: argparse.Namespace) -> None:
     if not args.dry_run and os.geteuid() != 0:
-        raise ExitError(
-            Exit.NO_PERMISSION, "run it with sudo, or use --dry-run to see what it would do"
-        )
+        raise NotPermittedError("run it with sudo, or use --dry-run to see what it would do")
 
 
 def _do(steps: Iterable[Step], dry_run: bool) -> None:
@@ -104,6 +102,6 @@ def _do(steps: Iterable[Step], dry_run: bool) -> None:
         except MendableError:
             raise
         except OSError as error:
-            raise ExitError(
-                Exit.FAILURE, f"could not: {step}: {error.strerror}; fix that and run it again"
+            raise MendableError(
+                f"could not: {step}: {error.strerror}; fix that and run it again"
             ) from None

@@ -25,7 +25,7 @@ from acsard.core.messages.encodings import encode
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
 from acsard.host.config_file import change, require_changeable, writable
-from acsard.host.errors import Exit, ExitError, MendableError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 
 
@@ -64,9 +64,7 @@ def main(args: argparse.Namespace) -> int:
         try:
             change(file, settings)
         except MendableError as error:
-            raise ExitError(
-                Exit.FAILURE, f"{reply.message}, {until}; not written: {error}"
-            ) from None
+            raise MendableError(f"{reply.message}, {until}; not written: {error}") from None
         until = f"written to {file}"
     text = f"{reply.message}; {until}" if reply.success else reply.message
     print(json_line(encode(reply, "json").decode()) if args.json else lines(text))

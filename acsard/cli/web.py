@@ -20,7 +20,7 @@ from acsard.core.formatting import lasting
 from acsard.core.values import ROLES
 from acsard.daemon.bus.address import address_of
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 from acsard.host.logs import Log
 from acsard.terminal.output import show, table
@@ -86,8 +86,8 @@ def main(args: argparse.Namespace) -> int:
         import aiohttp  # noqa: F401
         import segno  # noqa: F401
     except ImportError:
-        raise ExitError(
-            Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
+        raise MendableError(
+            f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
     where, loaded = load(args.config, {"record.directory": args.record or None})
     config = recorded(loaded)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
+from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
@@ -134,14 +134,14 @@ class Run(Struct, frozen=True):
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        """Run the command; raise `ExitError` with its error output, unless it may fail."""
+        """Run the command; raise `MendableError` with its error output, unless it may fail."""
         try:
             done = called(self.words, 60.0)
             failed = done.stderr.strip() if done.returncode else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             failed = str(error)
         if failed and not self.may_fail:
-            raise ExitError(Exit.FAILURE, f"{' '.join(self.words)}: {failed}")
+            raise MendableError(f"{' '.join(self.words)}: {failed}")
 
 
 Step = Write | Remove | RemoveAll | Keep | Run
@@ -150,4 +150,4 @@ Step = Write | Remove | RemoveAll | Keep | Run
 def _unreadable(path: Path, error: OSError) -> MendableError:
     if isinstance(error, PermissionError):
         return NotPermittedError(f"no permission to read {path}; run it with sudo")
-    return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; check the file")
+    return MendableError(f"cannot read {path}: {error.strerror}; check the file")

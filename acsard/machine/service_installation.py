@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import acsard
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import MendableError
 from acsard.host.processes import called
 from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
 
@@ -181,7 +181,7 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """Return the installation steps; raise `ExitError` if they would overwrite a changed file."""
+    """Return the installation steps; raise `MendableError` if one would replace a changed file."""
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
@@ -194,7 +194,7 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
         steps.append(Write(file))
     if changed and not force:
         paths = ", ".join(changed)
-        raise ExitError(Exit.FAILURE, f"would overwrite {paths}; look at them, or use --force")
+        raise MendableError(f"would overwrite {paths}; look at them, or use --force")
     return [*steps, *INSTALLED]
 
 
@@ -270,7 +270,7 @@ def source() -> Path:
         return inside
     clone = package.parent / "deploy"
     if not clone.is_dir():
-        raise ExitError(Exit.FAILURE, f"neither {inside} nor {clone} exists; install acsard again")
+        raise MendableError(f"neither {inside} nor {clone} exists; install acsard again")
     return clone
 
 
