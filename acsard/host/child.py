@@ -29,7 +29,6 @@ from msgspec import Struct
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.host.silence import Silence
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
 """Variables that systemd sets for the parent. A child must not answer in the parent's name."""
@@ -46,6 +45,21 @@ START_NS = 15 * NS_PER_S
 
 LINE_BYTES = 65536
 """Length of the longest line of output that a child may send."""
+
+
+class Silence:
+    """Silence of a peer, judged again and again.
+
+    A machine or a CPU quota that stops this process too does not count as silence of the peer.
+    """
+
+    def __init__(self, most_ns: int) -> None:
+        self._most_ns, self._ns = most_ns, 0
+
+    def too_long(self, heard: bool, passed_ns: int) -> bool:
+        """Return whether the silence exceeds `most_ns`, `passed_ns` after the last call."""
+        self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
+        return self._ns > self._most_ns
 
 
 # The parent's side: start, limit and end

@@ -68,21 +68,24 @@ class Write(Struct, frozen=True):
 
 
 class Remove(Struct, frozen=True):
-    """Step that removes a file, and the directories made for it if they are empty."""
+    """Step that removes a file, or a directory with everything in it."""
 
     path: Path
 
     def __str__(self) -> str:
-        return f"remove  {self.path}"
+        return f"remove  {self.path}" + ("/ and everything in it" if self._is_directory else "")
+
+    @property
+    def _is_directory(self) -> bool:
+        return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        self.path.unlink()
-        self.tidy(self.path)
-
-    @staticmethod
-    def tidy(path: Path) -> None:
-        """Remove acsard's own directories that have become empty."""
-        for place in path.parents:
+        """Remove it, and acsard's own directories that become empty."""
+        if self._is_directory:
+            shutil.rmtree(self.path)
+        else:
+            self.path.unlink()
+        for place in self.path.parents:
             if place.name not in OURS:
                 return
             try:
@@ -90,22 +93,6 @@ class Remove(Struct, frozen=True):
             except OSError:
                 # The directory holds something else.
                 return
-
-
-class RemoveAll(Struct, frozen=True):
-    """Step that removes a file, or a directory with everything in it."""
-
-    path: Path
-
-    def __str__(self) -> str:
-        return f"remove  {self.path}" + ("/ and everything in it" if self.path.is_dir() else "")
-
-    def do(self) -> None:
-        if self.path.is_dir() and not self.path.is_symlink():
-            shutil.rmtree(self.path)
-            Remove.tidy(self.path)
-        else:
-            Remove(self.path).do()
 
 
 class Keep(Struct, frozen=True):
@@ -144,7 +131,7 @@ class Run(Struct, frozen=True):
             raise MendableError(f"{' '.join(self.words)}: {failed}")
 
 
-Step = Write | Remove | RemoveAll | Keep | Run
+Step = Write | Remove | Keep | Run
 
 
 def _unreadable(path: Path, error: OSError) -> MendableError:

@@ -18,7 +18,7 @@ from pathlib import Path
 import acsard
 from acsard.host.errors import MendableError
 from acsard.host.processes import called
-from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
+from acsard.machine.installation_steps import File, Keep, Remove, Run, Step, Write
 
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`."""
@@ -241,7 +241,7 @@ def uninstalling(
     ]
     for path in others:
         what = "certificates and their authority" if path == Path(TLS) else "not the service's own"
-        steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
+        steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
         where, what = STATES[unit]
         # systemd knows the real place of the state directory, as long as it knows the unit.

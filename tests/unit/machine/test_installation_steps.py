@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.errors import MendableError
-from acsard.machine.installation_steps import File, Remove, RemoveAll, Run, Write
+from acsard.machine.installation_steps import File, Remove, Run, Write
 
 
 def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_a_whole_directory_goes_and_those_of_ours_that_are_empty_then(tmp_path: 
     place = tmp_path / "acsard" / "tls"
     (place / "clients").mkdir(parents=True)
     (place / "clients" / "key.pem").touch()
-    RemoveAll(place).do()
+    Remove(place).do()
     assert not list(tmp_path.iterdir())
 
 

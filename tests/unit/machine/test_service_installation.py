@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acsard.host.errors import MendableError
-from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Write
+from acsard.machine.installation_steps import File, Keep, Remove, Run, Write
 from acsard.machine.service_installation import (
     GATEWAY,
     GONE,
@@ -185,7 +185,7 @@ def test_a_purge_keeps_nothing() -> None:
     tls, found = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, found, [tls], force=True, purge=True)
     assert not [step for step in steps if isinstance(step, Keep)]
-    assert {step.path for step in steps if isinstance(step, (Remove, RemoveAll))} == {
+    assert {step.path for step in steps if isinstance(step, (Remove, Remove))} == {
         *(file.path for file in ALL),
         tls,
     }
