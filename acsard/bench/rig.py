@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -44,11 +45,6 @@ from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, Un
 
 END_S = 5.0
 """Time limit for the end of a process, s. It usually takes 0.2 s."""
-
-
-def end_with_us() -> None:
-    """End this child process if the benchmark is killed, so that no daemon remains."""
-    end_with_parent(signal.SIGTERM)
 
 
 def ended(who: str, code: int, said: str = "") -> MendableError:
@@ -188,7 +184,8 @@ class Rig:
                 stderr=log,
                 env=env,
                 start_new_session=True,
-                preexec_fn=end_with_us,
+                # If the benchmark is killed, no daemon may remain.
+                preexec_fn=partial(end_with_parent, signal.SIGTERM),
             )
         stack.callback(end, self.process, END_S)
 

@@ -69,15 +69,16 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
+    _require_fitting(args)
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:
-            found, config = calibrated(_only_log(args), mine.drive, args.distance), mine
+            found, config = calibrated(args.log, mine.drive, args.distance), mine
         else:
-            found, config = guided(_no_log(args), mine, where, lines)
+            found, config = guided(args, mine, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
@@ -102,27 +103,18 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     return int(Exit.OK)
 
 
-def _only_log(args: argparse.Namespace) -> Path:
-    """Return the log's path.
-
-    Raises `UsageError` if an option was given that only a guided drive takes.
-    """
-    for name in DRIVE_OPTIONS:
+def _require_fitting(args: argparse.Namespace) -> None:
+    """Raise `UsageError` for an option that does not fit a recorded drive, or a guided one."""
+    if not args.log and args.distance:
+        raise UsageError(
+            "--distance goes with --log: a guided drive asks for the distances that it needs"
+        )
+    for name in DRIVE_OPTIONS if args.log else ():
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
             raise UsageError(
                 f"{option} is for a guided drive and --log for a recorded one: leave one out"
             )
-    log: Path = args.log
-    return log
-
-
-def _no_log(args: argparse.Namespace) -> argparse.Namespace:
-    if args.distance:
-        raise UsageError(
-            "--distance goes with --log: a guided drive asks for the distances that it needs"
-        )
-    return args
 
 
 def _distance(text: str) -> Tape:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 import re
 import socket
-from collections.abc import Callable
 from pathlib import Path
 
 from acsard.cli.common import add_config, load, whole
@@ -134,7 +133,9 @@ def main_init(args: argparse.Namespace) -> int:
         robots.append(load(None)[1].robot.id)
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
-        _configure(args.write, keys)
+        changed = change(args.write, keys, new=True)
+        listen = write(changed["bus.listen"])
+        print(f"{args.write}: set bus.listen = {listen} and bus.tls\n")
     _admit_service(directory)
     host, robot = socket.gethostname(), robots[-1]
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
@@ -199,12 +200,6 @@ def main_router(args: argparse.Namespace) -> int:
 
 def _certified(names: list[str]) -> str:
     return f"Clients may reach the robot as {', '.join(names)} (add more with --address).\n"
-
-
-def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
-    """Set the keys of the bus in a configuration file and keep its comments."""
-    changed = change(file, keys, new=True)
-    print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
 
 
 def _admit_service(directory: Path) -> None:

@@ -45,11 +45,8 @@ def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
         editable = told.get("dir_info", {}).get("editable", False)
         return [*(["-e"] if editable else []), f"{place}[{extra}]"]
     libraries = (line.partition(";") for line in installed.requires or ())
-    return [name.strip() for name, _, when in libraries if when.split() == _only(extra)]
-
-
-def _only(extra: Extra) -> list[str]:
-    return ["extra", "==", f"'{extra}'"]
+    only = ["extra", "==", f"'{extra}'"]
+    return [name.strip() for name, _, when in libraries if when.split() == only]
 
 
 def _installer() -> list[str]:

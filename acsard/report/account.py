@@ -84,11 +84,8 @@ def summary(course: Course) -> str:
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
     late = counts["link_late"]
     link += f", {many(late, 'stall')} of the robot's computer" if late else ""
-    return f"{way} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
-
-
-def _be(count: int) -> str:
-    return "was" if count == 1 else "were"
+    be = "was" if counts["fault"] == 1 else "were"
+    return f"{way} There {be} {faults}, {stops}{by}{link}."
 
 
 def _names(marks: list[Mark]) -> str:
