@@ -14,7 +14,7 @@ import zenoh
 
 from acsard.cli.common import count
 from acsard.cli.connection import add_bus, connected, require_followed
-from acsard.cli.waiting import explained, lost_by, waits_for
+from acsard.cli.waiting import silence_explained
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,10 +28,7 @@ def main(args: argparse.Namespace) -> int:
     require_followed(args.topic)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n
-    with (
-        connected(args) as robot,
-        explained(waits_for(robot, args.topic), lost_by(robot)) as heard,
-    ):
+    with connected(args) as robot, silence_explained(robot, args.topic) as heard:
 
         def take(_: zenoh.Sample) -> None:
             times.append(time.monotonic())
