@@ -23,7 +23,6 @@ from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 from acsard.host.logs import Log
-from acsard.terminal.output import show, table
 
 if TYPE_CHECKING:
     from acsard.web.listen import Listen
@@ -177,6 +176,9 @@ def _vault(args: argparse.Namespace, config: Config) -> Vault:
 
 
 def _list(vault: Vault) -> int:
+    # The server, which runs for months, needs no tables: they would cost it 5 MB.
+    from acsard.terminal.output import show, table
+
     tokens, now_s = vault.all(), time.time()
 
     def until(ends: int) -> str:
