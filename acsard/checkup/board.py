@@ -369,7 +369,6 @@ class Board:
         raise StoppedError(found)
 
     def _flee(self) -> None:
-        """Send zeros once, and no more after them."""
         self.fled = True
         self.zeros()
 
@@ -416,5 +415,4 @@ class Board:
             self.ask(comma=comma)
 
     def _slows(self) -> bool:
-        """Return whether any motor slows down."""
         return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.FALLS

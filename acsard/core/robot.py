@@ -27,7 +27,7 @@ from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.limits import Limiter
-from acsard.core.motion.modes import LEAVING, Mode, RefusedError
+from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import (
@@ -293,7 +293,7 @@ class Robot:
         if inputs.guard_trip:
             trip = f"the guard replaced a line: {inputs.guard_trip}"
             self._fault(trip, inputs.now, events)
-        if inputs.leaving and self._life.mode is not Mode.SHUTDOWN:
+        if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         if not inputs.requests:
             return ()
@@ -425,6 +425,6 @@ class Robot:
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
             case Mode.SHUTDOWN:
-                return LEAVING
+                return GOING_DOWN
             case _:
                 assert_never(self._life.mode)

@@ -15,9 +15,9 @@ from acsard.core.config.settings import Config
 from acsard.core.config.wire_time import wire_ns
 from acsard.core.guard import Guard
 from acsard.core.incoming.bus_interface import GATEWAY_KEY as GATEWAY
-from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, GatewayTold, RoutersTold
+from acsard.core.incoming.bus_interface import NOTHING, Bus, BusInput, GatewayReports, RouterChanges
 from acsard.core.incoming.commands import Receiver, asker, parts, sender
-from acsard.core.incoming.imu import ImuTold
+from acsard.core.incoming.imu import ImuSamples
 from acsard.core.incoming.queries import Queries, Query, refused
 from acsard.core.link.line_gate import Port
 from acsard.core.messages.encodings import DecodeError
@@ -83,7 +83,7 @@ class ControlLoop:
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends_ns)
-        self.leaving = False
+        self.shutting_down = False
         """Set it to go down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
@@ -102,8 +102,8 @@ class ControlLoop:
             recorder.begins(self.robot, self._guard)
         self._receiver = Receiver(config.joints, Kinematics(config.drive))
         self._queries = Queries(config, info)
-        self._gateway, self._imu = GatewayTold(), ImuTold(config.mcu.simulated)
-        self._routers = RoutersTold()
+        self._gateway, self._imu = GatewayReports(), ImuSamples(config.mcu.simulated)
+        self._routers = RouterChanges()
         self._turn_rates: list[GyroSample] = []
         """Samples of a gyro since the last step."""
         self._port, self._bus, self._log, self._mono_ns = port, bus, log, mono_ns
@@ -172,7 +172,7 @@ class ControlLoop:
             missed,
             tuple(self._others),
             pace.at_once(now.mono_ns, port.sent_ns),
-            self.leaving,
+            self.shutting_down,
         )
         if inputs.events:
             self._others.clear()
@@ -238,11 +238,11 @@ class ControlLoop:
         self._note(got)
         for arrival in got.arrivals:
             if arrival.key == GATEWAY:
-                ends_ns = self._gateway.hear(arrival, self.robot.counters)
+                ends_ns = self._gateway.take(arrival, self.robot.counters)
                 self.report.certificate_ends_ns = ends_ns or self.report.certificate_ends_ns
                 continue
             if arrival.key == IMU:
-                heard = self._imu.hear(arrival, self.robot.counters, self._others)
+                heard = self._imu.take(arrival, self.robot.counters, self._others)
                 if heard is not None:
                     self._turn_rates.append(heard)
                 continue
@@ -278,7 +278,7 @@ class ControlLoop:
         if got.dropped:
             self.robot.counters["bus_dropped"] += got.dropped
         if got.routers is not None:
-            self._routers.hear(got.routers, self.robot.counters, self._others)
+            self._routers.take(got.routers, self.robot.counters, self._others)
         if got.stuck:
             self.robot.counters["bus_stuck"] += 1
             self._others.append(BUS_STUCK)

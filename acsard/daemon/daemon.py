@@ -273,10 +273,10 @@ async def _control(
 
         def step() -> Next | None:
             now = clock.now()
-            control.leaving = departure.begun_ns is not None
+            control.shutting_down = departure.begun_ns is not None
             period = ticker.take(now.mono_ns)
             manager.step(control.step(now, period))
-            if control.leaving and departure.over(now.mono_ns, control.at_rest):
+            if control.shutting_down and departure.over(now.mono_ns, control.at_rest):
                 return None
             return Next(control.listens, control.retry_ns, period_ended=period.expired > 0)
 

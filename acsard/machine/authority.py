@@ -19,11 +19,6 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
 from acsard.machine.certificates import CA_KEY
 
-SLACK = timedelta(hours=1)
-"""Time by which a certificate is valid before its creation, because a robot's clock may be slow
-when the robot starts.
-"""
-
 
 class Authority:
     """Certificate authority that signs certificates."""
@@ -116,7 +111,8 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(now, now + timedelta(days=days)) - SLACK)
+        # A robot's clock may be slow when the robot starts.
+        .not_valid_before(min(now, now + timedelta(days=days)) - timedelta(hours=1))
         .not_valid_after(now + timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )

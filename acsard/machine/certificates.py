@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from acsard.core.config.settings import Config
 from acsard.core.values import ROLES
 from acsard.daemon.bus.tls import CA
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
 from acsard.host.extras import missing
 from acsard.host.own_identity import own_addresses
 
@@ -40,8 +40,7 @@ def init(directory: Path, addresses: Sequence[str], days: int, *, force: bool) -
     Returns the robot's names.
     """
     if (directory / CA).exists() and not force:
-        raise ExitError(
-            Exit.FAILURE,
+        raise MendableError(
             f"{directory / CA} exists: `acsard tls add` makes one more certificate with it; "
             "--force makes a new authority, and then the daemon refuses all certificates of the "
             "old one",
@@ -61,7 +60,7 @@ def add(directory: Path, name: str, addresses: Sequence[str], days: int) -> Path
     authority = _load(directory)
     place = directory / "clients" / name
     if place.exists():
-        raise ExitError(Exit.FAILURE, f"{place} exists; remove it, or choose another name")
+        raise MendableError(f"{place} exists; remove it, or choose another name")
     named = [name] if ADDRESS.match(name) else []
     authority.issue(place, name, [*named, *addresses], days)
     return place
@@ -108,11 +107,9 @@ def _load(directory: Path) -> Authority:
     try:
         return maker.load(directory, _password)
     except FileNotFoundError:
-        raise ExitError(
-            Exit.FAILURE, f"{directory} has no authority: run `acsard tls init` first"
-        ) from None
+        raise MendableError(f"{directory} has no authority: run `acsard tls init` first") from None
     except (OSError, ValueError) as error:
-        raise ExitError(Exit.FAILURE, f"cannot use the authority in {directory}: {error}") from None
+        raise MendableError(f"cannot use the authority in {directory}: {error}") from None
 
 
 def _password() -> str:
@@ -127,14 +124,12 @@ def _password() -> str:
 
 
 def _writable(directory: Path) -> None:
-    """Raise `ExitError` unless the directory can be created or written to.
+    """Raise `MendableError` unless the directory can be created or written to.
 
     Nothing is created yet.
     """
     there = next(place for place in (directory, *directory.absolute().parents) if place.exists())
     if not there.is_dir():
-        raise ExitError(Exit.FAILURE, f"{there} is not a directory; use --directory")
+        raise MendableError(f"{there} is not a directory; use --directory")
     if not os.access(there, os.W_OK | os.X_OK):
-        raise ExitError(
-            Exit.NO_PERMISSION, f"cannot write to {there}: run it with sudo, or use --directory"
-        )
+        raise NotPermittedError(f"cannot write to {there}: run it with sudo, or use --directory")

@@ -24,9 +24,6 @@ MOST_REASONS = 8
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
-FINE_S = 0.05
-"""Bin width in s from which a note about the thinning is shown."""
-
 MOST_NAMES = 5
 """Maximum number of names or different texts in a list."""
 
@@ -87,11 +84,8 @@ def summary(course: Course) -> str:
     link = f", {many(lost, 'loss', 'losses')} of the link" if lost else ""
     late = counts["link_late"]
     link += f", {many(late, 'stall')} of the robot's computer" if late else ""
-    return f"{way} There {_be(counts['fault'])} {faults}, {stops}{by}{link}."
-
-
-def _be(count: int) -> str:
-    return "was" if count == 1 else "were"
+    be = "was" if counts["fault"] == 1 else "were"
+    return f"{way} There {be} {faults}, {stops}{by}{link}."
 
 
 def _names(marks: list[Mark]) -> str:
@@ -140,7 +134,7 @@ def notes(course: Course, origin: Origin) -> list[str]:
         )
     curves = [*course.linear.values(), *course.angular.values()]
     width = max(curve.width for curve in curves)
-    if width > FINE_S:
+    if width > 0.05:
         found.append(
             f"A point of a picture stands for up to {width:.2g} s and shows the lowest and the "
             "highest value of that time. --from and --to draw a shorter time in more detail."

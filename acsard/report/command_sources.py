@@ -33,8 +33,6 @@ LOOK_S = 0.1
 MOST_TEXT = 300
 """Maximum number of characters that are kept of a sentence or a name."""
 
-MOST_SENDERS = 256
-
 
 class CommandSources:
     """The states of all sources over the steps."""
@@ -61,7 +59,7 @@ class CommandSources:
         for command in commands:
             self._newest.pop((command.source, command.sender), None)
             self._newest[command.source, command.sender] = command
-        while len(self._newest) > MOST_SENDERS:
+        while len(self._newest) > 256:
             del self._newest[next(iter(self._newest))]
         for refusal in step.inputs.refusals:
             if refusal.source:
@@ -102,7 +100,6 @@ class CommandSources:
         return None
 
     def look(self, step: Step, t: float, robot: Robot) -> None:
-        """Record the present state of each source."""
         for name, does, words in self._do(step, t, robot):
             self.bands[name].add(t, does, words)
 

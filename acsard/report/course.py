@@ -95,13 +95,11 @@ class Link:
         self._sent, self._heard, self._open, self._least = 0, heard, most, None
 
     def end(self) -> None:
-        """Close the last second."""
         if self._second is not None:
             self._end(self._now)
 
 
 def _heard(counters: Mapping[str, int]) -> tuple[int, int]:
-    """Return the number of accepted and of dropped lines."""
     bad = sum(count for name, count in counters.items() if name.startswith(BAD))
     return counters.get(GOOD, 0) - counters.get(IMPOSSIBLE, 0), bad
 
@@ -292,7 +290,6 @@ class Course:
         self._number = step.number
 
     def end(self) -> None:
-        """Finish after the last step."""
         t = self.seconds
         for band in (self.modes, self.links, *self.sources.bands.values()):
             band.end(t)

@@ -49,9 +49,6 @@ def commander(number: int) -> tuple[str, str]:
     return COMMANDERS[place], PATTERNS[beyond % len(PATTERNS)]
 
 
-WRAP = 42
-"""Line length in characters that fits on a phone."""
-
 Trace = dict[str, Any]
 
 
@@ -77,8 +74,8 @@ class Figure(NamedTuple):
 
 
 def label(text: str) -> str:
-    """Escape any text for plotly and wrap it to short lines."""
-    lines = textwrap.wrap(printable(text), WRAP) or [""]
+    """Escape any text for plotly and wrap it to lines that fit on a phone."""
+    lines = textwrap.wrap(printable(text), 42) or [""]
     return "<br>".join(html.escape(line) for line in lines)
 
 
@@ -135,7 +132,6 @@ NOTED = {
 
 
 def path(course: Course) -> Figure:
-    """Draw the path with its events."""
     places = course.path.places()
     keys: list[Key] = []
     data: list[Trace] = []

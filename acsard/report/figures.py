@@ -121,7 +121,6 @@ class Pictures:
         ]  # fmt: skip
 
     def speeds(self) -> Figure:
-        """Draw the wished, limited and measured speeds."""
         course = self._course
         parts = [
             Part(
@@ -145,7 +144,6 @@ class Pictures:
         return self._stack("speeds", "Speed", caption, parts, 210)
 
     def wheels(self) -> Figure:
-        """Draw the commanded and measured speed of each wheel."""
         pairs = zip(WHEELS, self._course.asked, self._course.turned, strict=True)
         parts = [
             Part(
@@ -161,7 +159,6 @@ class Pictures:
         return self._stack("wheels", "The four wheels", caption, parts, 150)
 
     def link(self) -> Figure:
-        """Draw the lines per second, and the lost ones."""
         link = self._course.link
         bad = [Line("dropped", COLOURS["error"], link.dropped.points(), "hvh")]
         if not self._course.config.mcu.reply_period:
@@ -183,7 +180,6 @@ class Pictures:
         return self._stack("link", "The serial line", caption, parts, 170)
 
     def loop(self) -> Figure:
-        """Draw the lateness of the control loop."""
         late = Line("late", LIMITED, self._course.lateness.points(), "hv")
         caption = (
             "Delay from the time at which a period is due to its step, relative to the least delay."
@@ -191,7 +187,6 @@ class Pictures:
         return self._stack("loop", "The control loop", caption, [Part("late, ms", [late])], 200)
 
     def who(self) -> Figure:
-        """Draw mode, link and sources as bands."""
         course, silent = self._course, list[str]()
         rows: list[Row] = [
             ("mode", course.modes.spans()),
@@ -245,7 +240,6 @@ class Pictures:
         }
 
     def events(self) -> Figure:
-        """Draw all events as marks."""
         levels, kept = ("info", "warning", "error"), self._course.marks
         data = [
             self._marks(level, at, [mark for mark in kept.all() if mark.level == level])

@@ -77,13 +77,13 @@ GATEWAY_KEY = "gateway"
 _decoder = Decoder(GatewayState)
 
 
-class GatewayTold:
+class GatewayReports:
     """Follower of the TLS gateway's reports, also across restarts of the gateway."""
 
     def __init__(self) -> None:
         self._last = GatewayState(0, 0, 0)
 
-    def hear(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
+    def take(self, arrival: Arrival, counters: MutableMapping[str, int]) -> int | None:
         """Count the news in a report.
 
         Return the wall time at which the certificate ends, if it is known.
@@ -109,13 +109,13 @@ PEER = (
 )
 
 
-class RoutersTold:
+class RouterChanges:
     """Follower of the endpoints that this daemon should be connected to."""
 
     def __init__(self) -> None:
         self.status = RoutersStatus()
 
-    def hear(
+    def take(
         self, status: RoutersStatus, counters: MutableMapping[str, int], events: list[Event]
     ) -> None:
         """Take the present status. Log and count each connection that was lost or made."""

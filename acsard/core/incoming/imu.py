@@ -50,7 +50,7 @@ class _Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 _readings = Decoder(_Reading)
 
 
-class ImuTold:
+class ImuSamples:
     """Follower of the gyros on the bus, one at a time."""
 
     def __init__(self, own: bool = False) -> None:
@@ -62,7 +62,7 @@ class ImuTold:
         self._followed = public_name(OWN) if own else ""
         self._heard_ns = -FOLLOWED_NS
 
-    def hear(
+    def take(
         self, arrival: Arrival, counters: MutableMapping[str, int], events: list[Event]
     ) -> GyroSample | None:
         """Decode a gyro sample. Count and log a refused one and return None."""

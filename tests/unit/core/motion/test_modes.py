@@ -10,7 +10,7 @@ import pytest
 from acsard.core.motion.modes import REFUSALS, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import Verb
 
-FACTS = ("leaving", "fault", "stopped", "inactive", "linked", "commanded")
+FACTS = ("shutting_down", "fault", "stopped", "inactive", "linked", "commanded")
 
 ALL = [dict(zip(FACTS, values, strict=True)) for values in product((False, True), repeat=6)]
 
