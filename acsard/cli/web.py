@@ -33,8 +33,8 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "web",
         help="serve the robot's page: see, stop and drive the robot in a browser",
         description="Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in "
-        "a terminal starts this by itself. A browser on the robot's machine has "
-        "every permission. A browser on another machine needs HTTPS with the "
+        "a terminal starts this by itself. A browser on the robot's machine needs no "
+        "token and has the role of web.local. A browser on another machine needs HTTPS with the "
         f"robot's certificate, and a token. Needs an extra: {install('web')}.",
     )
     add_bus(parser)

@@ -15,13 +15,14 @@ from functools import partial
 from aiohttp import web
 from msgspec.structs import replace
 
+from acsard.core.values import Role
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.host.threads import in_thread
 from acsard.web.acceptor import Acceptor
 from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
 from acsard.web.callers import (
-    MAINTAINER,
+    HERE,
     Asked,
     Reason,
     RefusedError,
@@ -64,13 +65,20 @@ class Admission:
     """Finds the row of each request, and refuses the request or hands it to the row's handler."""
 
     def __init__(
-        self, robot: str, names: frozenset[str], vault: Vault, acceptor: Acceptor, counts: Counts
+        self,
+        robot: str,
+        names: frozenset[str],
+        vault: Vault,
+        acceptor: Acceptor,
+        counts: Counts,
+        local: Role,
     ) -> None:
         """Store how clients are known.
 
         `names` are the host names and addresses, in lower case, by which other machines reach the
-        robot.
+        robot. `local` is the role of a client on the robot itself.
         """
+        self._local = Who(local, HERE)
         self._robot, self._names, self._vault = robot, names, vault
         self._acceptor, self._counts = acceptor, counts
         self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
@@ -143,7 +151,7 @@ class Admission:
             require_own_origin(said)
         if is_open:
             return
-        who = replace(MAINTAINER, address=said.peer)
+        who = replace(self._local, address=said.peer)
         if not here:
             who = await self.owner(said.peer, tokens_shown(request, self._robot))
         request[WHO] = who

@@ -2,11 +2,12 @@
 
 This module is pure.
 
-A client on the robot itself has the role maintainer. However, any web page in a browser there may
-open `ws://localhost`, or point a host name of its own at 127.0.0.1. So `Host` must be a loopback
-name, and `Origin`, if the browser sends it, must be this page. A client from another machine must
-use HTTPS, a host name that the robot has, and a token. Requests through a proxy are refused: a
-proxy on the robot that rewrites `Host` would turn every client behind it into a maintainer.
+A client on the robot itself needs no token and has the role in `web.local`. However, any web page
+in a browser there may open `ws://localhost`, or point a host name of its own at 127.0.0.1. So
+`Host` must be a loopback name, and `Origin`, if the browser sends it, must be this page. A client
+from another machine must use HTTPS, a host name that the robot has, and a token. Requests through a
+proxy are refused: a proxy on the robot that rewrites `Host` would give every client behind it the
+role of the robot itself.
 """
 
 from __future__ import annotations

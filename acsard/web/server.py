@@ -91,7 +91,10 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
     calls, fleet = Calls(robots, guide.stop), Fleet(robots)
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
-    page = Page(robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page)
+    page = Page(
+        robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page,
+        wanted.config.web.local,
+    )  # fmt: skip
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S,

@@ -15,6 +15,7 @@ from aiohttp.test_utils import TestServer
 from acsard.client import Client
 from acsard.core.config.settings import Config
 from acsard.core.messages.signature import MOST
+from acsard.core.values import Role
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
@@ -45,7 +46,7 @@ ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
 class Inside:
     """The whole server without a connection to a robot, which a test opens if it needs one."""
 
-    def __init__(self, where: Path) -> None:
+    def __init__(self, where: Path, local: Role = "maintainer") -> None:
         self.counts = Counts()
 
         def connect() -> Client:
@@ -57,7 +58,7 @@ class Inside:
         self.page = Page(
             self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
             Vault(where, "acsar"), frozenset(), self.acceptor,
-            Guide(Reach("", "", "acsar", ""), "sim"),
+            Guide(Reach("", "", "acsar", ""), "sim"), local=local,
         )  # fmt: skip
 
     @asynccontextmanager
@@ -235,5 +236,19 @@ def test_a_dead_hand_ends_the_server(inside: Inside, tmp_path: Path) -> None:
         inside.hand.outbox.dead.set_exception(MemoryError("no room"))
         with pytest.raises(MemoryError):
             await _until(asyncio.Event(), inside.robots, inside.hand, inside.page, wanted)
+
+    run(story)
+
+
+def test_a_client_on_the_robot_has_the_role_of_the_configuration(tmp_path: Path) -> None:
+    inside = Inside(tmp_path, "operator")
+
+    async def story() -> None:
+        async with inside.hands() as ours:
+            hello = (await ours.find(lambda said: "hello" in said))["hello"]
+            assert hello["role"] == "operator"
+            assert {"set", "begin"} <= hello["barred"].keys()
+            assert not (await ours.call("set", settings={}))["ok"]
+        assert inside.counts.refused() == {"role": 1}
 
     run(story)

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
+from acsard.core.values import Role
 
 Name = Annotated[
     str,
@@ -321,6 +322,7 @@ class WebConfig(Struct, frozen=True):
     address: Annotated[tuple[WebAddress, ...], Meta(min_length=1, max_length=8)] = (
         "http://127.0.0.1:8080",
     )
+    local: Role = "maintainer"
 
 
 class SimConfig(Struct, frozen=True):
