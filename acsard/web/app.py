@@ -19,6 +19,7 @@ from aiohttp import web
 from msgspec import Meta, Struct
 
 from acsard import __version__
+from acsard.core.config.settings import WebConfig
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.permissions import least_role
 from acsard.core.values import Role
@@ -28,7 +29,7 @@ from acsard.web import metrics, openapi
 from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
-from acsard.web.callers import RefusedError, cookie_name
+from acsard.web.callers import PROTOCOL, RefusedError, cookie_name, tokens_offered
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
@@ -57,6 +58,9 @@ DRAWN: dict[State, int] = {"drawing": 202, "busy": 202, "ready": 200, "failed": 
 """HTTP status for each state of a report."""
 
 NO_TOKEN = "send the token as a form, token=..., or as JSON, both in UTF-8"
+
+
+DEFAULT = WebConfig()
 
 
 class TokenForm(Struct, frozen=True):
@@ -92,15 +96,15 @@ class Page:
         acceptor: Acceptor,
         guide: Guide,
         page: Path = PAGE,
-        local: Role = "maintainer",
+        rules: WebConfig = DEFAULT,
     ) -> None:
-        """Make the application; `names` and `local` are those of `Admission`."""
+        """Make the application; `names` and `rules` are those of `Admission`."""
         self._robots, self._hand, self._calls, self._fleet = robots, hand, calls, fleet
         self._guide, self._counts, self._vault = guide, counts, vault
         self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
         self._seats = Seats()
         self._viewers: set[Viewer] = set()
-        self._admission = Admission(robots.id, names, vault, acceptor, counts, local)
+        self._admission = Admission(robots.id, names, vault, acceptor, counts, rules)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:
@@ -171,11 +175,15 @@ class Page:
     async def socket(self, request: web.Request) -> web.StreamResponse:
         """Serve a WebSocket until it ends."""
         who, peer = request[WHO], peer_of(request)
+        offered = request.headers.get("Sec-WebSocket-Protocol", "")
+        if tokens_offered(offered) and PROTOCOL not in map(str.strip, offered.split(",")):
+            # aiohttp would log the names of all protocols if it knew none of them.
+            raise RefusedError("malformed", f"offer the subprotocol {PROTOCOL} beside the token")
         if full := self._seats.enter(peer, who.token):
             raise RefusedError("too_many", full)
         try:
             served = web.WebSocketResponse(
-                max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False
+                max_msg_size=MAX_BYTES, heartbeat=HEARTBEAT_S, compress=False, protocols=[PROTOCOL]
             )
             await served.prepare(request)
             _limit_buffer(request)

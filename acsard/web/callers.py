@@ -36,6 +36,9 @@ COOKIE = "__Host-acsard"
 """Prefix of the cookie names. Browsers accept a `__Host-` cookie only if it is Secure, without a
 Domain, and for all paths."""
 
+PROTOCOL, TOKEN = "acsard", "acsard.token."
+"""Subprotocol of the WebSocket, and prefix of one that carries a token."""
+
 MOST_COOKIES = 8
 """Maximum number of cookies that are checked for a token."""
 
@@ -129,6 +132,23 @@ def require_own_origin(asked: Asked) -> None:
     strange = asked.origin is not None and asked.origin.lower() != own
     if strange or asked.site not in (None, "same-origin", "none"):
         raise RefusedError("origin", "a page from another origin may not do that")
+
+
+def by_listed_page(asked: Asked, origins: Collection[str]) -> bool:
+    """Return whether a web page of an origin in `web.origins` made the browser send this request.
+
+    `origins` are in lower case.
+    """
+    return asked.origin is not None and asked.origin.lower() in origins
+
+
+def tokens_offered(protocols: str) -> list[str]:
+    """Return the tokens in a `Sec-WebSocket-Protocol` header.
+
+    A script in a browser can set no other header of a WebSocket.
+    """
+    offered = (one.strip() for one in protocols.split(","))
+    return [one.removeprefix(TOKEN) for one in offered if one.startswith(TOKEN)]
 
 
 def cookie_name(robot: str, port: int) -> str:

@@ -93,7 +93,7 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
     page = Page(
         robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page,
-        wanted.config.web.local,
+        wanted.config.web,
     )  # fmt: skip
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,

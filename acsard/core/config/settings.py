@@ -69,6 +69,19 @@ WebAddress = Annotated[
         },
     ),
 ]
+WebOrigin = Annotated[
+    str,
+    Meta(
+        pattern=(
+            r"^(?!http://.*:80\Z|https://.*:443\Z)"
+            r"https?://(\[[0-9a-f:.]{2,45}\]|[a-z0-9.-]{1,253})(:[0-9]{1,5})?\Z"
+        ),
+        extra={
+            "unit": "http(s):// and a host in lower case, and a port unless it is 80 or 443",
+            "example": "http://127.0.0.1:5173",
+        },
+    ),
+]
 FaultName = Annotated[
     str,
     Meta(
@@ -323,6 +336,7 @@ class WebConfig(Struct, frozen=True):
         "http://127.0.0.1:8080",
     )
     local: Role = "maintainer"
+    origins: Annotated[tuple[WebOrigin, ...], Meta(max_length=16)] = ()
 
 
 class SimConfig(Struct, frozen=True):
