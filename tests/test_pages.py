@@ -204,9 +204,10 @@ def test_python_is_on_the_page_whose_examples_are_run() -> None:
     assert {block.page for block in blocks("python")} == {"README.md", "deploy/web/README.md"}
 
 
-def test_javascript_is_on_the_page_whose_example_is_run() -> None:
-    """`tests/system/test_web_dashboard.py` runs this block."""
-    assert {block.page for block in blocks("js")} == {"deploy/web/README.md"}
+@each("language", ["html", "js"])
+def test_javascript_is_on_the_page_whose_examples_are_run(language: str) -> None:
+    """`tests/system/test_web_dashboard.py` runs these blocks."""
+    assert {block.page for block in blocks(language)} == {"deploy/web/README.md"}
 
 
 def test_the_subscribers_of_other_languages_in_the_readme_are_those_that_are_run() -> None:

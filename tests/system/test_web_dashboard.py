@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import shutil
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
 
 from acsard.certificates.authority import Authority
-from tests.system.browser import NAME, Page, run
-from tests.system.harness import ROOT, Bus, Daemon, finish, free_endpoint
+from tests.system.browser import NAME, Page, hands, run
+from tests.system.chromium import CHROMIUM, browsing
+from tests.system.harness import (
+    PATIENCE_S,
+    ROOT,
+    Bus,
+    Daemon,
+    finish,
+    free_endpoint,
+    until,
+)
 
 pytestmark = pytest.mark.network
 
@@ -34,16 +49,28 @@ def origin() -> str:
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory, origin: str) -> Iterator[Page]:
+def robot(tmp_path_factory: pytest.TempPathFactory, origin: str) -> Iterator[Daemon]:
+    where = tmp_path_factory.mktemp("robot")
+    with Daemon(where, config={"web": {"origins": [origin]}}) as robot:
+        yield robot
+
+
+@pytest.fixture(scope="module")
+def server(robot: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     where = tmp_path_factory.mktemp("dashboard")
     Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
-    with (
-        Daemon(where, config={"web": {"origins": [origin]}}) as daemon,
-        Bus(daemon.endpoint) as bus,
-    ):
+    with Page(robot, where) as server:
+        yield server
+
+
+@pytest.fixture
+def bus(robot: Daemon) -> Iterator[Bus]:
+    """A plain client of the robot, which stands and may be driven."""
+    with Bus(robot.endpoint) as bus:
         bus.linked()
-        with Page(daemon, where) as server:
-            yield server
+        bus.ask("srv/clear")
+        bus.at_rest()
+        yield bus
 
 
 def test_a_page_of_another_origin_sends_its_token_and_no_cookie(server: Page, origin: str) -> None:
@@ -63,12 +90,14 @@ def test_a_page_of_another_origin_sends_its_token_and_no_cookie(server: Page, or
             shown = {**told, "Authorization": f"Bearer {token}"}
             async with browser.get(f"{server.away}/api/state", headers=shown) as answer:
                 assert answer.status == 200
-            names = ("acsard", f"acsard.token.{token}")
-            opening = browser.ws_connect(f"{server.away}/ws", headers=told, protocols=names)
+            mine = f"acsard.token.{token}"
+            opening = browser.ws_connect(
+                f"{server.away}/ws", headers=told, protocols=("acsard", mine)
+            )
             async with opening as opened:
                 assert opened.protocol == "acsard"
                 assert json.loads((await opened.receive()).data)["hello"]["role"] == "operator"
-            for names in [("acsard", "acsard.token.wrong"), (f"acsard.token.{token}",)]:
+            for names in [["acsard", "acsard.token.wrong"], [mine]]:
                 with pytest.raises(aiohttp.WSServerHandshakeError):
                     await browser.ws_connect(f"{server.away}/ws", headers=told, protocols=names)
 
@@ -99,3 +128,89 @@ def test_the_proxy_of_the_manual_makes_requests_look_like_the_page_s_own(server:
                     assert "hello" in (await opened.receive()).data
 
     run(story)
+
+
+def test_a_finger_takes_over_from_a_program_that_names_no_source(server: Page, bus: Bus) -> None:
+    async def story() -> None:
+        async with hands(server) as program, hands(server) as finger:
+            program.source = ""
+            await program.say(subscribe="state", rate=50)
+            await program.until_driving(0.2)
+            assert bus.state()["source"] == "app"
+            driving = asyncio.create_task(program.hold(0.2, PATIENCE_S))
+            await finger.say(subscribe="state", rate=50)
+            await finger.until_driving(-0.2)
+            assert bus.state()["source"] == "teleop"
+            # The program goes on when the finger has been lifted.
+            await finger.drive(0.0)
+            await finger.state(lambda state: state["source"] == "app" and state["linear"] > 0.1)
+            driving.cancel()
+
+    run(story)
+    bus.at_rest()
+
+
+def test_a_program_that_names_an_unknown_source_is_refused(server: Page) -> None:
+    async def story() -> None:
+        async with hands(server) as program:
+            program.source = "nobody"
+            await program.drive(0.1)
+            refused = await program.find(lambda said: said.get("refused") == "cmd")
+            assert "nobody is not one of the robot's sources: teleop, app" in refused["reason"]
+
+    run(story)
+
+
+class _Silent(SimpleHTTPRequestHandler):
+    def log_request(self, code: int | str = "-", size: int | str = "-") -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def served(where: Path, origin: str) -> Iterator[None]:
+    """Serve the files of a directory at that origin."""
+    port = int(origin.rpartition(":")[2])
+    server = ThreadingHTTPServer(("127.0.0.1", port), partial(_Silent, directory=str(where)))
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+def test_the_dashboard_of_the_manual_drives_until_a_finger_takes_over_and_stops(
+    server: Page, bus: Bus, origin: str, tmp_path: Path
+) -> None:
+    text = block("html")
+    assert "http://127.0.0.1:8080" in text
+    (tmp_path / "index.html").write_text(text.replace("http://127.0.0.1:8080", server.here))
+
+    async def takes_over(look: Callable[[str], None]) -> None:
+        async with hands(server) as finger:
+            await finger.say(subscribe="state", rate=50)
+            await finger.until_driving(-0.2)
+            holding = asyncio.create_task(finger.hold(-0.2, PATIENCE_S))
+            await asyncio.to_thread(look, "driving by teleop")
+            holding.cancel()
+            await finger.drive(0.0)
+
+    with served(tmp_path, origin), browsing() as browser:
+
+        def shows(words: str) -> None:
+            until(lambda: words in browser.text("state"), PATIENCE_S, f"it shows {words!r}")
+
+        browser.open(origin)
+        shows("ready by nobody")
+        browser.js("document.getElementById('forward').onpointerdown()")
+        shows("driving by app")
+        until(lambda: bus.state()["linear"] > 0.1, PATIENCE_S, "it drives")
+        run(lambda: takes_over(shows))
+        shows("driving by app")
+        browser.js("document.getElementById('stop').click()")
+        shows("stopped by")
+        assert bus.state()["mode"] == "stopped"

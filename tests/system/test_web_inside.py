@@ -39,7 +39,7 @@ pytestmark = pytest.mark.network
 MISSED = 50
 """Messages at 50 a second that one client does not read."""
 
-ABOUT = About("1", True, 1.0, 4.0, 10.0, "")
+ABOUT = About("1", True, 1.0, 4.0, 10.0, "", {"teleop": 0.25, "app": 0.25})
 
 
 class Inside:
