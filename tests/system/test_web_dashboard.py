@@ -58,7 +58,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory, origin: str) -> Iterator[Dae
 @pytest.fixture(scope="module")
 def server(robot: Daemon, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
     where = tmp_path_factory.mktemp("dashboard")
-    Authority.make(where / "tls", "test", 1).issue(where / "tls", "robot", [NAME], 1)
+    Authority.make(where / "tls", "test", 1, [NAME]).issue(where / "tls", "robot", [NAME], 1)
     with Page(robot, where) as server:
         yield server
 
