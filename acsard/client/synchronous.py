@@ -285,14 +285,21 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
-    def put(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
-        """Send one command with a signature, for a program that forwards another sender's."""
-        self._puts.wait()
-        self._publish(twist, signature)
+    def put(
+        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
+    ) -> None:
+        """Send one command with a signature, for a program that forwards another sender's.
 
-    def _publish(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
+        `source` is the client's own by default.
+        """
+        self._puts.wait()
+        self._publish(twist, signature, source or self.source)
+
+    def _publish(
+        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str
+    ) -> None:
         self.session.put(
-            self.key(self.command_key(self.source)),
+            self.key(self.command_key(source)),
             encode(twist, "msgpack"),
             encoding=encoding_name("msgpack", type(twist).__name__),
             express=True,
@@ -309,7 +316,7 @@ class Client:
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
-        self._publish(message, self._sender.sign(stamp_ns, steady=steady))
+        self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         """Return the first reply. A stranger may send any number of further ones."""
