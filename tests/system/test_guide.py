@@ -14,8 +14,8 @@ from typing import Any, cast
 import aiohttp
 import pytest
 
-from acsard.certificates.authority import Authority
-from acsard.prompts.json_prompt import HEARD_S
+from acsard.machine.authority import Authority
+from acsard.terminal.json_prompt import HEARD_S
 from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from acsard.calibration import paths, prepared, solve
+from acsard.calibration import prepared, solve, wheel_angles
 from acsard.calibration import runs as reading
 from acsard.calibration.evidence import Base
 from acsard.calibration.heading import of_gyro
@@ -63,7 +63,7 @@ def log_of(log: str | Table) -> reading.Log:
 
 def ready(log: str | Table) -> Prepared:
     runs = log_of(log).runs
-    angles = [paths.wheels(run) for run in runs]
+    angles = [wheel_angles.angles_of(run) for run in runs]
     return prepared.prepared(runs, angles, of_gyro(runs, angles), BASE, 4.0)
 
 
