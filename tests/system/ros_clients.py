@@ -307,7 +307,7 @@ class Client:
         raise NotImplementedError
 
     def attachment(self) -> bytes | None:
-        """Return what goes with the next sample."""
+        """Return the attachment of the next sample, or None for a sample without one."""
         raise NotImplementedError
 
     def put(self, name: str, type_name: str, payload: bytes) -> None:

@@ -411,7 +411,7 @@ def test_the_numbers_of_1024_senders_without_stamps_are_remembered(
     assert numbered(freshness, 2, 5) == verdict
 
 
-# what a proof must not believe
+# messages that must not prove a clock
 
 
 def test_bursts_of_a_backlog_never_count_although_one_ends_a_half() -> None:
