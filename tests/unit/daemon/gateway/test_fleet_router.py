@@ -137,8 +137,8 @@ def test_for_one_robot_it_is_the_file_as_it_stands() -> None:
     assert made(["robot1"]) == read(TEMPLATE)
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize("message", ["query", "put"])
+@each("role", ROLES)
+@each("message", ["query", "put"])
 def test_each_role_may_use_the_keys_that_the_gateway_of_a_robot_lets_it(
     role: Role, message: str
 ) -> None:
