@@ -63,14 +63,14 @@ def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
     """Return a function that explains why nothing has arrived on a key."""
 
     def look() -> str:
-        from acsard.daemon.bus.quiet import why
-        from acsard.daemon.bus.robot_discovery import around
+        from acsard.daemon.bus.robot_discovery import presence
+        from acsard.daemon.bus.silent_key import explain_silence
 
-        seen = around(robot.session, where.robot_id, where.endpoint)
+        seen = presence(robot.session, where.robot_id, where.endpoint)
         if seen is None:
             return ""
         reason = "" if seen.linked else of_link(where)
-        reason = reason or why(key, where.robot_id, where.endpoint, seen)
+        reason = reason or explain_silence(key, where.robot_id, where.endpoint, seen)
         return f"waiting for {robot.key(key)}: {reason}"
 
     return look
@@ -85,15 +85,15 @@ def lost_by(robot: Client, where: Address) -> Callable[[], str]:
     def look() -> str:
         import zenoh
 
-        from acsard.daemon.bus.quiet import Around, why
+        from acsard.daemon.bus.silent_key import Presence, explain_silence
 
         try:
             if robot.session.info.links():
                 return ""
         except zenoh.ZError:
             return ""  # the session is being closed
-        gone = Around(linked=False, here=False)
-        return of_link(where) or why("", where.robot_id, where.endpoint, gone)
+        gone = Presence(linked=False, here=False)
+        return of_link(where) or explain_silence("", where.robot_id, where.endpoint, gone)
 
     return look
 

@@ -32,8 +32,8 @@ from acsard.core.messages.topics import (
 )
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.identity import Identity, identity
-from acsard.daemon.bus.quiet import why as why_quiet
-from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.robot_discovery import presence
+from acsard.daemon.bus.silent_key import explain_silence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
 from acsard.host import clock
@@ -320,13 +320,13 @@ class Client:
                 return NoAnswerError(f"{no_answer}: {us.silence}")
             if why := us.lacks(key):
                 return NotPermittedError(why)
-        seen = around(self.session, self._id, self._endpoint)
+        seen = presence(self.session, self._id, self._endpoint)
         if seen is None or seen.here or not self._endpoint:
             return NoAnswerError(
                 f"{no_answer}; is the daemon of robot.id {self._id!r} stuck, does it have this "
                 "key (`acsard topics`), and may you query it?"
             )
-        return NoAnswerError(f"{no_answer}: {why_quiet(key, self._id, self._endpoint, seen)}")
+        return NoAnswerError(f"{no_answer}: {explain_silence(key, self._id, self._endpoint, seen)}")
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Convert the error to its documented type, and add the role of the certificate in it."""

@@ -44,10 +44,10 @@ def test_a_key_is_of_one_robot_and_a_wildcard_of_none(key: str, robot: str) -> N
 
 
 def test_where_wildcards_do_not_pass_names_are_asked_for() -> None:
-    assert "exact keys" in nobody("tls/router.local:7447")
-    assert "exact keys" not in nobody("tcp/127.0.0.1:7448")
+    assert "name the robots" in nobody("tls/router.local:7447")
+    assert "name the robots" not in nobody("tcp/127.0.0.1:7448")
 
 
 def test_where_certificates_decide_who_sees_nobody_is_told_how_to_find_out() -> None:
-    assert "`acsard whoami --id robot1` says so" in nobody("tls/router.local:7447")
+    assert "`acsard whoami --id robot1` shows" in nobody("tls/router.local:7447")
     assert "whoami" not in nobody("tcp/127.0.0.1:7448")

@@ -128,7 +128,7 @@ def test_the_options_of_an_endpoint_are_not_part_of_its_port(
 
     monkeypatch.setattr(socket, "create_connection", connection)
     assert trouble(f"tls/robot.local:7449{options}", "") == (
-        "robot.local does not answer on port 7449: is it switched on, "
+        "robot.local does not answer on port 7449: is robot.local switched on, "
         "and does a firewall drop connections?"
     )
     assert asked == [("robot.local", 7449)]
