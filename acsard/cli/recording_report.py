@@ -127,13 +127,13 @@ def _drawn(
     """
     from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay
     from acsard.recording.replay_text import verdict
-    from acsard.report.account import Origin, notes
-    from acsard.report.course import Course
     from acsard.report.page import page
+    from acsard.report.report_data import ReportData
+    from acsard.report.report_text import Origin, notes
 
     about, looked = recording.about, DisplayReplay(recording)
     began, (begin, end) = about.wall_ns / NS_PER_S, recording_span.span(args, recording)
-    course = Course(looked.config, began + begin, began + end)
+    course = ReportData(looked.config, began + begin, began + end)
     for number, (step, outputs, robot) in enumerate(looked.steps()):
         if number % PROGRESS_STEPS == 0:
             tell(step.inputs.now.wall_ns)

@@ -20,7 +20,7 @@ from acsard.recording.export import export
 from acsard.recording.file import Recording
 from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.state import StateError, freeze, thaw
-from acsard.report.course import Course
+from acsard.report.report_data import ReportData
 from tests.each import each
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -145,7 +145,7 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
 def drawn(recording: Recording) -> None:
     """Replay a recording as a report does."""
     looked = DisplayReplay(recording)
-    course = Course(looked.config)
+    course = ReportData(looked.config)
     with looked.state_errors():
         for step, outputs, robot in looked.steps():
             course.step(step, outputs, robot)

@@ -8,14 +8,14 @@ from functools import lru_cache
 from acsard.core.config.settings import Config
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import Replay
-from acsard.report.course import Course
+from acsard.report.report_data import ReportData
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
 
 def course_of(
     drive: Callable[[World], None], begin: float | None = None, end: float | None = None
-) -> tuple[Course, list[Step]]:
+) -> tuple[ReportData, list[Step]]:
     """Return the path of a drive and its steps."""
     config, tape = Config(), Tape()
     world = World(config, recorder=tape)
@@ -29,10 +29,10 @@ def followed(
     config: Config | None = None,
     begin: float | None = None,
     end: float | None = None,
-) -> Course:
+) -> ReportData:
     """Return the path of these steps."""
     config = config or Config()
-    course, replay = Course(config, begin, end), Replay(config)
+    course, replay = ReportData(config, begin, end), Replay(config)
     for step in steps:
         replay.step(step)
         assert replay.outputs is not None
@@ -57,6 +57,6 @@ def two_drivers(world: World) -> None:
 
 
 @lru_cache
-def drive_of_two() -> tuple[Course, list[Step]]:
+def drive_of_two() -> tuple[ReportData, list[Step]]:
     """Return the drive with two commanders, which no test changes."""
     return course_of(two_drivers)

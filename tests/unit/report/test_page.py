@@ -13,9 +13,9 @@ import pytest
 
 from acsard.core.values import Command, Event, Refusal, Twist
 from acsard.recording.recorded_steps import Step
-from acsard.report.account import Origin
-from acsard.report.course import Course, Mark
-from acsard.report.page import MOST_OPEN, escaped, page
+from acsard.report.page import MAX_OPEN, escaped, page
+from acsard.report.report_data import Mark, ReportData
+from acsard.report.report_text import Origin
 from tests.unit.report.driven import drive_of_two, followed
 
 EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\u202e\x00<!--'
@@ -146,11 +146,11 @@ def test_what_is_missing_is_said_on_top() -> None:
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
 
-@pytest.mark.parametrize(("count", "opened"), [(MOST_OPEN, True), (MOST_OPEN + 1, False)])
+@pytest.mark.parametrize(("count", "opened"), [(MAX_OPEN, True), (MAX_OPEN + 1, False)])
 def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
     from acsard.core.config.settings import Config
 
-    course = Course(Config())
+    course = ReportData(Config())
     for n in range(count):
         course.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
     (details,) = [

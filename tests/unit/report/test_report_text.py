@@ -5,7 +5,7 @@ from __future__ import annotations
 from msgspec.structs import replace
 
 from acsard.core.config.settings import Config, Source
-from acsard.report.account import Origin, Setting, differences, reasons, rows, summary
+from acsard.report.report_text import Origin, Setting, differences, reasons, rows, summary
 from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two
 

@@ -8,7 +8,9 @@ from itertools import pairwise
 import pytest
 
 from acsard.recording.recorded_steps import MICRO
-from acsard.report.course import FIRST, LAST, Lateness, Link, Mark, Marks
+from acsard.report.loop_lateness import Lateness
+from acsard.report.report_data import FIRST, LAST, Mark, Marks
+from acsard.report.serial_counts import SerialCounts
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import course_of, drive_of_two, followed
 
@@ -26,7 +28,7 @@ def test_what_was_wished_limited_and_measured() -> None:
     course, _ = drive_of_two()
     top = {name: max(p.value for p in curve.points()) for name, curve in course.linear.items()}
     low = {name: min(p.value for p in curve.points()) for name, curve in course.angular.items()}
-    assert (top["wished"], low["wished"]) == (0.5, -0.8)
+    assert (top["commanded"], low["commanded"]) == (0.5, -0.8)
     assert top["limited"] == pytest.approx(0.5)
     assert low["limited"] == pytest.approx(-0.8)
     assert top["measured"] == course.fastest.linear
@@ -36,10 +38,12 @@ def test_what_was_wished_limited_and_measured() -> None:
 
 def test_each_wheel_follows_what_it_was_asked() -> None:
     course, _ = drive_of_two()
-    for asked, turned in zip(course.asked, course.turned, strict=True):
+    for asked, turned in zip(course.commanded_wheels, course.measured_wheels, strict=True):
         most = max(point.value for point in asked.points())
         assert max(point.value for point in turned.points()) == pytest.approx(most, rel=0.05)
-    right, left = (max(p.value for p in course.asked[wheel].points()) for wheel in (0, 1))
+    right, left = (
+        max(p.value for p in course.commanded_wheels[wheel].points()) for wheel in (0, 1)
+    )
     assert right > left  # the robot turned left
 
 
@@ -52,7 +56,7 @@ def test_what_no_line_says_is_no_value() -> None:
         world.run(0.5)
 
     course, _ = course_of(unplugged)
-    for curve in (course.linear["measured"], course.linear["limited"], course.asked[0]):
+    for curve in (course.linear["measured"], course.linear["limited"], course.commanded_wheels[0]):
         points = curve.points()
         gap = next(at for at, p in enumerate(points) if math.isnan(p.value) and p.t > 0.5)
         assert points[gap + 1].t - points[gap].t > 0.6
@@ -135,9 +139,9 @@ def test_missing_steps_are_counted() -> None:
 MS = 1_000_000
 
 
-def linked(answers: dict[int, int], seconds: int = 10, in_flight: int = 0) -> Link:
+def linked(answers: dict[int, int], seconds: int = 10, in_flight: int = 0) -> SerialCounts:
     """Return a link with 100 lines a second; `answers` gives seconds with another number."""
-    link, sent, good = Link(), 0, 0.0
+    link, sent, good = SerialCounts(), 0, 0.0
     for n in range(100 * seconds):
         second = n // 100
         sent, good = sent + 1, good + answers.get(second, 100) / 100
@@ -163,7 +167,7 @@ def test_lost_lines_are_told_in_their_second() -> None:
 
 
 def test_lines_that_are_no_good_are_dropped_and_not_lost() -> None:
-    link = Link()
+    link = SerialCounts()
     for n in range(300):
         bad = n // 10
         counters = {"lines": n + 1 - bad, "line_header": bad - bad // 2, "line_value": bad // 2}
@@ -174,7 +178,7 @@ def test_lines_that_are_no_good_are_dropped_and_not_lost() -> None:
 
 
 def test_a_line_that_could_not_be_true_is_dropped_too() -> None:
-    link = Link()
+    link = SerialCounts()
     link.step(0.0, True, {"lines": 0})
     link.step(0.5, True, {"lines": 2, "line_implausible": 1})
     link.end()
@@ -202,7 +206,7 @@ def test_lateness_is_against_the_least_late() -> None:
 
 
 def test_a_line_that_went_at_once_makes_no_period_late() -> None:
-    assert late([0.0] * 50, ahead=frozenset({7, 8, 20})).most == pytest.approx(0.0)
+    assert late([0.0] * 50, ahead=frozenset({7, 8, 20})).most_ms == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("at_once", [False, True])
@@ -215,7 +219,7 @@ def test_missed_periods_are_lateness_from_the_first_of_them(at_once: bool) -> No
     lateness.tick(0.132, 132 * MS, 3, known=True)
     lateness.tick(0.14, 140 * MS, 0, known=True)
     assert (lateness.missed, lateness.most_missed) == (3, 3)
-    assert lateness.most == pytest.approx(32.0)
+    assert lateness.most_ms == pytest.approx(32.0)
     assert lateness.points()[-1].value == pytest.approx(0.0)
 
 
@@ -224,4 +228,4 @@ def test_steps_that_are_missing_are_no_lateness() -> None:
     lateness.tick(0.0, 0, 0, known=True)
     lateness.tick(60.0, 60_000 * MS, 2, known=False)
     lateness.tick(60.01, 60_010 * MS, 0, known=True)
-    assert lateness.most == pytest.approx(0.0)
+    assert lateness.most_ms == pytest.approx(0.0)

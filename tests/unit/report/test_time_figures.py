@@ -11,8 +11,8 @@ import plotly.graph_objects as library
 import pytest
 
 from acsard.core.config.parsing import parse
-from acsard.report.drawing import Figure
-from acsard.report.figures import Pictures
+from acsard.report.plot_elements import Figure
+from acsard.report.time_figures import TimeFigures
 from tests.scenarios.taped import Tape, happenings
 from tests.scenarios.world import START, World
 from tests.unit.report.driven import course_of, drive_of_two, followed, two_drivers
@@ -24,7 +24,7 @@ OFFSET_S = 3600.0
 @pytest.fixture(scope="module")
 def figures() -> dict[str, Figure]:
     course, _ = drive_of_two()
-    return {figure.name: figure for figure in Pictures(course, OFFSET_S).all()}
+    return {figure.name: figure for figure in TimeFigures(course, OFFSET_S).all()}
 
 
 def known(values: Iterable[float]) -> list[float | None]:
@@ -39,10 +39,10 @@ def all_that_happens(world: World) -> None:
 
 def test_no_two_signs_of_a_picture_look_alike() -> None:
     course, _ = course_of(all_that_happens)
-    for figure in Pictures(course, OFFSET_S).all():
+    for figure in TimeFigures(course, OFFSET_S).all():
         signs = [(key.sign, key.colour) for key in figure.keys]
         assert len(signs) == len(set(signs)) > 0, figure.keys
-    keys = {key.meaning for figure in Pictures(course, OFFSET_S).all() for key in figure.keys}
+    keys = {key.meaning for figure in TimeFigures(course, OFFSET_S).all() for key in figure.keys}
     assert keys >= {"stop", "link down", "driving, teleop drives"}
 
 
@@ -72,19 +72,19 @@ def test_a_speed_is_at_the_time_of_the_clock_on_the_wall(figures: dict[str, Figu
 
 def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None:
     course, _ = drive_of_two()
-    for n, curve in enumerate(course.turned):
+    for n, curve in enumerate(course.measured_wheels):
         drawn = trace(figures["wheels"], "measured", f"y{n + 1}" if n else "y")
         assert known(column(drawn["y"])) == known(point.value for point in curve.points())
 
 
 def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
-    waits = trace(figures["who"], "waits")
+    waits = trace(figures["sources"], "waits")
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
     assert "<b>waits</b> teleop has priority: wait until it is silent" in words
     assert max(column(waits["x"])) > 1500  # in ms
-    rows = [note["text"] for note in figures["who"].layout["annotations"]]
+    rows = [note["text"] for note in figures["sources"].layout["annotations"]]
     assert rows == ["mode", "link", "teleop", "nav", "others"]
-    assert "Silent all the time: app, ros2_control." in figures["who"].caption
+    assert "Silent all the time: app, ros2_control." in figures["sources"].caption
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
@@ -98,7 +98,7 @@ def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
 
 
 def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str, Figure]) -> None:
-    who = figures["who"]
+    who = figures["sources"]
     looks = drivers(who)
     assert set(looks) == {"teleop", "nav"}
     assert len(set(looks.values())) == 2
@@ -114,7 +114,7 @@ def test_ten_who_drove_are_told_apart() -> None:
     for n in range(10):
         world.drive(0.3, seconds=0.1, source=f"app{n}")
         world.run(0.3)
-    figure = Pictures(followed(tape.steps(), config), OFFSET_S).who()
+    figure = TimeFigures(followed(tape.steps(), config), OFFSET_S).sources()
     library.Figure(data=figure.data, layout=figure.layout)
     looks = drivers(figure)
     assert len(looks) == len(set(looks.values())) == 10
@@ -127,5 +127,5 @@ def test_a_robot_that_was_never_heard_is_drawn_all_the_same() -> None:
         world.run(1.0)
 
     course, _ = course_of(mute)
-    for figure in Pictures(course, 0.0).all():
+    for figure in TimeFigures(course, 0.0).all():
         library.Figure(data=figure.data, layout=figure.layout)
