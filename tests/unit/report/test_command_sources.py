@@ -13,7 +13,7 @@ def spans(source: str) -> list[Span]:
     return course.sources.bands[source].spans()
 
 
-def test_who_drives_is_who_the_recording_says_drives() -> None:
+def test_the_driving_source_is_the_recorded_one() -> None:
     course, steps = drive_of_two()
     for name in ("nav", "teleop"):
         drives = [(s.begin, s.end) for s in spans(name) if s.kind == "drives"]
@@ -24,13 +24,13 @@ def test_who_drives_is_who_the_recording_says_drives() -> None:
     assert drew == recorded == {"nav", "teleop"}
 
 
-def test_who_waits_says_for_whom() -> None:
+def test_a_waiting_source_names_the_source_that_it_waits_for() -> None:
     (wait,) = [span for span in spans("nav") if span.kind == "waits"]
     assert wait.words == "teleop has priority: wait until it is silent"
     assert 1.5 < wait.end - wait.begin < 2.5
 
 
-def test_who_sends_to_a_robot_in_fault_reads_the_fault_and_no_other_reason() -> None:
+def test_a_source_that_sends_during_a_fault_has_only_the_fault_as_reason() -> None:
     def dead(world: World) -> None:
         world.drive(0.5, seconds=0.4)
         with world.mcu.dead_motor(0):
@@ -42,13 +42,13 @@ def test_who_sends_to_a_robot_in_fault_reads_the_fault_and_no_other_reason() -> 
     assert {(span.kind, span.words) for span in said} == {("sends", f"fault: {fault.words}")}
 
 
-def test_a_source_in_no_list_is_refused_among_the_others() -> None:
+def test_a_source_that_is_not_configured_is_refused_among_the_others() -> None:
     (refused,) = spans(OTHERS)
     assert refused.kind == "refused"
     assert refused.words == "not one of commands.sources"
 
 
-def test_a_message_that_is_none_is_refused_with_its_reason() -> None:
+def test_an_invalid_message_is_refused_with_its_reason() -> None:
     def garbled(world: World) -> None:
         world.drive(0.0, seconds=0.2, source="nav")
         world.run(0.3)
@@ -61,5 +61,5 @@ def test_a_message_that_is_none_is_refused_with_its_reason() -> None:
     assert 0.2 < refused.end - refused.begin < 0.5
 
 
-def test_who_never_sent_has_no_band() -> None:
+def test_a_source_that_never_sent_has_no_band() -> None:
     assert spans("ros2_control") == []

@@ -80,7 +80,7 @@ def evil() -> str:
     return page(followed(evil_steps()), origin(file=EVIL, robot=EVIL, version=EVIL), LIBRARY, clock)
 
 
-def test_no_word_of_a_stranger_is_markup_or_program() -> None:
+def test_no_text_of_a_stranger_becomes_markup_or_code() -> None:
     read = Read(evil())
     assert not {"img", "iframe", "object", "a", "link"} & {tag for tag, _ in read.tags}
     assert all(not name.startswith("on") for _, attrs in read.tags for name in attrs)
@@ -93,7 +93,7 @@ def test_no_word_of_a_stranger_is_markup_or_program() -> None:
     assert sum("<script>alert(1)</script>" in words for words in read.words) >= 4
 
 
-def test_what_the_pictures_say_is_not_even_their_librarys_markup() -> None:
+def test_texts_in_the_pictures_contain_no_markup_of_plotly() -> None:
     (pictures,) = [text for attrs, text in Read(evil()).scripts if attrs.get("id") == "pictures"]
     assert "<" not in pictures
     traces = [trace for figure in json.loads(pictures) for trace in figure["data"]]
@@ -105,7 +105,7 @@ def test_what_the_pictures_say_is_not_even_their_librarys_markup() -> None:
     assert tags <= {"<b>", "</b>", "<br>"}
 
 
-def test_it_loads_nothing_and_only_its_own_programs_may_run() -> None:
+def test_the_page_loads_nothing_and_runs_only_its_own_scripts() -> None:
     course, _ = drive_of_two()
     text = page(course, origin(), LIBRARY, clock)
     assert re.findall(r"(?:https?:)?//[\w.]+\.\w+", text) == []
@@ -123,7 +123,7 @@ def test_it_loads_nothing_and_only_its_own_programs_may_run() -> None:
         assert f"'sha256-{digest}'" in policy
 
 
-def test_every_event_has_a_row_with_who_asked() -> None:
+def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
     course, _ = drive_of_two()
     words = Read(page(course, origin(), LIBRARY, clock)).words
     marks = course.marks.all()
@@ -137,7 +137,7 @@ def escaped_words(mark: Mark) -> str:
     return mark.text or mark.name.replace("_", " ")
 
 
-def test_what_is_missing_is_said_on_top() -> None:
+def test_missing_steps_are_reported_at_the_top() -> None:
     _, steps = drive_of_two()
     course = followed(steps[:200] + steps[260:])
     notes = Origin("a", "r", "1", "3", ("no end: cut off, or still being recorded",))
@@ -159,5 +159,5 @@ def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
     assert ("open" in details) is opened
 
 
-def test_escaped_is_one_line_of_text() -> None:
+def test_escaped_text_has_one_line() -> None:
     assert escaped('<a href="x">\n&') == "&lt;a href=&quot;x&quot;&gt; &amp;"

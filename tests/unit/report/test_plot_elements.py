@@ -13,23 +13,23 @@ from tests.unit.report.driven import drive_of_two
 from tests.unit.report.seen import column, trace
 
 
-def test_what_strangers_wrote_is_no_markup_and_fits() -> None:
+def test_a_label_contains_no_markup_and_fits_on_a_phone() -> None:
     assert label("</script><b>x</b>\n&amp;") == "&lt;/script&gt;&lt;b&gt;x&lt;/b&gt; &amp;amp;"
     lines = label("a word and another " * 9 + "x" * 100).split("<br>")
     assert max(map(len, lines)) <= 42
 
 
-def test_what_is_no_number_stays_none() -> None:
+def test_nan_stays_nan() -> None:
     assert math.isnan(column(numbers([1.0, math.nan]))[1])
 
 
-def test_eight_who_drive_have_colours_that_nobody_takes_for_each_other() -> None:
+def test_the_colours_of_eight_sources_are_easy_to_distinguish() -> None:
     assert len(SOURCE_COLOURS) == 8
     rgb = [bytes.fromhex(source_style(n)[0].removeprefix("#")) for n in range(8)]
     assert min(math.dist(one, other) for one, other in combinations(rgb, 2)) > 60
 
 
-def test_whoever_comes_after_them_has_a_pattern() -> None:
+def test_further_sources_have_a_pattern() -> None:
     looks = [source_style(n) for n in range(40)]
     assert len(set(looks)) == 40
     assert [pattern for _, pattern in looks[:8]] == [""] * 8

@@ -24,7 +24,7 @@ def test_the_path_and_its_length_are_the_recorded_poses() -> None:
     assert (last.x, last.y, last.yaw) == tuple(value / MICRO for value in poses[-1])
 
 
-def test_what_was_wished_limited_and_measured() -> None:
+def test_the_commanded_limited_and_measured_speeds_are_drawn() -> None:
     course, _ = drive_of_two()
     top = {name: max(p.value for p in curve.points()) for name, curve in course.linear.items()}
     low = {name: min(p.value for p in curve.points()) for name, curve in course.angular.items()}
@@ -36,7 +36,7 @@ def test_what_was_wished_limited_and_measured() -> None:
     assert top["measured"] == pytest.approx(0.5, rel=0.05)
 
 
-def test_each_wheel_follows_what_it_was_asked() -> None:
+def test_the_measured_speed_of_each_wheel_follows_its_command() -> None:
     course, _ = drive_of_two()
     for asked, turned in zip(course.commanded_wheels, course.measured_wheels, strict=True):
         most = max(point.value for point in asked.points())
@@ -47,7 +47,7 @@ def test_each_wheel_follows_what_it_was_asked() -> None:
     assert right > left  # the robot turned left
 
 
-def test_what_no_line_says_is_no_value() -> None:
+def test_without_a_line_the_curves_have_a_gap() -> None:
     def unplugged(world: World) -> None:
         world.drive(0.5, seconds=0.6)
         world.port.unplug()
@@ -62,7 +62,7 @@ def test_what_no_line_says_is_no_value() -> None:
         assert points[gap + 1].t - points[gap].t > 0.6
 
 
-def test_the_bands_of_the_mode_are_those_recorded() -> None:
+def test_the_bands_of_the_mode_are_the_recorded_modes() -> None:
     course, steps = drive_of_two()
     modes = [span.kind for span in course.modes.spans()]
     recorded = [step.recorded.status[0] for step in steps]
@@ -73,7 +73,7 @@ def test_the_bands_of_the_mode_are_those_recorded() -> None:
     )
 
 
-def test_who_drove_how_far_and_for_how_long() -> None:
+def test_each_source_has_its_distance_and_duration() -> None:
     course, steps = drive_of_two()
     assert set(course.driven) == {"nav", "teleop"}
     driving = sum(
@@ -85,7 +85,7 @@ def test_who_drove_how_far_and_for_how_long() -> None:
     assert 0.0 < sum(one.metres for one in course.driven.values()) <= course.metres
 
 
-def test_events_are_marks_with_who_asked_and_where() -> None:
+def test_a_mark_has_the_client_and_the_place_of_its_event() -> None:
     course, _ = drive_of_two()
     (stop,) = [mark for mark in course.marks.all() if mark.name == "stop"]
     assert stop.by == "unnamed (native)"
@@ -94,7 +94,7 @@ def test_events_are_marks_with_who_asked_and_where() -> None:
     assert [mark.t for mark in course.marks.all()] == sorted(m.t for m in course.marks.all())
 
 
-def test_of_very_many_events_of_one_name_the_first_and_the_last_are_kept() -> None:
+def test_the_first_and_last_events_of_a_frequent_name_are_kept() -> None:
     marks = Marks()
     for n in range(1000):
         marks.add(Mark(float(n), "stop", "stopped", "info", "joe", 2, None))
@@ -105,7 +105,7 @@ def test_of_very_many_events_of_one_name_the_first_and_the_last_are_kept() -> No
     assert marks.counts == {"stop": 2000, "fault": 1}
 
 
-def test_a_pose_that_is_set_is_no_way_driven() -> None:
+def test_a_pose_that_was_set_adds_no_distance() -> None:
     def set_away(world: World) -> None:
         world.drive(0.3, seconds=0.3)
         world.call("set_pose", b'{"x": 100.0, "y": 0.0, "yaw": 0.0}')
@@ -117,7 +117,7 @@ def test_a_pose_that_is_set_is_no_way_driven() -> None:
     assert [place.new for place in course.path.places()].count(True) == 2
 
 
-def test_a_part_of_the_time_is_that_part_alone() -> None:
+def test_only_steps_of_the_time_window_are_collected() -> None:
     _, steps = drive_of_two()
     begin = START.wall_ns / 1e9 + 1.0
     course = followed(steps, begin=begin, end=begin + 0.9)
@@ -150,14 +150,14 @@ def linked(answers: dict[int, int], seconds: int = 10, in_flight: int = 0) -> Se
     return link
 
 
-def test_a_sound_line_loses_nothing() -> None:
+def test_a_good_serial_port_loses_no_line() -> None:
     for in_flight in (0, 1):
         link = linked({}, in_flight=in_flight)
         assert link.totals.unanswered == 0
         assert [point.value for point in link.sent.points()] == [100.0] * 10
 
 
-def test_lost_lines_are_told_in_their_second() -> None:
+def test_lost_lines_are_counted_in_their_second() -> None:
     link = linked({4: 70})
     lost = {int(point.t): point.value for point in link.unanswered.points()}
     assert link.totals.unanswered == 30
@@ -166,7 +166,7 @@ def test_lost_lines_are_told_in_their_second() -> None:
     assert {second: count for second, count in lost.items() if count and second not in (4, 5)} == {}
 
 
-def test_lines_that_are_no_good_are_dropped_and_not_lost() -> None:
+def test_unreadable_lines_count_as_dropped_and_not_as_lost() -> None:
     link = SerialCounts()
     for n in range(300):
         bad = n // 10
@@ -177,7 +177,7 @@ def test_lines_that_are_no_good_are_dropped_and_not_lost() -> None:
     assert link.totals.good + link.totals.dropped == 299  # the first line had already arrived
 
 
-def test_a_line_that_could_not_be_true_is_dropped_too() -> None:
+def test_an_implausible_line_counts_as_dropped() -> None:
     link = SerialCounts()
     link.step(0.0, True, {"lines": 0})
     link.step(0.5, True, {"lines": 2, "line_implausible": 1})
@@ -200,17 +200,17 @@ def late(lates: list[float], ahead: frozenset[int] = frozenset()) -> Lateness:
     return lateness
 
 
-def test_lateness_is_against_the_least_late() -> None:
+def test_lateness_is_relative_to_the_smallest_delay() -> None:
     values = [point.value for point in late([0.3, 0.1, 7.1, 0.1, 9.6, 0.1]).points()]
     assert values == pytest.approx([0.2, 0.0, 7.0, 0.0, 9.5, 0.0])
 
 
-def test_a_line_that_went_at_once_makes_no_period_late() -> None:
+def test_a_line_that_was_sent_at_once_makes_no_period_late() -> None:
     assert late([0.0] * 50, ahead=frozenset({7, 8, 20})).most_ms == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("at_once", [False, True])
-def test_missed_periods_are_lateness_from_the_first_of_them(at_once: bool) -> None:
+def test_lateness_counts_from_the_first_missed_period(at_once: bool) -> None:
     lateness = Lateness(100.0)
     for n in range(10):
         lateness.tick(n / 100, n * 10 * MS, 0, known=True)
@@ -223,7 +223,7 @@ def test_missed_periods_are_lateness_from_the_first_of_them(at_once: bool) -> No
     assert lateness.points()[-1].value == pytest.approx(0.0)
 
 
-def test_steps_that_are_missing_are_no_lateness() -> None:
+def test_missing_steps_do_not_count_as_lateness() -> None:
     lateness = Lateness(100.0)
     lateness.tick(0.0, 0, 0, known=True)
     lateness.tick(60.0, 60_000 * MS, 2, known=False)

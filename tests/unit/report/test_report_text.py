@@ -10,7 +10,7 @@ from tests.scenarios.world import World
 from tests.unit.report.driven import course_of, drive_of_two
 
 
-def test_the_summary_says_how_far_how_fast_and_who_stopped_it() -> None:
+def test_the_summary_has_distance_speed_and_the_client_that_stopped_the_robot() -> None:
     course, _ = drive_of_two()
     text = summary(course)
     assert text.startswith(f"The robot drove {course.metres:.2f} m in ")
@@ -18,12 +18,12 @@ def test_the_summary_says_how_far_how_fast_and_who_stopped_it() -> None:
     assert text.endswith("There were no faults, 1 stop (by unnamed (native)).")
 
 
-def test_a_robot_that_stood_did_not_drive() -> None:
+def test_the_summary_of_a_standing_robot_says_that_it_did_not_drive() -> None:
     course, _ = course_of(lambda world: world.run(0.5))
     assert summary(course).startswith("The robot did not drive in these 0.5 s.")
 
 
-def test_a_fault_is_told_with_its_time_and_its_words() -> None:
+def test_a_fault_is_listed_with_its_time_and_its_text() -> None:
     def stuck(world: World) -> None:
         world.drive(0.5, seconds=0.5)
         with world.mcu.dead_motor(0):
@@ -39,7 +39,7 @@ def test_a_fault_is_told_with_its_time_and_its_words() -> None:
     assert table["Recorded by"] == "acsard 0.1.0, Python 3.11.0"
 
 
-def test_a_computer_that_did_not_run_is_no_loss_of_the_link() -> None:
+def test_a_host_stall_does_not_count_as_a_loss_of_the_link() -> None:
     def late(world: World) -> None:
         world.drive(0.5, seconds=0.5)
         with world.mcu.mute():
@@ -50,7 +50,7 @@ def test_a_computer_that_did_not_run_is_no_loss_of_the_link() -> None:
     assert summary(course).endswith("no stops, 1 stall of the robot's computer.")
 
 
-def test_only_what_is_not_the_default_is_told_of_a_configuration() -> None:
+def test_only_settings_that_differ_from_the_default_are_listed() -> None:
     config = Config()
     assert differences(config) == []
     sources = (*config.commands.sources, Source("joe", 7))
@@ -73,7 +73,7 @@ def test_the_longest_reason_comes_first() -> None:
     assert all(first[3] >= other[3] for other in rest)
 
 
-def test_sentences_that_differ_by_a_number_are_one_reason_as_the_longest_says_it() -> None:
+def test_reasons_that_differ_in_a_number_count_as_one_with_the_longest_text() -> None:
     course, _ = course_of(lambda world: world.run(0.1))
     band = course.sources.bands["app"]
     for n, t in enumerate((1.0, 1.5, 3.5)):

@@ -37,7 +37,7 @@ def all_that_happens(world: World) -> None:
     happenings(world, random.Random(1))
 
 
-def test_no_two_signs_of_a_picture_look_alike() -> None:
+def test_no_two_symbols_of_a_picture_look_alike() -> None:
     course, _ = course_of(all_that_happens)
     for figure in TimeFigures(course, OFFSET_S).all():
         signs = [(key.sign, key.colour) for key in figure.keys]
@@ -46,7 +46,7 @@ def test_no_two_signs_of_a_picture_look_alike() -> None:
     assert keys >= {"stop", "link down", "driving, teleop drives"}
 
 
-def test_a_curve_that_another_may_hide_is_seen_beneath_it(figures: dict[str, Figure]) -> None:
+def test_a_curve_under_another_curve_stays_visible(figures: dict[str, Figure]) -> None:
     for name, beneath in (("speeds", "limited"), ("wheels", "commanded"), ("link", "sent")):
         widths = {one["name"]: one["line"]["width"] for one in figures[name].data}
         below = [one["name"] for one in figures[name].data].index(beneath)
@@ -55,13 +55,13 @@ def test_a_curve_that_another_may_hide_is_seen_beneath_it(figures: dict[str, Fig
 
 
 @pytest.mark.slow
-def test_the_library_knows_every_word_of_them(figures: dict[str, Figure]) -> None:
+def test_plotly_knows_every_attribute_of_the_pictures(figures: dict[str, Figure]) -> None:
     for figure in figures.values():
         made = library.Figure(data=figure.data, layout=figure.layout)
         assert len(made.data) == len(figure.data)
 
 
-def test_a_speed_is_at_the_time_of_the_clock_on_the_wall(figures: dict[str, Figure]) -> None:
+def test_speeds_are_drawn_at_local_times(figures: dict[str, Figure]) -> None:
     course, _ = drive_of_two()
     points, drawn = course.linear["measured"].points(), trace(figures["speeds"], "measured")
     assert known(column(drawn["y"])) == known(point.value for point in points)
@@ -77,7 +77,7 @@ def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None
         assert known(column(drawn["y"])) == known(point.value for point in curve.points())
 
 
-def test_bands_say_why_whoever_wrote_it(figures: dict[str, Figure]) -> None:
+def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
     waits = trace(figures["sources"], "waits")
     words = [text.replace("<br>", " ") for text in waits["hovertext"]]
     assert "<b>waits</b> teleop has priority: wait until it is silent" in words
@@ -97,7 +97,7 @@ def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
     }
 
 
-def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str, Figure]) -> None:
+def test_two_driving_sources_have_two_colours_in_the_legend(figures: dict[str, Figure]) -> None:
     who = figures["sources"]
     looks = drivers(who)
     assert set(looks) == {"teleop", "nav"}
@@ -107,7 +107,7 @@ def test_two_who_drove_have_two_colours_that_the_legend_names(figures: dict[str,
 
 
 @pytest.mark.slow
-def test_ten_who_drove_are_told_apart() -> None:
+def test_ten_driving_sources_have_different_styles() -> None:
     rows = [f'[[commands.sources]]\nname = "app{n}"\npriority = {n}\n' for n in range(10)]
     config, tape = parse("".join(rows).encode()), Tape()
     world = World(config, recorder=tape)
@@ -121,7 +121,7 @@ def test_ten_who_drove_are_told_apart() -> None:
     assert [pattern != "" for _, pattern in looks.values()] == [False] * 8 + [True] * 2
 
 
-def test_a_robot_that_was_never_heard_is_drawn_all_the_same() -> None:
+def test_a_robot_without_feedback_is_drawn() -> None:
     def mute(world: Any) -> None:
         world.port.unplug()
         world.run(1.0)

@@ -13,7 +13,7 @@ def absent(*others: str) -> Presence:
     return Presence(True, False, others)
 
 
-def test_of_a_robot_that_is_not_there_the_one_most_like_it_is_told_first() -> None:
+def test_for_an_absent_robot_the_most_similar_id_comes_first() -> None:
     told = explain_silence("state", "rob1t1", PLAIN, absent("acsar", "robot2", "robot1"))
     assert (
         "there is no robot rob1t1, but there is robot1, robot2, acsar: choose one, --id robot1"
@@ -21,7 +21,7 @@ def test_of_a_robot_that_is_not_there_the_one_most_like_it_is_told_first() -> No
     )
 
 
-def test_of_a_large_fleet_a_few_are_told() -> None:
+def test_only_a_few_robots_of_a_large_fleet_are_named() -> None:
     told = explain_silence("state", "robot7", PLAIN, absent(*(f"robot{n:02}" for n in range(100))))
     assert (
         told.count("robot") == 2 + MAX_NAMED + 1
@@ -29,12 +29,12 @@ def test_of_a_large_fleet_a_few_are_told() -> None:
     assert f"and {100 - MAX_NAMED} more (`acsard fleet`)" in told
 
 
-def test_where_nobody_is_seen_the_place_is_told() -> None:
+def test_if_no_robot_is_visible_the_message_names_the_endpoint() -> None:
     assert f"no robot is visible at {PLAIN}" in explain_silence("state", "acsar", PLAIN, absent())
     assert "`acsard whoami --id robot1`" in explain_silence("state", "robot1", TLS, absent())
 
 
-def test_a_daemon_that_is_gone_is_told_before_all_else() -> None:
+def test_a_lost_connection_is_reported_before_all_other_reasons() -> None:
     told = explain_silence("oddom", "acsar", PLAIN, Presence(linked=False, here=False))
     assert f"{PLAIN} has no connection any more" in told
 
@@ -53,7 +53,7 @@ def test_a_daemon_that_is_gone_is_told_before_all_else() -> None:
         ("diagnostics", "may you follow it"),
     ],
 )
-def test_of_a_robot_that_is_there_the_key_is_told(key: str, words: str) -> None:
+def test_for_a_present_robot_the_reason_is_about_the_key(key: str, words: str) -> None:
     told = explain_silence(key, "acsar", PLAIN, HERE)
     assert told.startswith("robot acsar is there, but ")
     assert words in told
