@@ -131,28 +131,28 @@ def _drawn(
     from acsard.report.report_data import ReportData
     from acsard.report.report_text import Origin, notes
 
-    about, looked = recording.about, DisplayReplay(recording)
+    about, replayed = recording.about, DisplayReplay(recording)
     began, (begin, end) = about.wall_ns / NS_PER_S, recording_span.span(args, recording)
-    course = ReportData(looked.config, began + begin, began + end)
-    for number, (step, outputs, robot) in enumerate(looked.steps()):
+    data = ReportData(replayed.config, began + begin, began + end)
+    for number, (step, outputs, robot) in enumerate(replayed.steps()):
         if number % PROGRESS_STEPS == 0:
             tell(step.inputs.now.wall_ns)
-        course.step(step, outputs, robot)
-        if course.over:
+        data.step(step, outputs, robot)
+        if data.over:
             # Read the rest, so that the notes count every damaged place.
             deque(recording.messages(), maxlen=0)
             break
-    if course.began is None:
+    if data.began is None:
         message = f"{recording.path} has no step in that span of time, so there is nothing to draw"
         raise ExitError(Exit.FAILURE, message)
-    course.end()
-    said = [*filter(None, [words.state(recording).strip(" []")]), *looked.notes]
-    comparison = looked.replay.comparison
-    if not (comparison.same or looked.notes or course.missing):
-        said.append(
+    data.end()
+    remarks = [*filter(None, [words.state(recording).strip(" []")]), *replayed.notes]
+    comparison = replayed.replay.comparison
+    if not (comparison.same or replayed.notes or data.missing):
+        remarks.append(
             "this version of acsard computes other results than the recorded ones: "
             f"{verdict(comparison)}"
         )
-    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
-    offset_s = time.localtime(course.began).tm_gmtoff
-    return page(course, origin, plotly, words.clock, offset_s), notes(course, origin)
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(remarks))
+    offset_s = time.localtime(data.began).tm_gmtoff
+    return page(data, origin, plotly, words.clock, offset_s), notes(data, origin)

@@ -145,10 +145,10 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
 def drawn(recording: Recording) -> None:
     """Replay a recording as a report does."""
     looked = DisplayReplay(recording)
-    course = ReportData(looked.config)
+    report = ReportData(looked.config)
     with looked.state_errors():
         for step, outputs, robot in looked.steps():
-            course.step(step, outputs, robot)
+            report.step(step, outputs, robot)
     if looked.notes:
         raise RecordingError(looked.notes[0])
 

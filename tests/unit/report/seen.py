@@ -1,4 +1,4 @@
-"""Reads the content of a plot, for the tests."""
+"""Reads the content of a picture, for the tests."""
 
 from __future__ import annotations
 

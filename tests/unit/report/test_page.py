@@ -16,7 +16,7 @@ from acsard.recording.recorded_steps import Step
 from acsard.report.page import MAX_OPEN, escaped, page
 from acsard.report.report_data import Mark, ReportData
 from acsard.report.report_text import Origin
-from tests.unit.report.driven import drive_of_two, followed
+from tests.unit.report.driven import drive_of_two, report_from
 
 EVIL = '</script><script>alert(1)</script><img src=x onerror="alert(2)">\'"&lt;\u202e\x00<!--'
 
@@ -24,7 +24,7 @@ LIBRARY = "var Plotly = {};"
 
 
 class Read(HTMLParser):
-    """The elements that a browser would see."""
+    """The elements of a page that a browser would see."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ def origin(**others: str) -> Origin:
 
 
 def evil_steps() -> list[Step]:
-    """Return a drive in which all text from others is hostile."""
+    """Return a drive in which all text of unknown origin is hostile."""
     from msgspec.structs import replace
 
     _, steps = drive_of_two()
@@ -77,7 +77,9 @@ def evil_steps() -> list[Step]:
 
 @lru_cache
 def evil() -> str:
-    return page(followed(evil_steps()), origin(file=EVIL, robot=EVIL, version=EVIL), LIBRARY, clock)
+    return page(
+        report_from(evil_steps()), origin(file=EVIL, robot=EVIL, version=EVIL), LIBRARY, clock
+    )
 
 
 def test_no_text_of_a_stranger_becomes_markup_or_code() -> None:
@@ -106,8 +108,8 @@ def test_texts_in_the_pictures_contain_no_markup_of_plotly() -> None:
 
 
 def test_the_page_loads_nothing_and_runs_only_its_own_scripts() -> None:
-    course, _ = drive_of_two()
-    text = page(course, origin(), LIBRARY, clock)
+    report, _ = drive_of_two()
+    text = page(report, origin(), LIBRARY, clock)
     assert re.findall(r"(?:https?:)?//[\w.]+\.\w+", text) == []
     read = Read(text)
     assert all(not {"src", "href"} & set(attrs) for _, attrs in read.tags)
@@ -124,9 +126,9 @@ def test_the_page_loads_nothing_and_runs_only_its_own_scripts() -> None:
 
 
 def test_every_event_has_a_row_with_the_client_that_caused_it() -> None:
-    course, _ = drive_of_two()
-    words = Read(page(course, origin(), LIBRARY, clock)).words
-    marks = course.marks.all()
+    report, _ = drive_of_two()
+    words = Read(page(report, origin(), LIBRARY, clock)).words
+    marks = report.marks.all()
     assert f"All {len(marks)} events" in words
     for mark in marks:
         assert escaped_words(mark) in words
@@ -139,9 +141,9 @@ def escaped_words(mark: Mark) -> str:
 
 def test_missing_steps_are_reported_at_the_top() -> None:
     _, steps = drive_of_two()
-    course = followed(steps[:200] + steps[260:])
+    report = report_from(steps[:200] + steps[260:])
     notes = Origin("a", "r", "1", "3", ("no end: cut off, or still being recorded",))
-    words = Read(page(course, notes, LIBRARY, clock)).words
+    words = Read(page(report, notes, LIBRARY, clock)).words
     assert "no end: cut off, or still being recorded" in words
     assert any(text.startswith("60 steps are missing: ") for text in words)
 
@@ -150,11 +152,11 @@ def test_missing_steps_are_reported_at_the_top() -> None:
 def test_a_long_list_of_events_is_folded(count: int, opened: bool) -> None:
     from acsard.core.config.settings import Config
 
-    course = ReportData(Config())
+    report = ReportData(Config())
     for n in range(count):
-        course.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
+        report.marks.add(Mark(float(n), f"name{n}", "text", "info", "", 1, None))
     (details,) = [
-        a for tag, a in Read(page(course, origin(), LIBRARY, clock)).tags if tag == "details"
+        a for tag, a in Read(page(report, origin(), LIBRARY, clock)).tags if tag == "details"
     ]
     assert ("open" in details) is opened
 

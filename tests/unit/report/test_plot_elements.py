@@ -1,4 +1,4 @@
-"""Tests of the words, numbers and paths that the plotting library receives."""
+"""Tests of the texts, numbers and paths that plotly receives."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def test_further_sources_have_a_pattern() -> None:
 
 
 def test_the_path_is_in_metres_with_equal_axes() -> None:
-    course, _ = drive_of_two()
-    drawn, places = path_figure(course), course.path.places()
+    report, _ = drive_of_two()
+    drawn, places = path_figure(report), report.path.places()
     assert drawn.layout["yaxis"]["scaleanchor"] == "x"
     assert drawn.layout["yaxis"]["scaleratio"] == 1
     assert column(trace(drawn, "path")["x"]) == [place.x for place in places]
@@ -47,9 +47,9 @@ def test_the_path_is_in_metres_with_equal_axes() -> None:
 
 
 def test_arrows_show_the_heading() -> None:
-    course, _ = drive_of_two()
-    heading = trace(path_figure(course), "heading")
-    by_place = {(place.x, place.y): place.yaw for place in course.path.places()}
+    report, _ = drive_of_two()
+    heading = trace(path_figure(report), "heading")
+    by_place = {(place.x, place.y): place.yaw for place in report.path.places()}
     places = zip(column(heading["x"]), column(heading["y"]), strict=True)
     told = [math.radians(90 - angle) for angle in heading["marker"]["angle"]]
     assert len(told) >= 8

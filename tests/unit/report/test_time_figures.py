@@ -1,4 +1,4 @@
-"""The plotting library accepts the plots, and their numbers are those of the path."""
+"""Plotly accepts the pictures, and their numbers are those of the report's data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from acsard.report.plot_elements import Figure
 from acsard.report.time_figures import TimeFigures
 from tests.scenarios.taped import Tape, happenings
 from tests.scenarios.world import START, World
-from tests.unit.report.driven import course_of, drive_of_two, followed, two_drivers
+from tests.unit.report.driven import drive_of_two, report_from, report_of, two_drivers
 from tests.unit.report.seen import column, trace
 
 OFFSET_S = 3600.0
@@ -23,8 +23,8 @@ OFFSET_S = 3600.0
 
 @pytest.fixture(scope="module")
 def figures() -> dict[str, Figure]:
-    course, _ = drive_of_two()
-    return {figure.name: figure for figure in TimeFigures(course, OFFSET_S).all()}
+    report, _ = drive_of_two()
+    return {figure.name: figure for figure in TimeFigures(report, OFFSET_S).all()}
 
 
 def known(values: Iterable[float]) -> list[float | None]:
@@ -38,11 +38,11 @@ def all_that_happens(world: World) -> None:
 
 
 def test_no_two_symbols_of_a_picture_look_alike() -> None:
-    course, _ = course_of(all_that_happens)
-    for figure in TimeFigures(course, OFFSET_S).all():
+    report, _ = report_of(all_that_happens)
+    for figure in TimeFigures(report, OFFSET_S).all():
         signs = [(key.sign, key.colour) for key in figure.keys]
         assert len(signs) == len(set(signs)) > 0, figure.keys
-    keys = {key.meaning for figure in TimeFigures(course, OFFSET_S).all() for key in figure.keys}
+    keys = {key.meaning for figure in TimeFigures(report, OFFSET_S).all() for key in figure.keys}
     assert keys >= {"stop", "link down", "driving, teleop drives"}
 
 
@@ -62,8 +62,8 @@ def test_plotly_knows_every_attribute_of_the_pictures(figures: dict[str, Figure]
 
 
 def test_speeds_are_drawn_at_local_times(figures: dict[str, Figure]) -> None:
-    course, _ = drive_of_two()
-    points, drawn = course.linear["measured"].points(), trace(figures["speeds"], "measured")
+    report, _ = drive_of_two()
+    points, drawn = report.linear["measured"].points(), trace(figures["speeds"], "measured")
     assert known(column(drawn["y"])) == known(point.value for point in points)
     zero_ms = 1000 * (START.wall_ns / 1e9 + OFFSET_S)
     times = [(ms - zero_ms) / 1000 for ms in column(drawn["x"])]
@@ -71,8 +71,8 @@ def test_speeds_are_drawn_at_local_times(figures: dict[str, Figure]) -> None:
 
 
 def test_each_wheel_has_a_picture_of_its_own(figures: dict[str, Figure]) -> None:
-    course, _ = drive_of_two()
-    for n, curve in enumerate(course.measured_wheels):
+    report, _ = drive_of_two()
+    for n, curve in enumerate(report.measured_wheels):
         drawn = trace(figures["wheels"], "measured", f"y{n + 1}" if n else "y")
         assert known(column(drawn["y"])) == known(point.value for point in curve.points())
 
@@ -88,7 +88,7 @@ def test_bands_show_the_reason_on_hover(figures: dict[str, Figure]) -> None:
 
 
 def drivers(figure: Figure) -> dict[str, tuple[str, str]]:
-    """Return the colour and pattern of each commander that drove."""
+    """Return the colour and pattern of each source that drove."""
     drives = [one for one in figure.data if one["name"].endswith(" drives")]
     looks = {one["name"].split()[0]: one["marker"] for one in drives}
     return {
@@ -114,7 +114,7 @@ def test_ten_driving_sources_have_different_styles() -> None:
     for n in range(10):
         world.drive(0.3, seconds=0.1, source=f"app{n}")
         world.run(0.3)
-    figure = TimeFigures(followed(tape.steps(), config), OFFSET_S).sources()
+    figure = TimeFigures(report_from(tape.steps(), config), OFFSET_S).sources()
     library.Figure(data=figure.data, layout=figure.layout)
     looks = drivers(figure)
     assert len(looks) == len(set(looks.values())) == 10
@@ -126,6 +126,6 @@ def test_a_robot_without_feedback_is_drawn() -> None:
         world.port.unplug()
         world.run(1.0)
 
-    course, _ = course_of(mute)
-    for figure in TimeFigures(course, 0.0).all():
+    report, _ = report_of(mute)
+    for figure in TimeFigures(report, 0.0).all():
         library.Figure(data=figure.data, layout=figure.layout)
