@@ -12,7 +12,7 @@ from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
 from acsard.core.formatting import many
-from acsard.terminal.tables import table
+from acsard.terminal.output import table
 
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",
@@ -27,19 +27,20 @@ MOST_STD = 1.0
 
 
 class Refusal(Struct, frozen=True):
-    """The object that `--json` prints if a log gives no result: the reason and earlier notes."""
+    """The object that `--json` prints if a log gives no calibration."""
 
     log: str
     refused: str
+    """The reason, and what to do."""
     notes: Sequence[str] = ()
+    """Sentences about the log that may explain the reason."""
 
 
 class Report(Struct, frozen=True):
     """The object that `--json` prints.
 
-    Multipliers and their standard deviations are pure numbers. Errors are those with the present
-    multipliers and with the new ones, on parts of the log that were left out of the fit; they are
-    None if nothing measures them.
+    An error `..._before` is that with the configured multipliers, and `..._after` that with the new
+    ones, measured on parts of the log that the fit did not use. It is None if nothing measures it.
     """
 
     log: str
@@ -56,10 +57,7 @@ class Report(Struct, frozen=True):
     covariance: Sequence[Sequence[float]]
     """Covariance of the three multipliers, in the order of the fields above."""
     odometry: dict[str, float]
-    """Standard deviations as the settings of `[odometry]`.
-
-    They are those of each multiplier without the common part, and that of the common part.
-    """
+    """Standard deviations for `[odometry]`, by the name of the setting (`Multipliers.own`)."""
     effective_track: float
     """Effective track, m."""
     effective_track_std: float
@@ -73,7 +71,7 @@ class Report(Struct, frozen=True):
     """Heading error after a turn of 360 deg, deg."""
     turn_error_after: float | None
     straight_error_before: float | None
-    """Heading error after 10 m straight on, deg."""
+    """Heading error after 10 m straight ahead, deg."""
     straight_error_after: float | None
     position_error_before: float | None
     """Position error over a few seconds, m rms."""
@@ -94,88 +92,101 @@ class Report(Struct, frozen=True):
     refused: None = None
 
 
-def report(log: str, found: Calibration, drive: DriveConfig, written: str) -> Report:
-    """Return the report of a calibration. `written` is the file that it was written to, or ""."""
-    track, left, right = found.found.values.tolist()
-    track_std, left_std, right_std = found.found.std.tolist()
-    gain, drives = found.gain, found.drives
+def report(log: str, calibration: Calibration, drive: DriveConfig, written: str) -> Report:
+    """Return the report of a calibration.
+
+    Args:
+        log: the name of the log, or of the guided drive.
+        calibration: the calibration.
+        drive: the geometry that the multipliers belong to.
+        written: the name of the file that now contains the multipliers, or "".
+    """
+    multipliers = calibration.multipliers
+    track, left, right = multipliers.values.tolist()
+    track_std, left_std, right_std = multipliers.std.tolist()
+    improvement, drives = calibration.improvement, calibration.drives
     return Report(
-        log=log, reference=found.way, scale=found.scale,
+        log=log, reference=calibration.reference, scale=calibration.scale,
         wheel_separation_multiplier=track, wheel_separation_multiplier_std=track_std,
         left_wheel_radius_multiplier=left, left_wheel_radius_multiplier_std=left_std,
         right_wheel_radius_multiplier=right, right_wheel_radius_multiplier_std=right_std,
-        covariance=found.found.covariance.tolist(), odometry=deviations(found),
+        covariance=multipliers.covariance.tolist(), odometry=deviations(calibration),
         effective_track=track * drive.wheel_separation,
         effective_track_std=track_std * drive.wheel_separation,
-        effective_track_growth=found.growth, effective_track_growth_std=found.growth_std,
+        effective_track_growth=calibration.growth,
+        effective_track_growth_std=calibration.growth_std,
         left_wheel_radius=left * drive.wheel_radius, right_wheel_radius=right * drive.wheel_radius,
-        turn_error_before=gain.turn.now, turn_error_after=gain.turn.then,
-        straight_error_before=gain.straight.now, straight_error_after=gain.straight.then,
-        position_error_before=gain.place.now, position_error_after=gain.place.then,
-        time_offsets=found.late, gyro_bias=found.bias,
+        turn_error_before=improvement.turn.before, turn_error_after=improvement.turn.after,
+        straight_error_before=improvement.straight.before,
+        straight_error_after=improvement.straight.after,
+        position_error_before=improvement.place.before,
+        position_error_after=improvement.place.after,
+        time_offsets=calibration.delays, gyro_bias=calibration.gyro_bias,
         runs=drives.runs, seconds=drives.seconds, distance=drives.metres, turns=drives.turns,
-        notes=found.notes, written=written or None,
+        notes=calibration.notes, written=written or None,
     )  # fmt: skip
 
 
-def keys(found: Calibration) -> dict[str, object]:
+def keys(calibration: Calibration) -> dict[str, object]:
     """Return the settings that `--write` sets, by dotted key."""
     wanted: dict[str, object] = {
         f"drive.{name}": round(float(value), DIGITS)
-        for name, value in zip(NAMES, found.found.values, strict=True)
+        for name, value in zip(NAMES, calibration.multipliers.values, strict=True)
     }
-    return wanted | {f"odometry.{name}": value for name, value in deviations(found).items()}
+    return wanted | {f"odometry.{name}": value for name, value in deviations(calibration).items()}
 
 
-def deviations(found: Calibration) -> dict[str, float]:
+def deviations(calibration: Calibration) -> dict[str, float]:
     """Return the settings of `[odometry]`; the scale is included only if it was measured."""
-    own, scale = found.found.own()
+    own, scale = calibration.multipliers.own()
     given = {f"{name}_std": float(value) for name, value in zip(NAMES, own, strict=True)}
-    if found.scale:
+    if calibration.scale:
         given["distance_scale_std"] = scale
     return {name: round(min(value, MOST_STD), DIGITS) for name, value in given.items()}
 
 
-def parts(found: Report, calibration: Calibration, where: str) -> Iterator[RenderableType]:
-    """Yield the sentences and the table of the report."""
+def parts(report: Report, calibration: Calibration, where: str) -> Iterator[RenderableType]:
+    """Yield the sentences and the table of the report. `where` names the configuration file."""
     drives = calibration.drives
     yield (
-        f"{found.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
+        f"{report.log}: {many(drives.runs, 'run')}, {drives.seconds:.0f} s, "
         f"{drives.metres:.1f} m, {drives.turns:.1f} turns at up to {drives.fastest:.2f} rad/s; "
-        f"compared with {found.reference}"
+        f"compared with {report.reference}"
     )
-    now, then = calibration.now, calibration.found
-    was = found.effective_track / then.values[SEPARATION] * now.values[SEPARATION]
+    now, new = calibration.configured, calibration.multipliers
+    was = report.effective_track / new.values[SEPARATION] * now.values[SEPARATION]
     figures = [
-        *zip(NAMES, now.values, then.values, then.std, strict=True),
-        ("effective track, m", was, found.effective_track, found.effective_track_std),
+        *zip(NAMES, now.values, new.values, new.std, strict=True),
+        ("effective track, m", was, report.effective_track, report.effective_track_std),
     ]
     rows = [(name, *(f"{value:.4f}" for value in values)) for name, *values in figures]
     yield from ("", table(rows, ("", "now", "found", "standard deviation"), right={1, 2}), "")
-    yield from _better(found)
+    yield from _better(report)
     yield ""
-    yield from _remains(found, calibration)
-    yield from (f"note: {note}" for note in found.notes)
-    yield from ("", f"{where}: written" if found.written else "for acsard.toml (or --write):")
+    yield from _remains(report, calibration)
+    yield from (f"note: {note}" for note in report.notes)
+    yield from ("", f"{where}: written" if report.written else "for acsard.toml (or --write):")
     yield from excerpt(keys(calibration))
 
 
-def _better(found: Report) -> list[str]:
-    """Return sentences about the improvement, as measured on data that was not fitted."""
-    told = []
+def _better(report: Report) -> list[str]:
+    """Return sentences about the improvement that the calibration brings."""
+    sentences = []
     for before, after, words, unit, factor in (
-        (found.turn_error_before, found.turn_error_after,
+        (report.turn_error_before, report.turn_error_after,
          "error of a turn of 360 deg: {} now, {} with the new values", "deg", 1),
-        (found.straight_error_before, found.straight_error_after,
+        (report.straight_error_before, report.straight_error_after,
          "heading error after 10 m straight ahead: {} now, {} with the new values", "deg", 1),
-        (found.position_error_before, found.position_error_after,
+        (report.position_error_before, report.position_error_after,
          "position error over a few seconds: {} now, {} with the new values", "cm", 100),
     ):  # fmt: skip
         if before is not None and after is not None:
-            told.append(
+            sentences.append(
                 words.format(f"{_two(before * factor)} {unit}", f"{_two(after * factor)} {unit}")
             )
-    return [*told, "(measured on parts of the log that the fit did not use)"] if told else []
+    return (
+        [*sentences, "(measured on parts of the log that the fit did not use)"] if sentences else []
+    )
 
 
 def _two(value: float) -> str:
@@ -183,20 +194,21 @@ def _two(value: float) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.1f}" if value >= 1 else f"{value:.2f}"
 
 
-def _remains(found: Report, calibration: Calibration) -> list[str]:
+def _remains(report: Report, calibration: Calibration) -> list[str]:
     """Return sentences about the errors that the calibration cannot remove."""
     fastest = calibration.drives.fastest
-    share = calibration.found.std[SEPARATION] / calibration.found.values[SEPARATION]
-    told = [
+    multipliers = calibration.multipliers
+    share = multipliers.std[SEPARATION] / multipliers.values[SEPARATION]
+    sentences = [
         "what remains: on wheels that skid the effective track is not constant; here it is known "
-        f"to {share:.1%}, and changes by {found.effective_track_growth * fastest:+.1%} (+- "
-        f"{found.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
+        f"to {share:.1%}, and changes by {report.effective_track_growth * fastest:+.1%} (+- "
+        f"{report.effective_track_growth_std * fastest:.1%}) from slow turns to fast ones. It "
         "differs on other ground, so calibrate where you drive"
     ]
-    if not found.scale:
-        told.append(
+    if not report.scale:
+        sentences.append(
             "the size of the wheels was not measured, only the ratio of left to right: distances "
             "are only as accurate as drive.wheel_radius. Drive 2 m or more straight ahead and give "
             "--distance METRES"
         )
-    return told
+    return sentences

@@ -1,14 +1,16 @@
-"""The contribution of a source of measurements to the parameters, one per block.
+"""The parameters of the calibration, and the normal equations for them that a sensor contributes.
 
-The nine parameters, by their index:
+The parameters are an array of nine numbers. Their indices are:
 
-- LEFT, RIGHT: ratio of the left and right wheels' radius to the configured wheel radius, about 1.
-- TURN: ratio of the wheel separation to the effective track, about 1. It is an inverse because
-  turns are linear in it.
-- RATE: growth of the track with the turn rate.
-- LATE, AHEAD, ASIDE: only for positions: their delay in s and where on the robot they are measured,
-  m ahead and m to the left.
-- DRIFT, STRETCH: only for a gyro: the error of its bias, rad/s, and of its scale, a fraction.
+- LEFT, RIGHT: radius of the left and the right wheels, as ratios to the configured wheel radius.
+- INVERSE_TRACK: ratio of the wheel separation to the effective track. The parameter is this inverse
+  because the turns of the robot are linear in it.
+- TRACK_GROWTH: fraction by which the effective track grows with each rad/s of turn rate.
+- DELAY: delay of the positions behind the wheels, s.
+- SENSOR_X, SENSOR_Y: the place on the robot whose positions are measured, m ahead and m to the
+  left.
+- BIAS_ERROR: error of the gyro's bias, rad/s.
+- SCALE_ERROR: error of the gyro's scale, a fraction.
 """
 
 from __future__ import annotations
@@ -21,48 +23,60 @@ from acsard.calibration.log_table import Floats
 from acsard.calibration.runs import Complexes
 from acsard.core.config.settings import DriveConfig
 
-LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE, DRIFT, STRETCH = range(9)
+LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y, BIAS_ERROR, SCALE_ERROR = (
+    range(9)
+)
 COUNT = 9
 
 HUBER = 2.0
-"""Standard deviations above which a residual counts less (Huber's weight)."""
+"""Size of a residual, in usual sizes, above which its weight falls (Huber's weight)."""
 
 
 class Base(Struct, frozen=True):
-    """The geometry that the parameters are relative to, m, and the configured multipliers."""
+    """The configured geometry, which the parameters are relative to. Lengths are in m."""
 
     radius: float
     separation: float
     left: float
+    """Configured multiplier of the left wheels' radius."""
     right: float
+    """Configured multiplier of the right wheels' radius."""
     track: float
-    """Configured wheel separation multiplier."""
+    """Configured multiplier of the wheel separation."""
 
     @classmethod
     def of(cls, drive: DriveConfig) -> Base:
-        """Return the configured geometry."""
+        """Return the geometry of a configuration."""
         return cls(
             drive.wheel_radius, drive.wheel_separation, drive.left_wheel_radius_multiplier,
             drive.right_wheel_radius_multiplier, drive.wheel_separation_multiplier,
         )  # fmt: skip
 
     def start(self) -> Floats:
-        """Return the parameters that are configured now."""
-        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - RATE)])
+        """Return the parameters that agree with the configured multipliers."""
+        return np.array([self.left, self.right, 1 / self.track, *[0.0] * (COUNT - TRACK_GROWTH)])
 
     @property
     def gain(self) -> float:
-        """Ratio R / L of wheel radius to wheel separation: the gain if all parameters are 1."""
+        """Wheel radius divided by wheel separation.
+
+        If the first three parameters are 1, the robot turns by `gain` times the angle by which the
+        right wheels rolled further than the left wheels.
+        """
         return self.radius / self.separation
 
 
 class Evidence(Struct, frozen=True):
-    """Normal equations per block, for unit weight."""
+    """The weighted normal equations of one sensor, block by block.
+
+    With Jacobian J (derivatives of the predictions with respect to the parameters), residuals r and
+    weights W: `normal` is J^T W J, and `score` is J^T W r. `fit` gives each sensor its noise.
+    """
 
     normal: Floats
-    """Shape (blocks, COUNT, COUNT)."""
+    """Left-hand sides, shape (blocks, COUNT, COUNT)."""
     score: Floats
-    """Shape (blocks, COUNT)."""
+    """Right-hand sides, shape (blocks, COUNT)."""
     squares: Floats
     """Sum of squared residuals per block."""
     counts: Floats
@@ -72,11 +86,11 @@ class Evidence(Struct, frozen=True):
 def of_rows(
     jacobian: Floats, residual: Floats, weight: Floats, block: npt.NDArray[np.int64], blocks: int
 ) -> Evidence:
-    """Sum rows into the blocks that they belong to.
+    """Return the evidence of rows, summed by block.
 
     Args:
-        jacobian: shape (rows, COUNT).
-        residual: shape (rows,).
+        jacobian: derivatives of each row's prediction, shape (rows, COUNT).
+        residual: measured minus predicted value of each row.
         weight: weight of each row.
         block: block number of each row.
         blocks: number of blocks.
@@ -92,18 +106,21 @@ def of_rows(
 
 
 def condition(normal: Floats) -> float:
-    """Return the condition number of normal equations, whatever the parameters' units are."""
+    """Return the condition number of normal equations, scaled so that units do not matter.
+
+    It is infinite if a parameter does not occur in the equations.
+    """
     size = np.sqrt(np.diag(normal))
     if not np.all(size > 0.0):
         return np.inf
     return float(np.linalg.cond(normal / np.outer(size, size)))
 
 
-def huber(normalised: Floats | Complexes, least: float) -> Floats:
-    """Return Huber weights, between 0 and 1, for residuals.
+def huber(residuals: Floats | Complexes, least: float) -> Floats:
+    """Return Huber's weight of each residual: 1 for a usual one, and less for an outlier.
 
-    The usual size of a residual is `least`, or more if most residuals are larger.
+    The usual size is the standard deviation that the median suggests, and at least `least`.
     """
-    size = np.abs(normalised)
+    size = np.abs(residuals)
     scale = max(least, 1.4826 * float(np.median(size)) if len(size) else 0.0)
     return np.asarray(np.minimum(1.0, HUBER * scale / np.maximum(size, 1e-300)))

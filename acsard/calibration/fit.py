@@ -1,14 +1,14 @@
-"""Fits the parameters to all sources together, with their uncertainty, and makes settings of them.
+"""Fits the parameters to the evidence of all sensors, and converts them to multipliers.
 
-The fit is Gauss-Newton on sums over blocks. The standard deviations come from a jackknife over the
-blocks: each block is left out in turn, and the resulting change shows the effect of chance,
-whatever the correlation of errors within a block (Quenouille and Tukey; since the step is linear,
-this is the one-step form). If there are few blocks, the deviation is widened to that of Student's
-t.
+The fit is a Gauss-Newton fit on sums over blocks. The standard deviations come from a jackknife
+over the blocks (Quenouille and Tukey): each block is left out in turn, and the changes of the
+parameters show the effect of chance. This is right even if the errors within a block are
+correlated. The change is computed by one linear step. If there are few blocks, the standard
+deviation is widened to that of Student's t.
 
-The effective track of a skidding robot is not constant. Its standard deviation therefore also
-includes the larger of two terms: half of its change from slow to fast turns, and its variation from
-block to block. `Multipliers` has the settings of `[drive]` that follow from a fit.
+The effective track of a skidding robot is not constant. The standard deviation of its multiplier
+therefore also includes the larger of two terms: half of its change from slow to fast turns, and its
+variation from block to block.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.evidence import (
-    AHEAD,
-    ASIDE,
+    BIAS_ERROR,
     COUNT,
-    DRIFT,
-    LATE,
+    DELAY,
+    INVERSE_TRACK,
     LEFT,
-    RATE,
     RIGHT,
-    STRETCH,
-    TURN,
+    SCALE_ERROR,
+    SENSOR_X,
+    SENSOR_Y,
+    TRACK_GROWTH,
     Base,
     Evidence,
 )  # fmt: skip
@@ -37,38 +37,36 @@ from acsard.calibration.heading import Rows
 from acsard.calibration.log_table import Floats
 
 Source = Callable[[Floats], Evidence]
+"""Function from parameters to the evidence of one sensor."""
 
 MOST_STEPS = 30
 SMALL, SETTLED = 1e-5, 0.02
-"""Size of a step that ends the search, and size below which the last step counts as converged."""
+"""Size of a step that ends the fit, and size below which the last step counts as converged."""
 
-USUAL = {RATE: 0.06, LATE: 1.0, AHEAD: 0.5, ASIDE: 0.5}
-"""Prior standard deviations of parameters that a log may not determine.
-
-They are the growth of the track, as a fraction per rad/s, the delay in s, and two lengths in m.
-"""
+USUAL = {TRACK_GROWTH: 0.06, DELAY: 1.0, SENSOR_X: 0.5, SENSOR_Y: 0.5}
+"""Prior standard deviations of the parameters that a log may not determine, in their units."""
 
 GYRO_SCALE = 0.005
 """Prior standard deviation of a gyro's scale, a fraction, for a usual MEMS gyro.
 
-A log of a gyro alone cannot show this error.
+If the log has no positions, nothing in it shows this error.
 """
 
 HELD = 1e9
-"""Weight that holds the mean radius if no source measures it."""
+"""Weight that holds the mean radius at its start if no sensor measures it."""
 
 MANY = 16
-"""Number of blocks from which on neighbouring pairs are left out as well."""
+"""Number of blocks from which on the jackknife also leaves out pairs of neighbouring blocks."""
 
 LEAST_FREE = 3.0
-"""Smallest degrees of freedom for Student's t, which has no standard deviation at 2."""
+"""Smallest degrees of freedom for Student's t, whose standard deviation is infinite at 2."""
 
 LEAST_BLOCKS = 5
 """Smallest number of blocks. Fewer do not show how much blocks differ."""
 
 
 class Fit(Struct, frozen=True):
-    """The parameters found, and the normal equations of each block at that point."""
+    """The result of a fit: the parameters, and the normal equations of each block at this point."""
 
     parameters: Floats
     normal: Floats
@@ -78,6 +76,7 @@ class Fit(Struct, frozen=True):
     known: Floats
     """Prior information as normal equations, shape (COUNT, COUNT)."""
     active: tuple[int, ...]
+    """Indices of the parameters that were fitted."""
     varies: float
     """Fraction by which the effective track differs from block to block."""
     converged: bool
@@ -85,29 +84,30 @@ class Fit(Struct, frozen=True):
     """Prior standard deviation of each parameter that has one."""
 
     def without(self, blocks: npt.NDArray[np.bool_]) -> Floats:
-        """Return the parameters without the blocks of this mask, by one linear step."""
+        """Return the parameters of a fit without the blocks of this mask, by one linear step."""
         rest = self.normal[~blocks].sum(axis=0) + self.known
         found = self.parameters.copy()
         found[list(self.active)] -= _solved(rest, self.score[blocks].sum(axis=0), self.active)
         return found
 
-    def apart(self) -> Floats:
-        """Return the normal equations of left, right and turn with all other parameters eliminated.
+    def marginal(self) -> Floats:
+        """Return the normal equations of both radii and the track, other parameters eliminated.
 
-        If the mean radius is held, the result has two parameters: left against right, and turn.
+        If no sensor measures the mean radius, the result has two parameters: the difference of the
+        radii, and the inverse of the track.
         """
         total = self.normal.sum(axis=0) + self.known
-        rest = [index for index in self.active if index > TURN]
-        inner, cross = total[np.ix_(rest, rest)], total[np.ix_([LEFT, RIGHT, TURN], rest)]
+        rest = [index for index in self.active if index > INVERSE_TRACK]
+        inner, cross = total[np.ix_(rest, rest)], total[np.ix_([LEFT, RIGHT, INVERSE_TRACK], rest)]
         three = np.asarray(total[:3, :3] - cross @ np.linalg.solve(inner, cross.T))
-        free = np.eye(3) if LATE in self.active else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
+        free = np.eye(3) if DELAY in self.active else np.array([[-0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(free @ three @ free.T)
 
     def covariance(self) -> Floats:
-        """Return the covariance of the parameters from chance and from prior assumptions."""
+        """Return the covariance of the parameters by the jackknife and the prior assumptions."""
         alone = self._jackknife(1)
         size = np.sqrt(np.maximum(np.diag(alone), 1e-300))
-        # Leaving out neighbours together shows errors that last longer than a block.
+        # Leaving out neighbouring blocks together shows errors that last longer than a block.
         paired = np.sqrt(np.diag(self._jackknife(2))) if len(self.score) >= MANY else size
         wider = np.maximum(1.0, paired / size)
         chance = alone * np.outer(wider, wider)
@@ -124,8 +124,8 @@ class Fit(Struct, frozen=True):
         change = np.array(
             [self.without(group == number) - self.parameters for number in range(group[-1] + 1)]
         )
-        # If a few groups make up most of a variance, it has as few degrees of freedom as those
-        # groups.
+        # If a few groups cause most of a variance, the variance has only that many degrees of
+        # freedom.
         squares = np.maximum(change**2, 1e-150)
         free = np.maximum(LEAST_FREE, squares.sum(axis=0) ** 2 / (squares**2).sum(axis=0))
         student = np.sqrt(free / (free - 2))
@@ -135,24 +135,26 @@ class Fit(Struct, frozen=True):
 
 def fit(
     sources: Sequence[Source], start: Floats, *, places: bool, gyro: bool = False,
-    drift: float = 0.0,
+    bias_std: float = 0.0,
 ) -> Fit:  # fmt: skip
-    """Fit the parameters, starting from parameters that are nearly right.
+    """Return the fit of the parameters to the evidence of all sensors.
 
     Args:
-        sources: functions from parameters to their evidence.
-        start: the parameters to start from.
+        sources: the sensors.
+        start: the parameters to start from, which must be nearly right.
         places: whether positions are among the sources.
         gyro: whether a gyro is among the sources.
-        drift: standard deviation of the gyro bias, rad/s; 0 if the bias was eliminated from the
-            rows.
+        bias_std: standard deviation of the gyro bias, rad/s. 0 means that the fit does not depend
+            on the bias.
     """
-    active: tuple[int, ...] = (LEFT, RIGHT, TURN, RATE, LATE, AHEAD, ASIDE)[: None if places else 4]
+    active: tuple[int, ...] = (LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH, DELAY, SENSOR_X, SENSOR_Y)[
+        : None if places else 4
+    ]
     usual = dict(USUAL)
     if gyro:
-        active, usual[STRETCH] = (*active, STRETCH), GYRO_SCALE
-    if drift:
-        active, usual[DRIFT] = (*active, DRIFT), drift
+        active, usual[SCALE_ERROR] = (*active, SCALE_ERROR), GYRO_SCALE
+    if bias_std:
+        active, usual[BIAS_ERROR] = (*active, BIAS_ERROR), bias_std
     held = start[LEFT] + start[RIGHT]
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):
@@ -160,10 +162,10 @@ def fit(
         known, told = _known(parameters, held, places, usual)
         step = np.zeros(COUNT)
         step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + told, active)
-        # Far from the solution, go only part of the way: the path must stay near its linearization
-        # point. After a third of the steps, halve each step, so that outliers do not alternately
-        # count and not count.
-        size = float(np.max(np.abs(step[: RATE + 1])))
+        # Far from the solution, take only a part of the step: the linearization holds only near its
+        # point. After a third of the steps, halve each step. Otherwise an outlier could count in
+        # every other step only, and the fit would not converge.
+        size = float(np.max(np.abs(step[: TRACK_GROWTH + 1])))
         whole = 1.0 if at < MOST_STEPS // 3 else 0.5
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
@@ -176,9 +178,10 @@ def fit(
 
 
 def _sum(found: Sequence[Evidence]) -> tuple[Floats, Floats]:
-    """Sum the evidence of all sources. Each is weighted by the noise that its blocks' scores show.
+    """Return the sums of the normal equations and of the scores of all sensors.
 
-    Correlated residuals contain less information than the same number of independent ones.
+    The weight of a sensor follows from the scatter of its scores from block to block. Unlike the
+    residuals themselves, this scatter shows how much less information correlated residuals contain.
     """
     normal, score = np.zeros_like(found[0].normal), np.zeros_like(found[0].score)
     for one in found:
@@ -194,7 +197,7 @@ def _weight(one: Evidence) -> float:
         return 0.0
     inner = np.linalg.pinv(total[np.ix_(used, used)], rcond=1e-10, hermitian=True)
     rank = int(np.linalg.matrix_rank(inner, hermitian=True))
-    # Take the deviations from the mean: while the parameters are still off, the mean is not noise.
+    # Use the deviations from the mean, because the mean is not noise until the fit has converged.
     apart = one.score[:, used] - one.score[:, used].mean(axis=0)
     noise = float(np.einsum("bi,ij,bj->", apart, inner, apart))
     white = float(one.squares.sum() / max(1.0, one.counts.sum()))
@@ -204,7 +207,14 @@ def _weight(one: Evidence) -> float:
 def _known(
     parameters: Floats, held: float, places: bool, usual: Mapping[int, float]
 ) -> tuple[Floats, Floats]:
-    """Return the prior information as normal equations."""
+    """Return the prior information as normal equations.
+
+    Args:
+        parameters: the present parameters.
+        held: the sum of both radii to hold if `places` is false.
+        places: whether positions measure the radii.
+        usual: the prior standard deviation of each parameter that has one.
+    """
     normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
     for index, deviation in usual.items():
         normal[index, index] = deviation**-2
@@ -231,35 +241,43 @@ def _varies(found: Sequence[Evidence], parameters: Floats) -> float:
     spread = weight = 0.0
     for one in found:
         share = _weight(one)
-        size, pull = share * one.normal[:, TURN, TURN], share * one.score[:, TURN]
+        size, pull = (
+            share * one.normal[:, INVERSE_TRACK, INVERSE_TRACK],
+            share * one.score[:, INVERSE_TRACK],
+        )
         seen = size > 0.0
         own = pull[seen] ** 2 / size[seen]
         free = max(1.0, float(one.counts[seen].sum() - seen.sum()))
         noise = max(0.0, float(share * one.squares[seen].sum() - own.sum())) / free
         spread += float(own.sum()) - noise * int(seen.sum())
         weight += float(size.sum())
-    return float(np.sqrt(max(0.0, spread) / weight)) / abs(parameters[TURN]) if weight else 0.0
+    return (
+        float(np.sqrt(max(0.0, spread) / weight)) / abs(parameters[INVERSE_TRACK])
+        if weight
+        else 0.0
+    )
 
 
 SEPARATION, LEFT_RADIUS, RIGHT_RADIUS = range(3)
-"""Indices into `values` and `covariance`."""
+"""Indices into `values` and `covariance` of `Multipliers`."""
 
 TURNING = 0.05
 """Turn rate below which a row counts as straight, rad/s."""
 
 FASTEST = 0.95
-"""Fraction of all turning that is slower than the rate called the fastest."""
+"""Fraction of the turned angle that was turned more slowly than `Rates.fastest`."""
 
 
 class Rates(Struct, frozen=True):
-    """Turn rates of the robot, rad/s: the mean, weighted by angle, and the fastest."""
+    """The turn rates of a log, rad/s."""
 
     mean: float
+    """Mean, weighted by the turned angle."""
     fastest: float
 
 
 class Multipliers(Struct, frozen=True):
-    """Multipliers of wheel separation, left and right wheel radius, and their covariance."""
+    """The multipliers of wheel separation, left and right wheel radius, and their covariance."""
 
     values: Floats
     covariance: Floats
@@ -276,13 +294,15 @@ class Multipliers(Struct, frozen=True):
         return float(np.sqrt(max(0.0, apart @ shares @ apart)))
 
     def own(self) -> tuple[Floats, float]:
-        """Return each multiplier's own standard deviation, and the common one as a fraction.
+        """Return the standard deviations as the settings of `[odometry]` declare them.
 
-        A tape measures the common scale, and comparing turns measures the ratios of the three
-        multipliers. The odometry treats all four deviations as independent. Let d be the variance
-        of the difference of both radii. Each side's own variance is d / 2. Of the variance of the
-        mean radius, d / 4 therefore comes from the sides, and belongs neither to the scale nor to
-        the track.
+        The first three belong to the single multipliers. The fourth is that of a scale that all of
+        them share, as a fraction. The odometry treats the four errors as independent.
+
+        Let d be the relative variance of the difference of both radii. Each radius then has the own
+        variance d / 2, and their mean has d / 4 from it. This d / 4 is subtracted from the
+        variances of the mean radius (the scale) and of the track relative to the mean radius (the
+        track).
         """
         shares = self.covariance / np.outer(self.values, self.values)
         mean, track, apart = (
@@ -294,15 +314,12 @@ class Multipliers(Struct, frozen=True):
 
 
 def configured(base: Base) -> Multipliers:
-    """Return the configured multipliers.
-
-    Their covariance is zero because their uncertainty is unknown.
-    """
+    """Return the configured multipliers, with a covariance of zero because it is unknown."""
     return Multipliers(np.array([base.track, base.left, base.right]), np.zeros((3, 3)))
 
 
 def rates(rows: Rows, by_wheels: Floats) -> Rates:
-    """Return the turn rates of these rows. `by_wheels` is the turn of each row, rad."""
+    """Return the turn rates of these rows, whose turns by the wheels are `by_wheels`, rad."""
     turned = np.abs(by_wheels)
     rate = turned / rows.seconds
     turning = rate > TURNING
@@ -315,27 +332,28 @@ def rates(rows: Rows, by_wheels: Floats) -> Rates:
     return Rates(mean, float(fastest))
 
 
-def found(fit: Fit, rate: Rates) -> Multipliers:
-    """Return the constant multipliers that serve best at the turn rates of the log."""
-    return constant(fit.parameters, fit.covariance(), rate, fit.varies)
+def multipliers(parameters: Floats, covariance: Floats, rate: Rates, varies: float) -> Multipliers:
+    """Return the multipliers that serve best at the turn rates of the log.
 
+    The variance of the track includes the difference between the true track and this constant: that
+    at the slowest or fastest turn rate, or the variation from block to block if it is larger.
 
-def constant(parameters: Floats, every: Floats, rate: Rates, varies: float) -> Multipliers:
-    """Return the multipliers for given parameters and their covariance.
-
-    The variance of the track includes how far the true track differs from this constant: at the
-    slowest or fastest turn rate or, if that is more, from block to block. `varies` is the latter,
-    as a fraction.
+    Args:
+        parameters: the parameters of a fit.
+        covariance: the covariance of the parameters.
+        rate: the turn rates of the log.
+        varies: the variation of the track from block to block, as a fraction.
     """
-    turn, slope = parameters[TURN], parameters[RATE]
-    left = 1.0 - slope * rate.mean
-    values = np.array([1 / (turn * left), parameters[LEFT], parameters[RIGHT]])
+    inverse, growth = parameters[INVERSE_TRACK], parameters[TRACK_GROWTH]
+    slower = 1.0 - growth * rate.mean
+    values = np.array([1 / (inverse * slower), parameters[LEFT], parameters[RIGHT]])
     jacobian = np.zeros((3, len(parameters)))
     jacobian[LEFT_RADIUS, LEFT] = jacobian[RIGHT_RADIUS, RIGHT] = 1.0
-    jacobian[SEPARATION, TURN] = -values[SEPARATION] / turn
-    jacobian[SEPARATION, RATE] = values[SEPARATION] * rate.mean / left
-    covariance = jacobian @ every @ jacobian.T
-    slopes = float(np.hypot(slope, min(USUAL[RATE], np.sqrt(every[RATE, RATE]))))
-    share = max(slopes * max(rate.mean, rate.fastest - rate.mean), varies)
-    covariance[SEPARATION, SEPARATION] += (values[SEPARATION] * share) ** 2
-    return Multipliers(values, covariance)
+    jacobian[SEPARATION, INVERSE_TRACK] = -values[SEPARATION] / inverse
+    jacobian[SEPARATION, TRACK_GROWTH] = values[SEPARATION] * rate.mean / slower
+    made = jacobian @ covariance @ jacobian.T
+    growth_std = min(USUAL[TRACK_GROWTH], np.sqrt(covariance[TRACK_GROWTH, TRACK_GROWTH]))
+    largest_growth = float(np.hypot(growth, growth_std))
+    share = max(largest_growth * max(rate.mean, rate.fastest - rate.mean), varies)
+    made[SEPARATION, SEPARATION] += (values[SEPARATION] * share) ** 2
+    return Multipliers(values, made)

@@ -1,8 +1,13 @@
-"""Turns of the robot as a gyro, or the yaw of a position source, shows them, and their evidence.
+"""Evidence from a heading sensor: a gyro, or the yaw of a source of positions.
 
-The rows follow Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots
-based on the least-squares technique, 2005): turned = g_r dphi_r - g_l dphi_l, linear in g_r = R_r /
-L and g_l = R_l / L.
+The turns of the sensor are compared with the turns of the wheels. The equation is that of
+Antonelli, Chiaverini & Fusco (A calibration method for odometry of mobile robots based on the
+least-squares technique, 2005):
+
+    turn = g_r phi_r - g_l phi_l,    g_r = R_r / L,    g_l = R_l / L
+
+phi_r and phi_l are the angles by which the right and the left wheels rolled, R_r and R_l their
+radii, and L is the effective track. The equation is linear in g_r and g_l.
 """
 
 from __future__ import annotations
@@ -14,49 +19,48 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from acsard.calibration.evidence import (
+    BIAS_ERROR,
     COUNT,
-    DRIFT,
+    INVERSE_TRACK,
     LEFT,
-    RATE,
     RIGHT,
-    STRETCH,
-    TURN,
+    SCALE_ERROR,
+    TRACK_GROWTH,
     Base,
     Evidence,
     huber,
     of_rows,
 )  # fmt: skip
 from acsard.calibration.log_table import Floats, LogError
-from acsard.calibration.paths import Block, Wheels, cumulative, gaps, inside, rests
 from acsard.calibration.runs import Run
+from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative, gaps, inside, rests
 
 REST_S, EDGE_S = 0.6, 0.3
 """Shortest rest in which the gyro bias is measured, and the margin cut off at both of its ends, s.
 
-The robot still shakes within the margin.
+The robot may still shake within the margin.
 """
 
 TURNED_BY_HAND = 0.05
 """Deviation from the usual bias, rad/s, above which a resting robot is being turned by hand."""
 
-LEAST_SAMPLES, OUTLIER = 5, 6.0
-"""Smallest number of gyro samples in a rest.
+LEAST_SAMPLES = 5
+"""Smallest number of gyro samples in a rest."""
 
-`OUTLIER` is the multiple of the median deviation above which a sample is not noise.
-"""
+OUTLIER = 6.0
+"""Multiple of the median deviation above which a gyro sample at rest is left out."""
 
-WALK, UNSEEN_WALK = 5e-5, 2e-4
-"""Random walk of a gyro bias, rad/s per square root of a second.
+WALK = 5e-5
+"""Smallest random walk of the gyro bias that is assumed, rad/s per square root of a second."""
 
-`WALK` is the smallest that is assumed, for a usual MEMS gyro. `UNSEEN_WALK` is assumed if there is
-only a single rest, which shows no walk.
-"""
+UNSEEN_WALK = 2e-4
+"""Random walk that is assumed if a single rest shows none, rad/s per square root of a second."""
 
 ROW_S = 1.0
 """Approximate time over which turns are compared, s."""
 
 GRID_S, FURTHEST_S = 0.02, 2.0
-"""Step and range of the search for the time offset, s."""
+"""Step and range of the search for the sensor's delay, s."""
 
 DEGREES = 10.0
 """Multiple of the wheels' turn above which a yaw is in degrees instead of radians."""
@@ -68,46 +72,50 @@ class Heading(Struct, frozen=True):
     t: Floats
     angle: Floats
     gaps: Floats
+    """Gaps of the samples, one row (begin, end) each, in s."""
 
 
 class Headings(Struct, frozen=True):
-    """The headings of all runs, one each, and the values that they share."""
+    """The headings of all runs by one sensor, and the sensor's delay and bias."""
 
     source: str
     """Column of the log that the headings come from."""
     of: tuple[Heading, ...]
-    late: float
-    """Delay of the sensor's times behind the wheels' for the same event, s."""
+    """The heading of each run."""
+    delay: float
+    """Delay of the sensor's times behind those of the wheels for the same event, s."""
     bias: float
-    """Mean bias that was subtracted, rad/s."""
-    drifts: bool
-    """Whether the bias was not seen at rest, so that the fit has to find it."""
-    unsure: float = 0.0
+    """Usual bias at rest, rad/s. The bias that was subtracted is interpolated between the rests."""
+    bias_unknown: bool
+    """Whether the robot never rested. The bias is then unknown, and the fit has to find it."""
+    bias_std: float = 0.0
     """Standard deviation of the bias while the robot moves, rad/s.
 
-    It is 0 if the sensor has no bias or if `drifts` is true.
+    It is 0 if the sensor has no bias or if `bias_unknown` is true.
     """
 
 
 class Rows(Struct, frozen=True):
-    """Turns over about a second each, by the sensor and by the wheels."""
+    """The motion of the robot in intervals of about a second."""
 
     block: npt.NDArray[np.int64]
+    """Number of the block of each interval."""
     turned: Floats
-    """Turn by the sensor, rad."""
+    """Turn by the heading sensor, rad; 0 without one."""
     left: Floats
-    """Angle that the left wheels rolled, rad."""
+    """Angle by which the left wheels rolled, rad."""
     right: Floats
     fast: Floats
-    """Integral of |right - left| (right - left), rad2/s.
+    """Integral of |w| w, rad2/s, where w is the speed of the right minus the left wheels, rad/s.
 
-    It reveals a track that grows with the turn rate.
+    It shows a track that grows with the turn rate.
     """
     seconds: Floats
+    """Length of each interval, s."""
 
 
-def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
-    """Return headings from the yaw rate, or None if no run has it.
+def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | None:
+    """Return the headings by the column yaw_rate, or None if no run has it.
 
     Raises `LogError` if the yaw rate never changes.
     """
@@ -133,39 +141,39 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[Wheels]) -> Headings | None:
     return Headings("yaw_rate", tuple(found), late, usual, not len(every), unsure)
 
 
-def of_yaw(driven: Sequence[Run], angles: Sequence[Wheels], gain: float) -> Headings | None:
-    """Return headings from the yaw of positions, or None if no run has it.
+def of_yaw(driven: Sequence[Run], angles: Sequence[WheelAngles], gain: float) -> Headings | None:
+    """Return the headings by the column yaw, or None if no run has it.
 
-    Raises `LogError` if the yaw is in degrees, because it would be unwrapped in the wrong places.
-    `gain` is about R / L, as configured.
+    Raises `LogError` if the yaw is in degrees, because jumps of 360 would not be recognized as
+    whole turns. `gain` is the configured wheel radius divided by the wheel separation.
     """
     if not any(len(run.yaw) for run in driven):
         return None
     found = []
-    for run, turned in zip(driven, angles, strict=True):
-        if _in_degrees(run, turned, gain):
+    for run, wheels in zip(driven, angles, strict=True):
+        if _in_degrees(run, wheels, gain):
             raise LogError("yaw is in degrees, but must be in radians: multiply it by pi / 180")
         angle = np.asarray(np.unwrap(run.yaw)) if len(run.yaw) else run.yaw
         found.append(Heading(run.yaw_t, angle, gaps(run.yaw_t)))
-    return Headings("yaw", tuple(found), offset(found, angles), 0.0, drifts=False)
+    return Headings("yaw", tuple(found), offset(found, angles), 0.0, bias_unknown=False)
 
 
-def _in_degrees(run: Run, turned: Wheels, gain: float) -> bool:
+def _in_degrees(run: Run, wheels: WheelAngles, gain: float) -> bool:
     if len(run.yaw) < 2 or np.ptp(run.yaw) < 3 * np.pi:
         return False
     steps = np.diff(run.yaw)
     if np.any((np.abs(steps) > 300.0) & (np.abs(steps) < 400.0)):
         return True
-    left, right = turned.angles(run.yaw_t)
-    wheels = gain * np.diff(right - left)
+    left, right = wheels.angles(run.yaw_t)
+    by_wheels = gain * np.diff(right - left)
     small = np.abs(steps) < 100.0
-    return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(wheels[small])))
+    return float(np.sum(np.abs(steps[small]))) > DEGREES * float(np.sum(np.abs(by_wheels[small])))
 
 
 Rests = tuple[Floats, Floats, Floats]
-"""The rests of a run in which the gyro was recorded.
+"""The gyro bias in the rests of a run: times of their middles, biases and variances of the biases.
 
-The arrays are the middle of each rest, s, the bias, rad/s, and the variance of the bias by noise.
+They are in s, rad/s and rad2/s2.
 """
 
 
@@ -180,9 +188,11 @@ def _biases(run: Run) -> Rests:
 
 
 def _mean(samples: Floats) -> tuple[float, float]:
-    """Return the mean without outliers, and its variance; correlated noise is taken into account.
+    """Return the mean without outliers, and the variance of this mean.
 
-    The median is not used: that of a coarsely quantized gyro lies on one of its quantization steps.
+    The variance comes from the means of five parts, so it is right for correlated noise as well.
+    The median would be wrong for a coarse gyro, because it is always one of the gyro's discrete
+    values.
     """
     off = np.abs(samples - np.median(samples))
     steps = np.diff(np.unique(samples))
@@ -195,15 +205,15 @@ def _mean(samples: Floats) -> tuple[float, float]:
 
 
 def _unsure(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
-    """Return the standard deviation of the mean bias over all drives, rad/s.
+    """Return the standard deviation of the mean bias over all runs, rad/s.
 
-    It consists of noise in the rests and a random walk between them.
+    Its causes are the noise in the rests and the random walk of the bias between the rests.
     """
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
     gone, lasted = np.concatenate(walked).sum(axis=0)
-    # An estimate from few differences is increased.
+    # An estimate from few differences is uncertain, so increase it.
     few = 1 + 2 / max(1, count - len(rested))
     walk = max(WALK**2, few * gone / lasted) if lasted else UNSEEN_WALK**2
     # Between two rests the bias error is a Brownian bridge; outside of them it is a free random
@@ -221,26 +231,26 @@ def _sums(rate: Floats, steps: Floats) -> Floats:
     return cumulative((rate[1:] + rate[:-1]) / 2 * steps) if len(rate) else rate
 
 
-def offset(found: Sequence[Heading], angles: Sequence[Wheels]) -> float:
-    """Return the delay of the sensor, s, at which its turn rate resembles the wheels' most.
+def offset(found: Sequence[Heading], angles: Sequence[WheelAngles]) -> float:
+    """Return the delay of the sensor, s, for which its turns correlate best with the wheels'.
 
-    The turn rate of the wheels is the difference of both sides, or their sum in case one side is
-    reversed.
+    The turns of the wheels are the differences of both sides. If the sign of one side is wrong,
+    they are the sums, so both are tried.
     """
     reach = round(FURTHEST_S / GRID_S)
     scores, sizes = np.zeros((2, 2 * reach + 1)), np.zeros(2)
-    for heading, turned in zip(found, angles, strict=True):
-        grid = np.arange(turned.t[0], turned.t[-1], GRID_S)
+    for heading, wheels in zip(found, angles, strict=True):
+        grid = np.arange(wheels.t[0], wheels.t[-1], GRID_S)
         if len(heading.t) < 2 or len(grid) < 4:
             continue
-        left, right = turned.angles(grid)
+        left, right = wheels.angles(grid)
         sensor = np.diff(np.interp(grid, heading.t, heading.angle))
         sensor[~inside(grid[:-1], grid[1:], heading.gaps)] = 0.0
         sensor -= sensor.mean()
-        for at, wheels in enumerate((np.diff(right - left), np.diff(right + left))):
-            wheels = wheels - wheels.mean()
-            scores[at] += _correlation(sensor, wheels, reach)
-            sizes[at] += float(wheels @ wheels)
+        for at, series in enumerate((np.diff(right - left), np.diff(right + left))):
+            centred = series - series.mean()
+            scores[at] += _correlation(sensor, centred, reach)
+            sizes[at] += float(centred @ centred)
     alike = np.abs(scores) / np.sqrt(np.maximum(sizes, 1e-300))[:, None]
     score = alike[int(np.argmax(alike.max(axis=1)))]
     best = int(np.argmax(score))
@@ -252,7 +262,10 @@ def offset(found: Sequence[Heading], angles: Sequence[Wheels]) -> float:
 
 
 def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
-    """Return the correlation of two series of equal length for shifts from -reach to reach."""
+    """Return the correlation of two series of equal length for shifts from -reach to reach.
+
+    A positive shift means that `later` lags behind `earlier`.
+    """
     size = 1 << (len(later) + reach).bit_length()
     spectrum = np.fft.rfft(later, size) * np.conj(np.fft.rfft(earlier, size))
     whole = np.fft.irfft(spectrum, size)
@@ -262,27 +275,30 @@ def _correlation(later: Floats, earlier: Floats, reach: int) -> Floats:
 def rows(
     headings: Headings | None,
     driven: Sequence[Run],
-    angles: Sequence[Wheels],
+    angles: Sequence[WheelAngles],
     parts: Sequence[Block],
 ) -> Rows:
-    """Return the rows of all blocks. Without a heading sensor they contain the wheels alone."""
-    fast = [_fast(run, turned) for run, turned in zip(driven, angles, strict=True)]
+    """Return the rows of all blocks in which the heading sensor has samples.
+
+    If `headings` is None, return the rows of all blocks, with the wheels alone.
+    """
+    fast = [_fast(run, wheels) for run, wheels in zip(driven, angles, strict=True)]
     found: list[tuple[Floats, ...]] = []
     for number, part in enumerate(parts):
         count = max(1, round((part.end - part.begin) / ROW_S))
         edges = np.linspace(part.begin, part.end, count + 1)
         angle, whole = np.zeros(count + 1), np.ones(count, dtype=bool)
         if headings is not None:
-            heading, seen = headings.of[part.run], edges + headings.late
+            heading, seen = headings.of[part.run], edges + headings.delay
             if not len(heading.t):
                 continue
             angle = np.interp(seen, heading.t, heading.angle)
             whole = inside(seen[:-1], seen[1:], heading.gaps)
             whole &= (seen[:-1] >= heading.t[0]) & (seen[1:] <= heading.t[-1])
         left, right = angles[part.run].angles(edges)
-        slow = np.interp(edges, driven[part.run].t, fast[part.run])
-        series = (angle, left, right, slow, edges)
-        found.append((np.full(count, number)[whole], *(np.diff(one)[whole] for one in series)))
+        squares = np.interp(edges, driven[part.run].t, fast[part.run])
+        series = (angle, left, right, squares, edges)
+        found.append((np.full(count, number)[whole], *(np.diff(sums)[whole] for sums in series)))
     if not found:
         return Rows(np.zeros(0, dtype=np.int64), *[np.zeros(0)] * 5)
     block, *columns = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -290,7 +306,10 @@ def rows(
 
 
 def level(rows: Rows) -> Rows:
-    """Remove from every column the part that a common bias would explain, for the fit."""
+    """Return the rows without the part of each column that is proportional to time.
+
+    The fit of these rows is independent of an unknown constant bias of the gyro.
+    """
     share = rows.seconds / float(rows.seconds @ rows.seconds)
     turned, left, right, fast = (
         column - rows.seconds * float(share @ column)
@@ -299,53 +318,57 @@ def level(rows: Rows) -> Rows:
     return Rows(rows.block, turned, left, right, fast, rows.seconds)
 
 
-def _fast(run: Run, turned: Wheels) -> Floats:
-    apart = turned.apart(run.t)
+def _fast(run: Run, wheels: WheelAngles) -> Floats:
+    apart = wheels.speed_difference(run.t)
     steps = np.minimum(np.diff(run.t), ROW_S)
     return _sums(np.abs(apart) * apart, steps)
 
 
-NOISE = 0.01
-"""Residuals that are usual when outliers are sought.
+NOISE, SHARE = 0.01, 0.03
+"""Usual residual of a row: `NOISE` rad per second and the fraction `SHARE` of the turn.
 
-They are `NOISE` rad per second and the fraction `SHARE` of the turn, added as squares.
+Both are added as squares. A row with a much larger residual is an outlier.
 """
-SHARE = 0.03
 
 
 def turned(rows: Rows, base: Base, parameters: Floats) -> Floats:
     """Return the turn of each row by the wheels for these parameters, rad."""
-    left, right, turn, slope = parameters[[LEFT, RIGHT, TURN, RATE]]
-    straight = base.gain * turn * (right * rows.right - left * rows.left)
-    return np.asarray(straight + slope * _slower(rows, base, parameters))
+    left, right, inverse, growth = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
+    constant = base.gain * inverse * (right * rows.right - left * rows.left)
+    return np.asarray(constant + growth * _by_growth(rows, base, parameters))
 
 
-def _slower(rows: Rows, base: Base, parameters: Floats) -> Floats:
-    """Return the reduction of each row's turn per unit of `RATE`, rad."""
-    left, right, turn = parameters[[LEFT, RIGHT, TURN]]
-    rate = base.gain * turn * (left + right) / 2
-    return np.asarray(-rate * abs(rate) * rows.fast)
+def _by_growth(rows: Rows, base: Base, parameters: Floats) -> Floats:
+    """Return the derivative of each row's turn with respect to TRACK_GROWTH, rad2/s."""
+    left, right, inverse = parameters[[LEFT, RIGHT, INVERSE_TRACK]]
+    gain = base.gain * inverse * (left + right) / 2
+    return np.asarray(-gain * abs(gain) * rows.fast)
 
 
 def evidence(rows: Rows, base: Base, parameters: Floats, blocks: int) -> Evidence:
-    """Return the evidence at these parameters."""
-    turn = parameters[TURN]
+    """Return the evidence of the rows at these parameters, for `blocks` blocks."""
+    turn = parameters[INVERSE_TRACK]
     by_wheels = turned(rows, base, parameters)
     jacobian = np.zeros((len(rows.turned), COUNT))
     jacobian[:, LEFT] = -base.gain * turn * rows.left
     jacobian[:, RIGHT] = base.gain * turn * rows.right
-    jacobian[:, RATE] = _slower(rows, base, parameters)
-    jacobian[:, TURN] = (by_wheels + jacobian[:, RATE] * parameters[RATE]) / turn
-    jacobian[:, DRIFT] = rows.seconds
-    jacobian[:, STRETCH] = by_wheels
-    gyro = by_wheels * (1 + parameters[STRETCH]) + parameters[DRIFT] * rows.seconds
+    jacobian[:, TRACK_GROWTH] = _by_growth(rows, base, parameters)
+    jacobian[:, INVERSE_TRACK] = (
+        by_wheels + jacobian[:, TRACK_GROWTH] * parameters[TRACK_GROWTH]
+    ) / turn
+    jacobian[:, BIAS_ERROR] = rows.seconds
+    jacobian[:, SCALE_ERROR] = by_wheels
+    gyro = by_wheels * (1 + parameters[SCALE_ERROR]) + parameters[BIAS_ERROR] * rows.seconds
     residual = rows.turned - gyro
     usual = np.hypot(NOISE * rows.seconds, SHARE * by_wheels)
     return of_rows(jacobian, residual, huber(residual / usual, 1.0), rows.block, blocks)
 
 
 def bias(rows: Rows, by_wheels: Floats) -> float:
-    """Return the rate by which the sensor exceeds the wheels, rad/s, by robust least squares."""
+    """Return the sensor's turn rate minus that of the wheels, rad/s, by robust least squares.
+
+    `by_wheels` is the turn of each row by the wheels, rad.
+    """
     seconds, found = rows.seconds, 0.0
     for _ in range(10):
         off = rows.turned - by_wheels
@@ -356,9 +379,9 @@ def bias(rows: Rows, by_wheels: Floats) -> float:
 
 
 def first(rows: Rows, base: Base) -> Floats:
-    """Return g_l and g_r, of any sign, by least squares.
+    """Return g_l and g_r divided by `base.gain`, by robust least squares, without a start value.
 
-    They are relative to the gain of parameters that are all 1.
+    A negative one means that the sign of this side's wheels, or of the sensor, is wrong.
     """
     columns = base.gain * np.column_stack((-rows.left, rows.right))
     weight = np.ones(len(rows.turned))
@@ -373,5 +396,5 @@ def first(rows: Rows, base: Base) -> Floats:
 
 
 def by_sides(rows: Rows, base: Base, sides: Floats) -> Floats:
-    """Return the turn of each row by the wheels for the result of `first`, rad."""
+    """Return the turn of each row by the wheels, rad, for `sides` as `first` returns them."""
     return np.asarray(base.gain * (sides[1] * rows.right - sides[0] * rows.left))

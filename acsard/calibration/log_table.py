@@ -1,11 +1,11 @@
 """Reads the bytes of a CSV file into columns of numbers and the runs that they belong to.
 
-The header names the columns in any order, with their units, such as "t [ms]" and "yaw_rate
-(deg/s)". A cell may be empty, so that sensors of different rates share a file. A row that cannot be
-read is left out, counted and reported. A file with more than a few such rows is refused, since the
-rest would not be what was recorded. Impossible values are removed, counted and reported.
+The header names the columns in any order, and may give units, such as "t [ms]" and "yaw_rate
+(deg/s)". A cell may be empty, so that sensors of different rates share a file. Rows that cannot be
+read and impossible values are left out, counted and reported. A file with more than a few such rows
+is refused.
 
-`row` makes a line of such a log from a bus message.
+`row` makes a line of such a file from a bus message.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TURNS = {"rpm": math.tau / 60, "rps": math.tau, "dps": math.radians(1.0)}
 RATE = {f"{unit}/s": size for unit, size in ANGLE.items()} | TURNS
 
 UNITS = {"t": TIME, "x": LENGTH, "y": LENGTH, "yaw": ANGLE}
-"""Known units by column, as factors to s, m and rad. All other columns are rates in rad/s."""
+"""Known units by column, as factors to s, m and rad. All other columns take the units `RATE`."""
 
 SI = {"t": "s", "x": "m", "y": "m", "yaw": "rad"}
 
@@ -41,10 +41,10 @@ _NAME = re.compile(r"(?P<name>[^\[(]*)[\[(]?(?P<unit>[^\])]*)")
 
 
 def parted(cell: str) -> tuple[str, str]:
-    """Return the name and the unit of a column from a header cell.
+    """Return the name and the unit of a column from its header cell, such as "t [ms]".
 
-    The name is in lower case with "_" between words. The unit stands in brackets and ends at a
-    comma; without brackets it is "".
+    The name is in lower case with "_" between words. The unit is the text in brackets, up to a
+    comma, or "" without brackets.
     """
     found = _NAME.match(cell.strip().lower())
     assert found is not None
@@ -64,23 +64,25 @@ WHEELS = ("fr", "fl", "rl", "rr", "left", "right")
 
 BOUNDS = dict.fromkeys(WHEELS, 1e3) | {"t": 1e20, "yaw_rate": 1e4, "yaw": 1e7}
 PLACE_BOUND = 1e9
-"""Bounds above which a value is impossible (rad/s, s, rad, m).
+"""Sizes above which a value is impossible, in rad/s, s, rad or m.
 
-They are wide enough for degrees and nanoseconds, so that later checks can name the wrong unit.
+Values in degrees and nanoseconds stay below them, so that later checks can name the wrong unit.
 """
 
 RATES = frozenset((*WHEELS, "yaw_rate"))
-SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
-"""Definition of a spike, which is a misread number.
+"""Columns in which spikes are removed."""
 
-It is more than `SPIKE` times as large as each neighbour and as the usual speed. Of the rates over
-`SLOW` rad/s, all but the fraction `FEW_VALUES` stay below the usual speed. A robot that stands for
-nearly the whole log also turns much faster than that, but never for a single sample.
+SPIKE, FEW_VALUES, SLOW = 10.0, 0.02, 0.02
+"""Definition of a spike, which is a number that was recorded wrongly.
+
+A spike is more than `SPIKE` times as large as both neighbours and as the usual rate. Of the rates
+above `SLOW` rad/s, only the fraction `FEW_VALUES` exceeds the usual rate. A robot that rarely moves
+can exceed the usual rate as much, but not in a single sample.
 """
 
 
 def bounded(columns: dict[str, Floats]) -> Iterator[str]:
-    """Replace impossible values with NaN in place. Yield a sentence for each column with any."""
+    """Replace impossible values by NaN in place, and yield a sentence for each changed column."""
     order = np.argsort(columns["t"], kind="stable")
     for name, values in columns.items():
         with np.errstate(invalid="ignore"):
@@ -98,8 +100,9 @@ def bounded(columns: dict[str, Floats]) -> Iterator[str]:
 def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
     """Return a mask of the rows that are spikes; `order` sorts the rows by time.
 
-    A spike stands out among its neighbours both in the file and in time. In a shuffled file, or one
-    of several drives, a true turn stands out in only one of them.
+    A spike stands out from its neighbours both in the order of the file and in the order of time.
+    If rows are shuffled or come from several drives, a true turn may stand out in one of these
+    orders.
     """
     sizes = np.abs(values)
     moving = sizes[sizes > SLOW]
@@ -112,9 +115,9 @@ def _spikes(values: Floats, order: npt.NDArray[np.int64]) -> npt.NDArray[np.bool
 
 
 def _alone(sizes: Floats, usual: float) -> npt.NDArray[np.bool_]:
-    """Return a mask of the values far above `usual` and above both neighbours.
+    """Return a mask of the values that are far above `usual` and above both neighbours.
 
-    Missing values are skipped in the search for a neighbour.
+    The neighbour of a value is the next one that is not NaN.
     """
     held = np.flatnonzero(np.isfinite(sizes))
     seen = np.concatenate([[0.0], sizes[held], [0.0]])
@@ -129,39 +132,42 @@ FOUR, TWO = ("fr", "fl", "rl", "rr"), ("left", "right")
 
 NUMBERS = ("t", *FOUR, *TWO, "yaw_rate", "x", "y", "yaw")
 COLUMNS = (*NUMBERS, "run")
+"""Columns that a log can have: numbers, and the name of the run."""
 
 MISSING = frozenset(("", "nan", "-nan(ind)", "null", "none", "na", "n/a", "#n/a", "-", "--"))
+"""Contents of a cell without a value, in lower case."""
 
 COMMENTS = ("#", "%")
-"""Beginnings of lines above the numbers that do not belong to the table."""
+"""First characters of the comment lines above the table."""
 
 BEHIND = re.compile(r"(?:^|\s)#")
-"""Pattern of a comment after a number; "1.#QNAN" does not contain one."""
+"""Pattern for the begin of a comment after a number. It does not match "1.#QNAN"."""
 
 FEW, SHARE = 3, 0.01
-"""Number of rows that may be unreadable, and fraction of all rows; the larger one counts."""
+"""Largest number of unreadable rows, and largest fraction of all rows; the larger limit counts."""
 
 EXAMPLE = '"t,left,right,yaw_rate" or "t,fr,fl,rl,rr,x,y"'
-
 
 AS_CSV = f"export it as CSV, whose first line names the columns, like {EXAMPLE}"
 
 
 class LogError(AcsardError):
-    """Refusal of a file that cannot be used. The text names the place, the fault and the remedy."""
+    """A log that cannot be used. The text names the place and the fault, and says what to do."""
 
 
 def noted(error: Exception, notes: Iterable[str]) -> None:
-    """Add the notes made so far to an error, because they may explain it."""
+    """Add the notes about a log to an error, because they may explain it."""
     for note in notes:
         error.add_note(note)
 
 
 class Table(Struct, frozen=True):
-    """Columns by name, with NaN for an empty cell; `runs` has the number of each row's run."""
+    """The contents of a log file."""
 
     columns: dict[str, Floats]
+    """Columns by name, in SI units, with NaN for an empty cell."""
     runs: npt.NDArray[np.int64]
+    """Number of the run of each row."""
     names: tuple[str, ...]
     """Names of the runs, by number."""
     notes: tuple[str, ...]
@@ -169,7 +175,7 @@ class Table(Struct, frozen=True):
 
 
 def read(data: bytes) -> Table:
-    """Return the table in a file. Raises `LogError`."""
+    """Return the table in the bytes of a CSV file. Raises `LogError`."""
     lines = _text(data).splitlines()
     number, header, separator = _header(lines)
     names = _columns([name for name, _ in header], number)
@@ -191,10 +197,10 @@ def _text(data: bytes) -> str:
 
 
 def _header(lines: Sequence[str]) -> tuple[int, list[tuple[str, str]], str]:
-    """Return the number of lines before the data, the names with their units, and the separator.
+    """Return the number of lines above the data, the names with their units, and the separator.
 
-    Some programs, such as numpy, write the header as a comment. The last comment before the numbers
-    is then the header.
+    If the first line of the table has numbers, the last comment line above it is the header,
+    because numpy and some other programs write the header as a comment.
     """
     comment = ""
     for at, line in enumerate(lines):
@@ -243,7 +249,10 @@ def _is_number(cell: str) -> bool:
 
 
 def _columns(header: list[str], number: int) -> list[str]:
-    """Return the use of each column, "" for one that is not used. Raises `LogError`."""
+    """Return the names of the columns, with "" for a column that is not used.
+
+    `number` is the line number of the header. Raises `LogError` if a necessary column is missing.
+    """
     where = f"line {number} (the header)"
     twice = {name for name in header if name in COLUMNS and header.count(name) > 1}
     if twice:
@@ -270,11 +279,11 @@ def _columns(header: list[str], number: int) -> list[str]:
 
 
 def _near(names: Sequence[str], header: Sequence[str]) -> str:
-    """Return a hint to the column that may have been meant, or ""."""
+    """Return a hint to the column of the header that may be one of `names`, or ""."""
     others = [name for name in header if name and name not in COLUMNS]
     if "t" in names and (times := [name for name in others if "time" in name or "stamp" in name]):
         return f" (is {times[0][:40]} it? rename it t, in s)"
-    near = [one for name in names for one in nearest(name, others)]
+    near = [other for name in names for other in nearest(name, others)]
     return f" (is {near[0]} it? rename it)" if near else ""
 
 
@@ -297,7 +306,7 @@ def _unknown_units(header: list[tuple[str, str]], names: list[str]) -> list[str]
 
 
 class _Reader:
-    """Parser of the lines below the header. It must be fast for a million lines."""
+    """Parses the lines below the header. It must be fast for logs with a million lines."""
 
     def __init__(self, names: list[str], separator: str, factors: list[float]) -> None:
         self._names, self._separator, self._factors = names, separator, factors
@@ -366,7 +375,7 @@ class _Reader:
                 row.append(float(cell))
             except ValueError:
                 if parted(cell)[0] == self._names[i]:
-                    return []  # the header is repeated because logs were concatenated
+                    return []  # a header in the middle of the file: logs were concatenated
                 shown = printable(cell if len(cell) <= 30 else cell[:27] + "...")
                 date = self._names[i] == "t" and ":" in cell
                 why = "a date, but t must be in s" if date else "not a number"
@@ -401,13 +410,13 @@ class _Reader:
 HEADER = f"t,{','.join(FOUR)},yaw_rate,x,y,yaw"
 
 KEYS = ("wheel_states", "imu", "sim/pose")
-"""Keys that a log can contain. Wheel speeds are in the order in which they are published."""
+"""Keys whose messages a log can contain."""
 
 
 def row(message: Message, arrived_ns: int) -> str:
-    """Return the row of one message of `KEYS`. Raises `ValueError` for any other message.
+    """Return the row of a message from one of `KEYS`. Raises `ValueError` for any other message.
 
-    `arrived_ns` is the wall-clock time that a message without a stamp gets.
+    `arrived_ns` is the wall-clock time of arrival, ns since 1970. It replaces a missing stamp.
     """
     if isinstance(message, JointState) and len(message.velocity) == len(FOUR):
         cells = [*(f"{speed:.6g}" for speed in message.velocity), "", "", "", ""]

@@ -1,8 +1,8 @@
-"""A log cut into blocks, with the quantities to compare and the parameters to start from.
+"""Prepares a log for the fit: cuts it into blocks, checks it and finds parameters to start from.
 
-This module decides whether a log can be used at all: its signs and units, whether a sensor follows
-the wheels, and whether there is enough of it. If a log does not contain enough movement, the advice
-says what to drive.
+The checks decide whether the log can be used. They look at signs and units, at the agreement
+between sensors and wheels, and at the amount of movement. If a log does not contain enough
+movement, the message says what to drive.
 """
 
 from __future__ import annotations
@@ -12,39 +12,45 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration import heading, places
-from acsard.calibration.doubts import (
-    RefusedError,
-    heading_follows,
-    places_follow,
-    turn_rates,
-    turn_units,
-    turns_the_right_way,
-    way_units,
-)  # fmt: skip
-from acsard.calibration.evidence import LEFT, RIGHT, TURN, Base, condition
+from acsard.calibration import heading, positions
+from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base, condition
 from acsard.calibration.fit import LEAST_BLOCKS, Multipliers, Source
 from acsard.calibration.heading import Headings, Rows
 from acsard.calibration.log_table import Floats
-from acsard.calibration.paths import Block, Wheels, blocks
-from acsard.calibration.places import Grid, Spots
+from acsard.calibration.plausibility import (
+    RefusedError,
+    distance_units,
+    heading_follows,
+    positions_follow,
+    turn_rates,
+    turn_units,
+    turns_the_right_way,
+)  # fmt: skip
+from acsard.calibration.positions import Segment, WheelSteps
 from acsard.calibration.runs import Run
 from acsard.calibration.search import search
+from acsard.calibration.wheel_angles import Block, WheelAngles, blocks
 
 LEAST_TURN = 2 * np.pi
 """Smallest total turn of the robot, rad."""
 
 LEAST_ROLL = 3.0
-"""Smallest total roll of the wheels, rad, both in the same direction and against each other."""
+"""Smallest angle by which the wheels must roll in all, rad.
+
+Both the mean of the sides and half of their difference must reach it.
+"""
 
 ALIKE = 0.98
-"""Squared correlation of both rolls above which they count as a single movement."""
+"""Squared correlation of the mean and the difference of both sides at which a log is refused.
+
+Such a robot drives the same curve all the time.
+"""
 
 WORST = 0.2, 0.03
-"""Largest useful standard deviations, as fractions: of the track by chance, of the radii ratio."""
+"""Largest useful standard deviations, as fractions: of the track, and of the ratio of the radii."""
 
 WORST_CONDITION = 1e4
-"""Largest condition number of the scaled normal equations at which parameters can be told apart."""
+"""Largest condition number of the normal equations at which radii and track can be separated."""
 
 DRIVE = (
     "drive 60 s: stand 3 s, 2 m straight ahead and back, three full turns to the left and three to "
@@ -53,7 +59,7 @@ DRIVE = (
 
 
 def drives_enough(parts: Sequence[Block]) -> None:
-    """Raise `RefusedError` if the wheels hardly move at all."""
+    """Raise `RefusedError` if the log has too few blocks in which the wheels turn."""
     if len(parts) < LEAST_BLOCKS:
         seconds = sum(part.end - part.begin for part in parts)
         raise RefusedError(f"the wheels turn for only {seconds:.0f} s, which is too short: {DRIVE}")
@@ -62,7 +68,8 @@ def drives_enough(parts: Sequence[Block]) -> None:
 def rolls_enough(rows: Rows) -> None:
     """Raise `RefusedError` if the wheels lack a movement that the fit needs.
 
-    They must roll together and against each other, and not always in the same proportion.
+    Both sides must roll in the same direction and in opposite directions, and the proportion of the
+    two movements must vary.
     """
     together, against = (rows.right + rows.left) / 2, (rows.right - rows.left) / 2
     for rolled, what in ((together, "ahead or back"), (against, "against each other")):
@@ -79,7 +86,7 @@ def rolls_enough(rows: Rows) -> None:
 
 
 def turns_enough(turned: Floats) -> None:
-    """Raise `RefusedError` if the robot hardly turns. `turned` is in rad per row."""
+    """Raise `RefusedError` if the robot hardly turns. `turned` is the turn of each row, rad."""
     if (angle := float(np.abs(turned).sum())) < LEAST_TURN:
         raise RefusedError(
             f"the robot turned by {np.degrees(angle):.0f} deg in all, which is too little for the "
@@ -88,26 +95,32 @@ def turns_enough(turned: Floats) -> None:
 
 
 def sure_enough(
-    found: Multipliers, chance: float, worst: tuple[float, float] = WORST, log: str = "this log",
-    mend: str = DRIVE,
+    found: Multipliers, track_std: float, worst: tuple[float, float] = WORST,
+    log: str = "this log", advice: str = DRIVE,
 ) -> None:  # fmt: skip
     """Raise `RefusedError` if the result is too uncertain to be useful.
 
-    `chance` is the standard deviation of the track as a fraction, without the track's own
-    variation. `mend` is what to do then.
+    Args:
+        found: the multipliers.
+        track_std: the standard deviation of the track as a fraction. It leaves out that the track
+            itself varies with the turn rate and from block to block.
+        worst: the largest useful standard deviations of the track and of the ratio of the radii.
+        log: the name of the data in the message.
+        advice: what to do, in the words of the message.
     """
-    told = {"the effective track": chance, "the ratio of left to right": found.ratio_std}
-    for (name, deviation), most in zip(told.items(), worst, strict=True):
+    deviations = {"the effective track": track_std, "the ratio of left to right": found.ratio_std}
+    for (name, deviation), most in zip(deviations.items(), worst, strict=True):
         if not deviation <= most:
             raise RefusedError(
-                f"{log} determines {name} only to {deviation:.1%}, which is too inaccurate: {mend}"
+                f"{log} determines {name} only to {deviation:.1%}, which is too inaccurate: "
+                f"{advice}"
             )
 
 
-def told_apart(normal: Floats) -> None:
+def separates_track(normal: Floats) -> None:
     """Raise `RefusedError` if the log cannot separate the radii from the track.
 
-    `normal` is the result of `Fit.apart`.
+    `normal` has the normal equations of both, as `Fit.marginal` returns them.
     """
     if condition(normal) > WORST_CONDITION:
         raise RefusedError(
@@ -117,31 +130,41 @@ def told_apart(normal: Floats) -> None:
 
 
 class Prepared(Struct, frozen=True):
-    """Blocks of one length and the quantities that are compared in them."""
+    """A log that was cut into blocks of one length, and the evidence that it gives."""
 
     parts: list[Block]
     rows: Rows
-    """Unchanged rows; if the gyro bias was not seen at rest, they still contain it."""
-    spots: list[Spots]
-    grids: list[Grid]
+    """The turns. If the robot never rested, those of the gyro still contain the gyro's bias."""
+    segments: list[Segment]
+    """The positions; empty if the log has none."""
+    steps: list[WheelSteps]
+    """The wheel steps of each run; empty if the log has no positions."""
     sources: list[Source]
     start: Floats
+    """The parameters from which the fit starts."""
 
 
 def prepared(
-    driven: Sequence[Run], angles: Sequence[Wheels], headings: Headings | None, base: Base,
+    driven: Sequence[Run], angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
     length: float,
 ) -> Prepared:  # fmt: skip
-    """Cut the log into blocks of about `length` s and check it.
+    """Cut the log into blocks of about `length` s, check it, and return it.
 
-    Raises `RefusedError` for wrong signs or units, and if there is nothing to compare the wheels
-    with.
+    Args:
+        driven: the runs of the log.
+        angles: the wheel angles of each run.
+        headings: the headings by a sensor, or None.
+        base: the configured geometry.
+        length: the length of the blocks, s.
+
+    Raises:
+        RefusedError: the log cannot be used; the text says why and what to do.
     """
     parts = blocks(driven, angles, length)
     drives_enough(parts)
     count, start = len(parts), base.start()
     every = rows = heading.rows(headings, driven, angles, parts)
-    if headings is not None and headings.drifts and len(every.turned):
+    if headings is not None and headings.bias_unknown and len(every.turned):
         rows = heading.level(every)
     if headings is not None and not len(rows.turned):
         raise RefusedError(
@@ -149,42 +172,48 @@ def prepared(
             "time, with times of one clock"
         )
     rolls_enough(rows)
-    spots = places.spots(driven, angles, parts)
-    grids = [places.grid(*pair) for pair in zip(driven, angles, strict=True)] if spots else []
+    segments = positions.segments(driven, angles, parts)
+    steps = (
+        [positions.wheel_steps(*pair) for pair in zip(driven, angles, strict=True)]
+        if segments
+        else []
+    )
     sources: list[Source] = []
-    sides = begun = None
+    sides = by_positions = None
     if headings is not None and len(rows.turned):
         turns_enough(rows.turned)
         sides = heading.first(rows, base)
         heading_follows(headings.source, rows.turned, heading.by_sides(rows, base, sides))
         sources.append(lambda p: heading.evidence(rows, base, p, count))
-    if spots:
-        begun = search(spots, driven, angles, base, sides)
-        places_follow(begun)
+    if segments:
+        by_positions = search(segments, driven, angles, base, sides)
+        positions_follow(by_positions)
         sources.append(
-            lambda p: places.evidence(spots, [places.path(g, base, p) for g in grids], p, count)
+            lambda p: positions.evidence(
+                segments, [positions.path(g, base, p) for g in steps], p, count
+            )
         )
-        start = begun.parameters.copy()
+        start = by_positions.parameters.copy()
     if not sources:
         raise RefusedError(
             "there are no positions or turn rates while the robot drives: record both at the same "
             "time, with times of one clock"
         )
-    turns_the_right_way(headings.source if headings else "", sides, begun)
+    turns_the_right_way(headings.source if headings else "", sides, by_positions)
     if sides is not None:
         mean, size = float(sides.mean()), float(start[[LEFT, RIGHT]].mean())
         start[[LEFT, RIGHT]] = size * sides / mean
-        start[TURN] = mean / size
+        start[INVERSE_TRACK] = mean / size
     if headings is not None:
         turn_rates(headings.source, rows.turned, rows.seconds)
-    _units(headings, start, base, begun is not None)
-    return Prepared(parts, every, spots, grids, sources, start)
+    _check_units(headings, start, base, by_positions is not None)
+    return Prepared(parts, every, segments, steps, sources, start)
 
 
-def _units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
-    size, was = float(start[[LEFT, RIGHT]].mean()), base.start()
+def _check_units(headings: Headings | None, start: Floats, base: Base, sized: bool) -> None:
+    size, configured = float(start[[LEFT, RIGHT]].mean()), base.start()
     if sized:
-        way_units(size, base)
-    bare = size * float(start[TURN])
-    turn = bare / float(was[[LEFT, RIGHT]].mean() * was[TURN])
+        distance_units(size, base)
+    bare = size * float(start[INVERSE_TRACK])
+    turn = bare / float(configured[[LEFT, RIGHT]].mean() * configured[INVERSE_TRACK])
     turn_units(headings.source if headings else "the positions' yaw", turn, bare, base)

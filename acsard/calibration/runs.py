@@ -1,7 +1,7 @@
-"""Splits the table of a log into runs, each with its sensors as streams in order of time.
+"""Splits the table of a log into runs. A run has the samples of one drive, sensor by sensor.
 
-Times may have any origin; within a run they begin at 0. Rows that are out of order are sorted. If
-the time itself restarts, a new run begins.
+The times of a log may have any origin. Within a run they begin at 0. Rows that are out of order are
+sorted. If the times start again, or the wheels have no sample for a minute, a new run begins.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ Complexes = npt.NDArray[np.complex128]
 Rows = npt.NDArray[np.int64]
 
 RESTART_S = 1.0
-"""Step back in time, s, above which rows are out of order or the time has restarted."""
+"""Step back in time, s, above which the time may have started again."""
 
 FEW_RESTARTS = 100
-"""Largest number of restarts. With more, the rows are in no order at all."""
+"""Largest number of restarts. With more of them, the rows are in no order at all."""
 
 SLOWEST_S = 0.7
-"""Longest period of wheel samples, s. A longer one is not a log of a drive, or not in seconds."""
+"""Longest period of wheel samples, s. If it is longer, the times are probably not in seconds."""
 
 LEAST_ROWS = 20
 """Smallest number of wheel samples in a run, and in a log."""
@@ -34,33 +34,37 @@ LEAST_ROWS = 20
 PAUSE_S = 60.0
 """Time without a wheel sample after which a new drive begins, s."""
 
-ENOUGH_S, REPEATED = 0.2, 4.0
-"""Signs of rounded times if both are exceeded: their period in s, and the samples per time."""
+ROUNDED_S, REPEATED = 0.2, 4.0
+"""Period of the times, s, and mean number of rows per time. If both are exceeded, t was rounded."""
 
 ROLLING, AGAIN = 0.2, 0.5
 """Evidence for a logger that repeats a position until the next one arrives.
 
-`ROLLING` is the speed of both sides together, rad/s, at which no true position stays the same.
-`AGAIN` is the fraction of such rows that repeat the row before.
+Above a speed of `ROLLING` rad/s, both sides together, a true position does not stay the same. The
+logger repeats positions if it does stay the same in more than the fraction `AGAIN` of these rows.
 """
 
 MOST_RUNS = 1000
-"""Largest number of runs in a log. With more, the column does not name drives."""
+"""Largest number of runs in a log. With more of them, the column run does not name drives."""
 
-TOGETHER, TOLD, APART = 50, 0.15, 0.8
-"""Thresholds for the comparison of the front and rear wheels of a side.
+TOGETHER = 50
+"""Number of rows that are summed before the front and rear wheel of a side are compared."""
 
-`TOGETHER` is the number of rows that are summed first. The others are the fractions of their way by
-which both may differ without a note, and at all.
+NOTED, APART = 0.15, 0.8
+"""Difference of the front and rear wheel of a side, as a fraction of the distance they rolled.
+
+Above `NOTED` it is reported, above `APART` the log is refused.
 """
 
 
 class Run(Struct, frozen=True):
-    """One drive. Times are in s since `start`, in order, and each occurs once."""
+    """The samples of one drive. Times are in s since `start`, in order, and each occurs once."""
 
     name: str
     start: float
+    """Time of the first wheel sample in the log, s."""
     t: Floats
+    """Times of the wheel speeds."""
     left: Floats
     """Mean speed of the left wheels, rad/s."""
     right: Floats
@@ -76,14 +80,14 @@ class Run(Struct, frozen=True):
 
 
 class Log(Struct, frozen=True):
-    """The drives of a file, and notes made while it was read."""
+    """The runs of a log, and sentences about data that was left out or changed."""
 
     runs: tuple[Run, ...]
     notes: tuple[str, ...]
 
 
 def runs(table: Table) -> Log:
-    """Return the drives in a table. Raises `LogError` if there are none."""
+    """Return the runs in a table. Raises `LogError` if it has no run that can be used."""
     notes = list(table.notes)
     columns = dict(table.columns)
     t = columns["t"]
@@ -134,7 +138,7 @@ def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats
         return columns["left"], columns["right"]
     for front, rear in (("fl", "rl"), ("fr", "rr")):
         apart = _apart(columns, front, rear)
-        if apart > TOLD:
+        if apart > NOTED:
             notes.append(
                 f"{front} and {rear} differ by {apart:.0%} of their distance: the tool uses their "
                 "mean"
@@ -144,20 +148,21 @@ def _sides(columns: dict[str, Floats], notes: list[str]) -> tuple[Floats, Floats
 
 
 def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
-    """Return the fraction of their way by which both wheels of a side differ.
+    """Return the difference of the wheels of a side, as a fraction of the distance they rolled.
 
-    Both roll over the same floor. Raises `LogError` if they differ impossibly far.
+    Both wheels roll over the same floor, so a large difference means an error. Raises `LogError` if
+    it exceeds `APART`.
     """
     seen = np.isfinite(columns[front]) & np.isfinite(columns[rear])
     starts = np.arange(0, int(seen.sum()), TOGETHER)
     if not len(starts):
         return 0.0
     a, b = (np.add.reduceat(columns[name][seen], starts) for name in (front, rear))
-    apart, way = np.abs(a - b).sum(), np.maximum(np.abs(a), np.abs(b)).sum()
-    if apart <= APART * way:
-        return float(apart / way) if way else 0.0
+    apart, rolled = np.abs(a - b).sum(), np.maximum(np.abs(a), np.abs(b)).sum()
+    if apart <= APART * rolled:
+        return float(apart / rolled) if rolled else 0.0
     least, most = (front, rear) if np.abs(a).sum() < np.abs(b).sum() else (rear, front)
-    sizes = sorted(float(np.abs(one).sum()) for one in (a, b))
+    sizes = sorted(float(np.abs(speeds).sum()) for speeds in (a, b))
     raise LogError(
         f"{least} hardly turns while {most} does: name the wheels that work left and right, and "
         "omit the others"
@@ -168,9 +173,10 @@ def _apart(columns: dict[str, Floats], front: str, rear: str) -> float:
 
 
 def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Return the rows of each drive in a run whose drives are marked only by a restart of the time.
+    """Return the rows of each drive, split where the times start again.
 
-    Only wheel rows decide it: sensors may follow one another in a file, each in its own order.
+    Only rows with wheel speeds count: in a file, the rows of one sensor may all come after the rows
+    of another, each in its own order.
     """
     wheels = rows[np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])]
     back = np.flatnonzero(np.diff(t[wheels]) < -RESTART_S) + 1
@@ -197,7 +203,7 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
             continue
         once = np.unique(times)
         period = float(np.median(np.diff(once))) if len(once) > 1 else np.inf
-        if len(times) > REPEATED * len(once) and period > ENOUGH_S:
+        if len(times) > REPEATED * len(once) and period > ROUNDED_S:
             raise LogError(
                 f"run {name or 1}: {len(times)} rows of wheel speeds have {len(once)} different "
                 "times, because t was rounded: write it with 3 decimals of a second"
@@ -210,9 +216,9 @@ def _in_seconds(name: str, t: Floats, parts: list[Rows], columns: dict[str, Floa
 
 
 def _pauses(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
-    """Return the rows of each drive, split at long pauses.
+    """Return the rows of each drive, split where the wheels have no sample for `PAUSE_S`.
 
-    Otherwise a stamp of another day would make one drive of a thousand hours.
+    Without the split, a single stamp of another day would make one drive of many hours.
     """
     times = _wheel_times(t, rows, columns)
     ends = np.flatnonzero(np.diff(times) > PAUSE_S)
@@ -235,8 +241,8 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
             )
         return None
     yaw, place = (
-        _new(yaw, wheels, f"run {name}: yaw", notes),
-        _new(place, wheels, f"run {name}: x y", notes),
+        _without_repeats(yaw, wheels, f"run {name}: yaw", notes),
+        _without_repeats(place, wheels, f"run {name}: x y", notes),
     )
     start = float(wheels[0][0])
     x, y = place[1:] if len(place[0]) else (np.zeros(0), np.zeros(0))
@@ -247,10 +253,10 @@ def _run(name: str, columns: dict[str, Floats], rows: Rows, notes: list[str]) ->
     )  # fmt: skip
 
 
-def _new(
+def _without_repeats(
     stream: tuple[Floats, ...], wheels: tuple[Floats, ...], what: str, notes: list[str]
 ) -> tuple[Floats, ...]:
-    """Remove the values that a logger repeats in every row until the next sample arrives."""
+    """Return a stream without the values that a logger repeats until the next sample arrives."""
     t, *values = stream
     if len(t) < LEAST_ROWS:
         return stream
@@ -259,7 +265,8 @@ def _new(
     rolling = int((again & rolls).sum())
     if rolling <= AGAIN * rolls.sum():
         return stream
-    # This includes repetitions at rest: the first of them may be older than its row.
+    # Remove the repetitions at rest as well: a repeated value may be older than the time of its
+    # row.
     notes.append(
         f"{what} repeat their value between samples: {rolling} such rows while the wheels turn "
         "are left out"
@@ -270,7 +277,10 @@ def _new(
 def _stream(
     columns: dict[str, Floats], rows: Rows, names: Iterable[str], run: str, notes: list[str]
 ) -> tuple[Floats, ...]:
-    """Return the times and values of a sensor from its complete rows: sorted, one per time."""
+    """Return the times and values of a sensor, sorted, with one row for each time.
+
+    Rows in which one of its columns is empty are left out.
+    """
     held = [columns.get(name) for name in names]
     if any(values is None for values in held):
         return (np.zeros(0),) * (1 + len(held))
@@ -280,7 +290,7 @@ def _stream(
 
 
 def _ordered(stream: list[Floats], what: str, run: str, notes: list[str]) -> Iterator[Floats]:
-    """Sort by time and keep the first of several samples at the same time."""
+    """Sort a stream by time. Of several samples with the same time, keep the first."""
     t = stream[0]
     if count := int((np.diff(t) < 0).sum()):
         notes.append(f"run {run}: {count} rows of {what} are out of order and were sorted")

@@ -1,10 +1,12 @@
-"""Finds a starting point for positions, because Gauss-Newton needs a nearly correct track.
+"""Finds parameters from which the fit to positions can start.
 
-It tries tracks from a tenth to thirty times the configured one, with both signs of the turn and
-with one side reversed. The size of the resulting path gives the radius.
+The Gauss-Newton fit needs a track that is nearly right. The search tries tracks from a tenth to
+thirty times the configured one, with turns to either side and with one side of the wheels reversed.
+For each of them, the size of the path gives the radius.
 
-Positions alone often determine a turn in place only up to whole turns: 90 deg to the left end like
-270 deg to the right. Among starting points that explain about as much, the more likely robot wins.
+A turn on the spot moves no position. Positions therefore often determine such a turn only up to
+whole turns: 90 deg to the left end like 270 deg to the right. If several starting points explain
+the positions about as well, the one of the more usual robot is chosen.
 """
 
 from __future__ import annotations
@@ -16,103 +18,104 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from acsard.calibration import places
-from acsard.calibration.evidence import LATE, LEFT, RIGHT, TURN, Base, Evidence
+from acsard.calibration import positions
+from acsard.calibration.evidence import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base, Evidence
 from acsard.calibration.fit import fit
 from acsard.calibration.log_table import Floats
-from acsard.calibration.paths import Wheels
-from acsard.calibration.places import Grid, Spots, grid, place
+from acsard.calibration.positions import Segment, WheelSteps, place, wheel_steps
 from acsard.calibration.runs import Run
+from acsard.calibration.wheel_angles import WheelAngles
 
 TURNS = np.unique(np.concatenate((np.geomspace(0.03, 10.0, 60), np.geomspace(0.28, 1.4, 40))))
-"""Ratios of configured to true track that are tried. They are finer in the usual range.
-
-They apply to wheels of the configured radius.
-"""
+"""Ratios of configured to true track that are tried. They are finer in the usual range."""
 
 DELAYS = np.arange(-1.5, 1.55, 0.1)
-"""Delays of positions that are tried, s."""
+"""Delays of the positions that are tried, s."""
 
-MOST_SPOTS, SETTLED_SPOTS = 60, 20
-"""Number of blocks that are used, those with the longest reach first.
+MOST_SEGMENTS, REFINED_SEGMENTS = 60, 20
+"""Number of segments that are used to try and to refine: those with the longest reach.
 
-This is a search, not a fit.
+A search needs no more of them.
 """
 
 MOST_POINTS = 80
-"""Number of positions per block that are used, evenly spaced."""
+"""Approximate number of positions per segment that are used, evenly spaced."""
 
-MOST_BEGUN, FAR_WORSE = 4, 20.0
-"""Number of starting points that are refined, and how much worse than the best they may be."""
+MOST_REFINED, FAR_WORSE = 4, 20.0
+"""Number of starting points to refine, and how many times worse than the best each may be."""
 
-USUAL_TURN, NEAR_HEADING = (0.31, 1.25), (0.8, 1.25)
-"""Usual ratios of the robot's turn to that of another source: lowest and highest.
+USUAL_TURN = 0.31, 1.25
+"""Usual ratios of the robot's turn to the turn by its wheels and the wheel separation.
 
-`USUAL_TURN` is relative to the wheels and the wheel separation, from skid-steer to no skidding.
-`NEAR_HEADING` is relative to a heading sensor.
+The lowest is that of a robot that skids much, the highest that of a robot that does not skid.
 """
 
-WRONG_WAY = 4.0
-"""Penalty for a robot with a reversed side, or one that turns to the other side.
+NEAR_HEADING = 0.8, 1.25
+"""Usual ratios of the robot's turn by positions to the turn by a heading sensor."""
 
-A correct robot must leave this many times more unexplained before the reversed one is believed.
+WRONG_WAY = 4.0
+"""Factor by which the unexplained part of an unusual robot is multiplied.
+
+Such a robot has one side reversed, or turns to the other side than its wheels.
 """
 
 NOTHING = 1e-3
-"""Fraction of the positions' spread that cannot distinguish starting points.
+"""Part of the positions' spread below which differences between starting points mean nothing.
 
-Any starting point explains short straights except for their noise.
+It is the noise of positions, which no starting point explains.
 """
 
 STRAYED = 1.3
-"""Factor by which the turn may change during refinement. Beyond it, the result is not used."""
+"""Factor by which the turn may change during refinement. Beyond it, the refinement is not used."""
 
 COARSE_S = 0.1
-"""Time step in which the paths are summed here, s."""
+"""Time step in which paths are summed during the search, s."""
 
 
-class Begin(Struct, frozen=True):
-    """A starting point; `unexplained` is the fraction of the positions' spread that it leaves."""
+class StartingPoint(Struct, frozen=True):
+    """Parameters from which a fit can start."""
 
     parameters: Floats
     unexplained: float
+    """Part of the positions' spread, as squares, that the path of the wheels leaves unexplained."""
 
 
 def search(
-    found: Sequence[Spots], driven: Sequence[Run], angles: Sequence[Wheels], base: Base,
+    segments: Sequence[Segment], driven: Sequence[Run], angles: Sequence[WheelAngles], base: Base,
     sides: Floats | None = None,
-) -> Begin:  # fmt: skip
-    """Return the best starting point.
+) -> StartingPoint:  # fmt: skip
+    """Return the best starting point for these positions.
 
-    `sides` are g_l and g_r by a heading sensor, divided by the gain, or None.
+    `sides` is the result of `heading.first`, or None without a heading sensor.
     """
-    kept = _furthest(found, MOST_SPOTS)
-    needed = sorted({spot.run for spot in kept})
-    grids = {run: grid(driven[run], angles[run], COARSE_S) for run in needed}
-    begun: list[Begin] = []
+    kept = _furthest(segments, MOST_SEGMENTS)
+    needed = sorted({segment.run for segment in kept})
+    steps = {run: wheel_steps(driven[run], angles[run], COARSE_S) for run in needed}
+    points: list[StartingPoint] = []
     for left, way in itertools.product((1.0, -1.0), (1.0, -1.0)):
-        tried = [_tried(kept, grids, base, (left, way * turn, 0.0)) for turn in TURNS]
-        begun += [one for one, *others in _neighbours(tried) if one.unexplained <= min(others)]
+        points += _local_minima(
+            [_tried(kept, steps, base, (left, way * turn, 0.0)) for turn in TURNS]
+        )
     if sides is not None:
         left, way = np.sign(sides[0] * sides[1]), np.sign(sides[1]) * np.abs(sides).mean()
-        begun.append(_tried(kept, grids, base, (float(left), float(way), 0.0)))
+        points.append(_tried(kept, steps, base, (float(left), float(way), 0.0)))
 
-    def worse(one: Begin) -> float:
-        return (one.unexplained + NOTHING) * _doubt(one, sides)
+    def badness(point: StartingPoint) -> float:
+        return (point.unexplained + NOTHING) * _penalty(point, sides)
 
-    begun.sort(key=worse)
-    few, worst = _furthest(kept, SETTLED_SPOTS), FAR_WORSE * worse(begun[0])
-    settled = [
-        _settled(_timed(one, few, grids, base), few, grids, base)
-        for one in begun[:MOST_BEGUN]
-        if worse(one) <= worst
+    points.sort(key=badness)
+    few, worst = _furthest(kept, REFINED_SEGMENTS), FAR_WORSE * badness(points[0])
+    refined = [
+        _refined(_timed(point, few, steps, base), few, steps, base)
+        for point in points[:MOST_REFINED]
+        if badness(point) <= worst
     ]
-    return min(settled, key=worse)
+    return min(refined, key=badness)
 
 
-def _furthest(found: Sequence[Spots], most: int) -> list[Spots]:
-    reach = [float(np.ptp(s.place.real) + np.ptp(s.place.imag)) for s in found]
-    kept = [found[i] for i in sorted(np.argsort(reach)[::-1][:most])]
+def _furthest(segments: Sequence[Segment], most: int) -> list[Segment]:
+    reach = [float(np.ptp(s.place.real) + np.ptp(s.place.imag)) for s in segments]
+    kept = [segments[i] for i in sorted(np.argsort(reach)[::-1][:most])]
     return [
         replace(s, t=s.t[:: 1 + len(s.t) // MOST_POINTS],
                 place=s.place[:: 1 + len(s.t) // MOST_POINTS])
@@ -120,15 +123,15 @@ def _furthest(found: Sequence[Spots], most: int) -> list[Spots]:
     ]  # fmt: skip
 
 
-def _neighbours(tried: Sequence[Begin]) -> list[tuple[Begin, float, float]]:
-    """Return each starting point with the unexplained fractions of its neighbours."""
-    left = [np.inf, *(one.unexplained for one in tried), np.inf]
-    return [(one, left[at], left[at + 2]) for at, one in enumerate(tried)]
+def _local_minima(tried: Sequence[StartingPoint]) -> list[StartingPoint]:
+    """Return the starting points that leave no more unexplained than both of their neighbours."""
+    left = [np.inf, *(point.unexplained for point in tried), np.inf]
+    return [p for at, p in enumerate(tried) if p.unexplained <= min(left[at], left[at + 2])]
 
 
-def _doubt(begun: Begin, sides: Floats | None) -> float:
-    """Return how much less likely this robot is than a usual one, as a factor of at least 1."""
-    signed = begun.parameters[[LEFT, RIGHT]] * begun.parameters[TURN]
+def _penalty(point: StartingPoint, sides: Floats | None) -> float:
+    """Return a factor of at least 1, which is larger for a less usual robot."""
+    signed = point.parameters[[LEFT, RIGHT]] * point.parameters[INVERSE_TRACK]
     turn, (least, most) = float(np.abs(signed).mean()), USUAL_TURN
     like = np.ones(2)
     if sides is not None:
@@ -139,65 +142,76 @@ def _doubt(begun: Begin, sides: Floats | None) -> float:
 
 
 def _turn(parameters: Floats) -> float:
-    """Return the turn by the right side, with its sign."""
-    return float(parameters[TURN] * parameters[RIGHT])
+    """Return the robot's turn for a roll of the right wheels alone, relative to `Base.gain`."""
+    return float(parameters[INVERSE_TRACK] * parameters[RIGHT])
 
 
-def _timed(begun: Begin, kept: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
-    """Return the starting point with the delay that suits it best."""
-    parameters = begun.parameters
-    shape = float(np.sign(parameters[LEFT])), float(parameters[TURN] * parameters[RIGHT])
-    tried = [_tried(kept, grids, base, (*shape, late)) for late in DELAYS]
-    return min([begun, *tried], key=lambda one: one.unexplained)
+def _timed(
+    point: StartingPoint, kept: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
+) -> StartingPoint:
+    """Return the starting point with the delay of the positions that suits it best."""
+    parameters = point.parameters
+    shape = float(np.sign(parameters[LEFT])), float(parameters[INVERSE_TRACK] * parameters[RIGHT])
+    tried = [_tried(kept, steps, base, (*shape, late)) for late in DELAYS]
+    return min([point, *tried], key=lambda point: point.unexplained)
 
 
 def _tried(
-    kept: Sequence[Spots], grids: dict[int, Grid], base: Base, shape: tuple[float, float, float]
-) -> Begin:
-    """Return the starting point for a sign of the left side, a turn and a delay."""
+    kept: Sequence[Segment],
+    steps: dict[int, WheelSteps],
+    base: Base,
+    shape: tuple[float, float, float],
+) -> StartingPoint:
+    """Return the starting point for a shape of the path.
+
+    `shape` has the sign of the left side, the ratio of configured to true track, and the delay of
+    the positions in s.
+    """
     parameters = base.start()
-    parameters[[LEFT, RIGHT, TURN, LATE]] = shape[0], 1.0, shape[1], shape[2]
-    paths = {run: place(steps, base, parameters) for run, steps in grids.items()}
+    parameters[[LEFT, RIGHT, INVERSE_TRACK, DELAY]] = shape[0], 1.0, shape[1], shape[2]
+    paths = {run: place(of_run, base, parameters) for run, of_run in steps.items()}
     cross = spread = size = 0.0
-    for spot in kept:
-        path = np.interp(spot.t - shape[2], grids[spot.run].t, paths[spot.run])
-        seen, gone = spot.place - spot.place.mean(), path - path.mean()
+    for segment in kept:
+        path = np.interp(segment.t - shape[2], steps[segment.run].t, paths[segment.run])
+        centred, centred_path = segment.place - segment.place.mean(), path - path.mean()
         # Each path is rotated in the best way; all share one scale.
-        cross += abs(complex(np.vdot(gone, seen)))
-        size += float(np.sum(np.abs(gone) ** 2))
-        spread += float(np.sum(np.abs(seen) ** 2))
+        cross += abs(complex(np.vdot(centred_path, centred)))
+        size += float(np.sum(np.abs(centred_path) ** 2))
+        spread += float(np.sum(np.abs(centred) ** 2))
     if not size or not spread:
-        return Begin(parameters, np.inf)
+        return StartingPoint(parameters, np.inf)
     scale = cross / size
     parameters[[LEFT, RIGHT]] *= scale
-    parameters[TURN] /= scale
-    return Begin(parameters, 1.0 - cross**2 / (size * spread))
+    parameters[INVERSE_TRACK] /= scale
+    return StartingPoint(parameters, 1.0 - cross**2 / (size * spread))
 
 
-def _settled(begun: Begin, few: Sequence[Spots], grids: dict[int, Grid], base: Base) -> Begin:
-    """Refine a starting point by the fit.
+def _refined(
+    point: StartingPoint, few: Sequence[Segment], steps: dict[int, WheelSteps], base: Base
+) -> StartingPoint:
+    """Return the starting point after a fit to a few segments.
 
     The fit also finds where on the robot the positions are measured, and outliers count less.
     """
-    spots = [replace(spot, block=number) for number, spot in enumerate(few)]
+    segments = [replace(segment, block=number) for number, segment in enumerate(few)]
 
     def evidence(parameters: Floats) -> Evidence:
-        return places.evidence(spots, paths(parameters), parameters, len(spots))
+        return positions.evidence(segments, paths(parameters), parameters, len(segments))
 
-    def paths(parameters: Floats) -> dict[int, places.Path]:
-        return {run: places.path(steps, base, parameters) for run, steps in grids.items()}
+    def paths(parameters: Floats) -> dict[int, positions.Path]:
+        return {run: positions.path(of_run, base, parameters) for run, of_run in steps.items()}
 
     def unexplained(parameters: Floats) -> float:
-        spread = sum(float(np.sum(np.abs(s.place - s.place.mean()) ** 2)) for s in spots)
-        off = places.spread(spots, paths(parameters), parameters)
-        return off**2 * sum(len(s.t) for s in spots) / spread if spread else np.inf
+        spread = sum(float(np.sum(np.abs(s.place - s.place.mean()) ** 2)) for s in segments)
+        off = positions.spread(segments, paths(parameters), parameters)
+        return off**2 * sum(len(s.t) for s in segments) / spread if spread else np.inf
 
-    before = Begin(begun.parameters, unexplained(begun.parameters))
+    before = StartingPoint(point.parameters, unexplained(point.parameters))
     if not np.isfinite(before.unexplained):
-        return begun
-    parameters = fit([evidence], begun.parameters, places=True).parameters
-    moved = _turn(parameters) / _turn(begun.parameters)
+        return point
+    parameters = fit([evidence], point.parameters, places=True).parameters
+    moved = _turn(parameters) / _turn(point.parameters)
     if not 1 / STRAYED < moved < STRAYED:
         return before  # the data does not determine the turn there
-    after = Begin(parameters, unexplained(parameters))
-    return min([before, after], key=lambda one: one.unexplained)
+    after = StartingPoint(parameters, unexplained(parameters))
+    return min([before, after], key=lambda point: point.unexplained)

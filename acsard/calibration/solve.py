@@ -9,9 +9,17 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from acsard.calibration import fit as fitting
-from acsard.calibration import heading, places
-from acsard.calibration.doubts import RefusedError, UnlikeError, in_range, remarks
-from acsard.calibration.evidence import DRIFT, LATE, LEFT, RATE, RIGHT, STRETCH, TURN, Base
+from acsard.calibration import heading, positions
+from acsard.calibration.evidence import (
+    BIAS_ERROR,
+    DELAY,
+    INVERSE_TRACK,
+    LEFT,
+    RIGHT,
+    SCALE_ERROR,
+    TRACK_GROWTH,
+    Base,
+)
 from acsard.calibration.fit import (
     LEFT_RADIUS,
     RIGHT_RADIUS,
@@ -21,48 +29,48 @@ from acsard.calibration.fit import (
     Rates,
     configured,
     fit,
-    found,
+    multipliers,
     rates,
 )  # fmt: skip
-from acsard.calibration.gain import Gain, gain, seen_by_places
 from acsard.calibration.heading import Headings, Rows
+from acsard.calibration.improvement import Improvement, improvement, turns_by_positions
 from acsard.calibration.log_table import Floats, noted
-from acsard.calibration.paths import Wheels, wheels
+from acsard.calibration.plausibility import RefusedError, UnlikeError, in_range, remarks
 from acsard.calibration.prepared import (
     DRIVE,
     Prepared,
     prepared,
+    separates_track,
     sure_enough,
-    told_apart,
     turns_enough,
 )
 from acsard.calibration.runs import Log, Run
-from acsard.calibration.tape_distance import Follow, Tape, Way, scaled
+from acsard.calibration.tape_distance import Extent, Follow, Tape, scaled
+from acsard.calibration.wheel_angles import WheelAngles, angles_of
 from acsard.core.config.settings import DriveConfig
 from acsard.core.values import AcsardError
 
 LENGTHS_S = {True: (4.0,), False: (8.0, 16.0, 32.0)}
-"""Block lengths that are tried, s: with a heading sensor, and without.
+"""Lengths of blocks that are tried, s, by whether the log has a heading sensor.
 
-Longer blocks are better if positions are coarse. More blocks are better if positions are fine.
+Long blocks are better for coarse positions, and many blocks for fine ones.
 """
 
-
 PERFECT = 1e-3
-"""Fraction of the motion by which a true sensor differs from the wheels at least."""
+"""Fraction of the motion by which every true sensor differs from the wheels."""
 
 PLENTY = 100
-"""Number of blocks from which on other lengths are not tried, to save time."""
+"""Number of blocks above which no longer blocks are tried, to save time."""
 
 
 class Drives(Struct, frozen=True):
-    """Totals of the drives."""
+    """Totals of the runs of a log."""
 
     runs: int
     seconds: float
     metres: float
     turns: float
-    """Number of turns of 360 deg to both sides together, with the parameters found."""
+    """Number of turns of 360 deg to both sides together, according to the calibrated wheels."""
     fastest: float
     """Rate of the fastest turns, rad/s."""
 
@@ -81,30 +89,41 @@ class Drives(Struct, frozen=True):
 
 
 class Calibration(Struct, frozen=True):
-    """The result. Each standard deviation has the unit of its quantity."""
+    """The result of a calibration. Each standard deviation has the unit of its quantity."""
 
-    way: str
-    """Sensors that the wheels were compared with."""
+    reference: str
+    """The sensors or the tool that the wheels were compared with, in words."""
     drives: Drives
-    now: Multipliers
-    found: Multipliers
+    configured: Multipliers
+    multipliers: Multipliers
+    """The new multipliers."""
     scale: str
     """Sensors that measured the distance: "positions", "distance", both, or "" for none."""
     growth: float
     """Fraction by which the effective track grows with each rad/s of turn rate."""
     growth_std: float
-    gain: Gain
-    late: dict[str, float]
+    improvement: Improvement
+    delays: dict[str, float]
     """Delay of each sensor behind the wheels, s."""
-    bias: float
-    """Gyro bias, rad/s."""
+    gyro_bias: float
+    """Gyro bias, rad/s; 0 without a gyro."""
     notes: tuple[str, ...]
+    """Sentences about the log that the user should know."""
 
 
 def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibration:
     """Return the calibration of the robot that recorded this log.
 
-    Raises `LogError` or `RefusedError`, to which the log's notes are added.
+    Args:
+        log: the recorded runs.
+        drive: the geometry that the multipliers belong to, and the present multipliers.
+        tape: a distance that was measured by tape, or None.
+
+    Raises:
+        LogError: a sensor of the log cannot be used.
+        RefusedError: the log gives no calibration.
+
+    The notes of the log are added to each of these errors.
     """
     try:
         return _calibrated(log, drive, tape)
@@ -115,7 +134,7 @@ def calibrate(log: Log, drive: DriveConfig, tape: Tape | None = None) -> Calibra
 
 def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
     base = Base.of(drive)
-    angles = [wheels(run) for run in log.runs]
+    angles = [angles_of(run) for run in log.runs]
     headings = heading.of_gyro(log.runs, angles) or heading.of_yaw(log.runs, angles, base.gain)
     tries: list[tuple[float, int, Prepared, Fit]] = []
     unlike: UnlikeError | None = None
@@ -124,16 +143,18 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
             made = prepared(log.runs, angles, headings, base, length)
         except UnlikeError as error:
             unlike = unlike or error
-            continue  # coarse positions may follow the wheels over longer blocks
+            continue  # coarse positions may still follow the wheels in longer blocks
         except RefusedError as error:
             raise unlike or error from None
         gyro = headings is not None and headings.source == "yaw_rate"
-        drift = headings.unsure if headings is not None else 0.0
-        fitted = fit(made.sources, made.start, places=bool(made.spots), gyro=gyro, drift=drift)
-        unsure = float(np.trace(fitted.covariance()[: TURN + 1, : TURN + 1]))
-        tries.append((unsure, len(tries), made, fitted))
+        bias_std = headings.bias_std if headings is not None else 0.0
+        fitted = fit(
+            made.sources, made.start, places=bool(made.segments), gyro=gyro, bias_std=bias_std
+        )
+        variance = float(np.trace(fitted.covariance()[: INVERSE_TRACK + 1, : INVERSE_TRACK + 1]))
+        tries.append((variance, len(tries), made, fitted))
         if not 3 * fitting.LEAST_BLOCKS <= len(made.parts) <= PLENTY:
-            break  # half as many blocks would be too few, or these are plenty
+            break  # twice the length would give too few blocks, or there are plenty already
     if unlike is not None and not tries:
         raise unlike
     _, _, made, fitted = min(tries)
@@ -141,56 +162,58 @@ def _calibrated(log: Log, drive: DriveConfig, tape: Tape | None) -> Calibration:
 
 
 def _calibration(
-    log: Log, angles: Sequence[Wheels], headings: Headings | None, base: Base, tape: Tape | None,
-    made: Prepared, fitted: Fit,
+    log: Log, angles: Sequence[WheelAngles], headings: Headings | None, base: Base,
+    tape: Tape | None, made: Prepared, fitted: Fit,
 ) -> Calibration:  # fmt: skip
-    """Convert the fit to settings and evaluate its improvement."""
-    rows, spots, every = made.rows, made.spots, fitted.covariance()
+    """Return the calibration that a fit gives, after checks of the result."""
+    rows, segments, covariance = made.rows, made.segments, fitted.covariance()
+    std = np.sqrt(np.diag(covariance))
     if not fitted.converged:
         raise RefusedError(f"the search for the parameters does not converge: {DRIVE}")
-    told_apart(fitted.apart())
+    separates_track(fitted.marginal())
     by_wheels = heading.turned(rows, base, fitted.parameters)
-    bias = headings.bias if headings is not None else 0.0
-    drift, scale_of_gyro = float(fitted.parameters[DRIFT]), 1 + float(fitted.parameters[STRETCH])
-    if headings is not None and headings.drifts:
-        drift = heading.bias(rows, by_wheels * scale_of_gyro)
-    bias += drift
-    rows = replace(rows, turned=(rows.turned - drift * rows.seconds) / scale_of_gyro)
+    gyro_scale = 1 + float(fitted.parameters[SCALE_ERROR])
+    bias_error = float(fitted.parameters[BIAS_ERROR])
+    if headings is not None and headings.bias_unknown:
+        bias_error = heading.bias(rows, by_wheels * gyro_scale)
+    gyro_bias = (headings.bias if headings is not None else 0.0) + bias_error
+    rows = replace(rows, turned=(rows.turned - bias_error * rows.seconds) / gyro_scale)
     rate, truth = rates(rows, by_wheels), rows.turned
     if headings is None:
         turns_enough(by_wheels)
-        truth = seen_by_places(fitted, rows, base)
-    result = found(fitted, rate)
-    sure_enough(result, float(np.sqrt(every[TURN, TURN])) / abs(fitted.parameters[TURN]))
-    better = gain(fitted, base, made.parts, rate, rows, truth, spots, made.grids)
-    late = {headings.source: headings.late} if headings is not None else {}
-    if spots:
-        late["positions"] = float(fitted.parameters[LATE])
-    scale, notes = ["positions"] if spots else [], list(log.notes)
+        truth = turns_by_positions(fitted, rows, base)
+    result = multipliers(fitted.parameters, covariance, rate, fitted.varies)
+    sure_enough(result, float(std[INVERSE_TRACK]) / abs(fitted.parameters[INVERSE_TRACK]))
+    better = improvement(fitted, base, made.parts, rate, rows, truth, segments, made.steps)
+    delays = {headings.source: headings.delay} if headings is not None else {}
+    if segments:
+        delays["positions"] = float(fitted.parameters[DELAY])
+    scale, notes = ["positions"] if segments else [], list(log.notes)
     if tape is not None:
         follow = _follow(log.runs, angles, base, fitted, rate)
         names = [run.name for run in log.runs]
-        result, name = scaled(result, tape, names, follow, known=bool(spots))
+        result, name = scaled(result, tape, names, follow, known=bool(segments))
         scale.append("distance")
         notes.append(f"the distance of {tape.metres:g} m is used for run {name}")
     in_range(result.values)
     drives = Drives.of(log.runs, rows, by_wheels, base, result, rate)
     notes += _cuts(log.runs, angles)
     notes += _too_good(headings, made, fitted, base)
-    notes += remarks(late, bias, by_wheels, result.values, base, sized=bool(scale))
+    notes += remarks(delays, gyro_bias, by_wheels, result.values, base, sized=bool(scale))
     return Calibration(
-        " and ".join(late), drives, configured(base), result, " and ".join(scale),
-        float(fitted.parameters[RATE]), float(np.sqrt(every[RATE, RATE])), better, late, bias,
-        tuple(notes),
+        reference=" and ".join(delays), drives=drives, configured=configured(base),
+        multipliers=result, scale=" and ".join(scale),
+        growth=float(fitted.parameters[TRACK_GROWTH]), growth_std=float(std[TRACK_GROWTH]),
+        improvement=better, delays=delays, gyro_bias=gyro_bias, notes=tuple(notes),
     )  # fmt: skip
 
 
-def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
-    """Yield a sentence for each kind of place where the log was cut."""
-    if gone := sum(len(turned.gaps) for turned in angles):
-        yield f"the wheel speeds have {gone} gaps: the tool uses no data across them"
+def _cuts(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Iterator[str]:
+    """Yield a sentence about the gaps of the wheels, and one about the jumps of the positions."""
+    if gaps := sum(len(wheels.gaps) for wheels in angles):
+        yield f"the wheel speeds have {gaps} gaps: the tool uses no data across them"
     pairs = zip(driven, angles, strict=True)
-    if jumps := sum(len(places.jumps(run, turned)) for run, turned in pairs):
+    if jumps := sum(len(positions.jumps(run, turned)) for run, turned in pairs):
         yield (
             f"the positions jump {jumps} times (outliers, or a source that corrected "
             "itself): the tool uses no data across the jumps"
@@ -198,17 +221,20 @@ def _cuts(driven: Sequence[Run], angles: Sequence[Wheels]) -> Iterator[str]:
 
 
 def _too_good(headings: Headings | None, made: Prepared, fitted: Fit, base: Base) -> Iterator[str]:
-    """Yield a sentence for each source that agrees too well with the wheels for a true sensor."""
+    """Yield a sentence for each sensor that agrees with the wheels better than a true one can."""
     rows = made.rows
     if headings is not None:
         off = rows.turned - heading.turned(rows, base, fitted.parameters)
         off -= np.median(off / rows.seconds) * rows.seconds
         if float(off @ off) < PERFECT**2 * float(rows.turned @ rows.turned):
             yield _own(headings.source)
-    if made.spots:
-        along = [places.path(one, base, fitted.parameters) for one in made.grids]
-        reach = max(float(np.ptp(spot.place.real) + np.ptp(spot.place.imag)) for spot in made.spots)
-        if places.spread(made.spots, along, fitted.parameters) < PERFECT * reach:
+    if made.segments:
+        along = [positions.path(steps, base, fitted.parameters) for steps in made.steps]
+        reach = max(
+            float(np.ptp(segment.place.real) + np.ptp(segment.place.imag))
+            for segment in made.segments
+        )
+        if positions.spread(made.segments, along, fitted.parameters) < PERFECT * reach:
             yield _own("the positions")
 
 
@@ -221,18 +247,22 @@ def _own(what: str) -> str:
 
 
 def _follow(
-    driven: Sequence[Run], angles: Sequence[Wheels], base: Base, fitted: Fit, rate: Rates
+    driven: Sequence[Run], angles: Sequence[WheelAngles], base: Base, fitted: Fit, rate: Rates
 ) -> Follow:
-    """Return a function that computes the way of a run for given multipliers.
+    """Return a function from multipliers and the number of a run to the extent of its path.
 
     The track changes with the turn rate as the fit found.
     """
 
-    def follow(values: Floats, number: int) -> Way:
+    def follow(values: Floats, number: int) -> Extent:
         parameters = fitted.parameters.copy()
         parameters[[LEFT, RIGHT]] = values[[LEFT_RADIUS, RIGHT_RADIUS]]
-        parameters[TURN] = 1 / (values[SEPARATION] * (1 - parameters[RATE] * rate.mean))
-        place = places.path(places.grid(driven[number], angles[number]), base, parameters).place
-        return Way(float(abs(place[-1])), float(np.abs(np.diff(place)).sum()))
+        parameters[INVERSE_TRACK] = 1 / (
+            values[SEPARATION] * (1 - parameters[TRACK_GROWTH] * rate.mean)
+        )
+        place = positions.path(
+            positions.wheel_steps(driven[number], angles[number]), base, parameters
+        ).place
+        return Extent(float(abs(place[-1])), float(np.abs(np.diff(place)).sum()))
 
     return follow

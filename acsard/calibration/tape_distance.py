@@ -1,4 +1,8 @@
-"""A distance measured by tape, which gives the size of the wheels to a log of turn rates."""
+"""Corrects the multipliers by a distance that was measured by tape.
+
+A log of turn rates alone shows the ratios of the multipliers. The distance shows how large the
+wheels are.
+"""
 
 from __future__ import annotations
 
@@ -7,85 +11,94 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from msgspec import Struct
 
-from acsard.calibration.doubts import RefusedError
 from acsard.calibration.fit import LEFT_RADIUS, RIGHT_RADIUS, SEPARATION, Multipliers
 from acsard.calibration.log_table import Floats
+from acsard.calibration.plausibility import RefusedError
 
 TAPE_M = 0.01
-"""Standard deviation of a distance by tape, including where on the robot it was measured, m."""
+"""Standard deviation of a distance by tape, m. It includes the choice of the point on the robot."""
 
 UNKNOWN = 1.0
-"""Standard deviation of the scale's logarithm if nothing else has measured it."""
+"""Standard deviation of the logarithm of the scale if no sensor has measured the scale."""
 
 LEAST_M = 0.5
-"""Shortest distance of a run's end from its start by odometry that can be used, m."""
+"""Shortest distance between start and end of a run, m, that a tape may measure."""
 
 STRAIGHT = 0.8
-"""Smallest distance from start to end, as a fraction of the way between them."""
+"""Smallest straightness of a run, as in `Extent.straight`."""
 
 
 class Tape(Struct, frozen=True):
-    """Straight-line distance of a run's end from its start, m.
-
-    If `run` is "", the straightest run is meant.
-    """
+    """A measured straight-line distance from the start to the end of a run."""
 
     metres: float
     run: str = ""
+    """Name of the run; "" means the straightest run of the log."""
 
 
-class Way(Struct, frozen=True):
-    """The way of a run for given multipliers: from start to end, and along the path, m."""
+class Extent(Struct, frozen=True):
+    """The extent of a run's path according to the wheels."""
 
-    apart: float
-    along: float
+    distance: float
+    """Straight-line distance from start to end, m."""
+    length: float
+    """Length along the path, m."""
 
     @property
     def straight(self) -> float:
-        """Straightness: 1 for a straight line, 0 for a run that gets nowhere."""
-        return self.apart / self.along if self.apart > LEAST_M else 0.0
+        """Straightness of the path: 1 for a straight line, 0 for a short distance."""
+        return self.distance / self.length if self.distance > LEAST_M else 0.0
 
 
-Follow = Callable[[Floats, int], Way]
-"""Function from multipliers (as in `Multipliers.values`) and a run's number to its way."""
+Follow = Callable[[Floats, int], Extent]
+"""Function from multipliers (as in `Multipliers.values`) and a run's number to its extent."""
 
 
 def scaled(
     found: Multipliers, tape: Tape, names: Sequence[str], follow: Follow, *, known: bool
 ) -> tuple[Multipliers, str]:
-    """Return the multipliers corrected by the distance, and the name of the run it was used for.
+    """Return the corrected multipliers, and the name of the run that the distance belongs to.
 
-    The correction is a Kalman step in the logarithms of the multipliers. `known` says whether
-    positions have already measured the scale. Raises `RefusedError` if there is no such run or if
-    no run is straight enough.
+    The correction is the update step of a Kalman filter on the logarithms of the multipliers.
+
+    Args:
+        found: the multipliers that the fit gave.
+        tape: the measured distance.
+        names: the names of the runs.
+        follow: computes the extent of a run.
+        known: whether positions have already measured the scale.
+
+    Raises:
+        RefusedError: the log has no such run, or the run is not straight enough.
     """
     if tape.run and tape.run not in names:
         raise RefusedError(
             f'--distance: there is no run "{tape.run}" in the log; it has {", ".join(names[:10])}'
         )
     numbers = [names.index(tape.run)] if tape.run else range(len(names))
-    ways = {number: follow(found.values, number) for number in numbers}
-    best = max(ways, key=lambda number: ways[number].straight)
-    way = ways[best]
-    if way.straight < STRAIGHT:
+    extents = {number: follow(found.values, number) for number in numbers}
+    best = max(extents, key=lambda number: extents[number].straight)
+    extent = extents[best]
+    if extent.straight < STRAIGHT:
         raise RefusedError(
-            f"--distance: run {names[best]} ends {way.apart:.2f} m from its start, after "
-            f"{way.along:.2f} m: drive straight ahead for 2 m or more in a separate run, and "
+            f"--distance: run {names[best]} ends {extent.distance:.2f} m from its start, after "
+            f"{extent.length:.2f} m: drive straight ahead for 2 m or more in a separate run, and "
             "measure from start to end"
         )
-    slopes = np.zeros(3)
+    # Derivatives of the logarithm of the distance with respect to those of the multipliers.
+    jacobian = np.zeros(3)
     for index in (SEPARATION, LEFT_RADIUS, RIGHT_RADIUS):
         longer = found.values.copy()
         longer[index] *= 1.0 + 1e-4
-        slopes[index] = np.log(follow(longer, best).apart / way.apart) / 1e-4
+        jacobian[index] = np.log(follow(longer, best).distance / extent.distance) / 1e-4
     logs = np.diag(1 / found.values)
     covariance = logs @ found.covariance @ logs
     if not known:
         covariance = covariance + UNKNOWN**2
     noise = (TAPE_M / tape.metres) ** 2
-    pull = covariance @ slopes / (slopes @ covariance @ slopes + noise)
-    values = found.values * np.exp(pull * np.log(tape.metres / way.apart))
-    rest = np.eye(3) - np.outer(pull, slopes)
-    covariance = rest @ covariance @ rest.T + np.outer(pull, pull) * noise
+    gain = covariance @ jacobian / (jacobian @ covariance @ jacobian + noise)
+    values = found.values * np.exp(gain * np.log(tape.metres / extent.distance))
+    rest = np.eye(3) - np.outer(gain, jacobian)
+    covariance = rest @ covariance @ rest.T + np.outer(gain, gain) * noise
     back = np.diag(values)
     return Multipliers(values, back @ covariance @ back), names[best]

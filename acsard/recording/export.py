@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple, Protocol
+from typing import BinaryIO, Literal, Protocol
 
 from mcap.writer import Writer
 from msgspec import Struct
@@ -28,21 +27,12 @@ from acsard.recording.file_replay import (
 from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import Step
 from acsard.recording.replay import replay_step
+from acsard.recording.time_span import WHOLE, Span
 
 Kind = Literal["mcap", "csv", "rosbag2"]
 
 SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".rosbag2"}
 """Suffix of the exported file if the user gives no name."""
-
-
-class Span(NamedTuple):
-    """Time span to export, in s of the monotonic clock after the first step of the recording."""
-
-    begin: float = -math.inf
-    end: float = math.inf
-
-
-WHOLE = Span()
 
 
 class ExportResult(Struct, frozen=True):

@@ -39,10 +39,11 @@ from mcap.records import (
 )
 from msgspec import Struct
 
+from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.recording.chunks import GROWING_HEAD, GrowingChunk, Message
-from acsard.recording.end_record import END, EndRecord, Ns, as_metadata
+from acsard.recording.end_record import END, EndRecord, Ns, as_metadata, how_it_ends
 from acsard.recording.mcap_records import MAGIC, walk
 from acsard.recording.recorded_steps import UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, first_of
@@ -338,6 +339,30 @@ class Recording:
     def whole(self) -> bool:
         """True if the file is finished and has no damaged place. Read all messages first."""
         return self.ended and not self.damaged
+
+    @property
+    def ending(self) -> str:
+        """Why it ended other than by a normal end of the daemon, or "". Read it before."""
+        if not self.ended:
+            return "no end: cut off, or still being recorded"
+        return how_it_ends(self.cut, self.why)
+
+    @property
+    def missing(self) -> str:
+        """The damaged places and the ending in words, or "". Read it before."""
+        places = many(self.damaged, "damaged place is", "damaged places are")
+        damaged = f"{places} left out" if self.damaged else ""
+        return "; ".join(filter(None, [damaged, self.ending]))
+
+    def compute_end_record(self) -> EndRecord:
+        """Read the recording, and return the end record that it lacks."""
+        builder = EndRecordBuilder(self.about)
+        for topic, wall_ns, data in self.messages():
+            builder.message(topic, wall_ns, data)
+            if topic == "events":
+                with suppress(RecordingError):  # omit only the event that cannot be decoded
+                    builder.event(event_of(self, data))
+        return builder.end_record()
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the topic, the wall-clock time in ns and the bytes of each message.

@@ -1,6 +1,6 @@
 """`acsard recording report`: turns a recording into the text of one HTML file.
 
-All modules of this package are pure.
+All modules of this package are pure, except `page.drawn`, which replays the recording.
 
 - `report_data` takes the steps one by one and keeps the data to draw. It thins the data while they
   arrive (`acsard.core.thinning`), so a day takes no more memory than a minute.

@@ -11,11 +11,19 @@ from __future__ import annotations
 import binascii
 import hashlib
 import html
+import time
+from collections import deque
 from collections.abc import Sequence
 
 import msgspec
 
 from acsard.core.formatting import lasting, printable
+from acsard.core.values import NS_PER_S
+from acsard.host.errors import RecordingError
+from acsard.recording.file import Recording
+from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
+from acsard.recording.replay_text import verdict
+from acsard.recording.time_span import WHOLE, Span, clock
 from acsard.report.plot_elements import Figure
 from acsard.report.report_data import ReportData
 from acsard.report.report_text import Clock, Origin, differences, notes, reasons, rows, summary
@@ -163,6 +171,42 @@ def page(
             "</body></html>\n",
         ]
     )
+
+
+def drawn(
+    recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
+) -> tuple[str, list[str]]:
+    """Replay a part of a recording; return the text of the file and notes about the recording.
+
+    `progress` is called with the wall-clock time reached, in ns. Raises `RecordingError` if nothing
+    was recorded in that time.
+    """
+    about, replayed = recording.about, DisplayReplay(recording)
+    began = about.wall_ns / NS_PER_S
+    data = ReportData(replayed.config, began + span.begin, began + span.end)
+    for number, (step, outputs, robot) in enumerate(replayed.steps()):
+        if number % PROGRESS_STEPS == 0:
+            progress(step.inputs.now.wall_ns)
+        data.step(step, outputs, robot)
+        if data.over:
+            # Read the rest, so that the notes count every damaged place.
+            deque(recording.messages(), maxlen=0)
+            break
+    if data.began is None:
+        raise RecordingError(
+            f"{recording.path} has no step in that span of time, so there is nothing to draw"
+        )
+    data.end()
+    remarks = [*filter(None, [recording.missing]), *replayed.notes]
+    comparison = replayed.replay.comparison
+    if not (comparison.same or replayed.notes or data.missing):
+        remarks.append(
+            "this version of acsard computes other results than the recorded ones: "
+            f"{verdict(comparison)}"
+        )
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(remarks))
+    offset_s = time.localtime(data.began).tm_gmtoff
+    return page(data, origin, library, clock, offset_s), notes(data, origin)
 
 
 def _hash(program: str) -> str:

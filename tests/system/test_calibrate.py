@@ -20,8 +20,9 @@ import pytest
 import zenoh
 
 from acsard.calibration.guided import robot_on_bus
-from acsard.calibration.guided.leg_driver import HELD_UP, Recorder, Sample
-from acsard.calibration.guided.legs import GuideError, Leg, Move
+from acsard.calibration.guided.drive_plan import GuideError, Leg, Move
+from acsard.calibration.guided.leg_driver import HELD_UP
+from acsard.calibration.guided.leg_recorder import Recorder, Sample
 from acsard.calibration.guided.robot_on_bus import POSITIONS, RobotOnBus, Sensor
 from acsard.client import Client
 from acsard.core.config.parsing import parse
@@ -30,8 +31,8 @@ from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
-from acsard.prompts.prompt import Ask
-from acsard.prompts.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import Ask
+from acsard.terminal.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,
@@ -396,7 +397,7 @@ def test_positions_are_heard_from_elsewhere_as_both_types_in_every_encoding(free
 
                 def came() -> bool:
                     said.put(key, encode(message, form))  # noqa: B023
-                    return sensor.hear(recorder.place, 9.0) > 0  # noqa: B023
+                    return sensor.receive(recorder.place, 9.0) > 0  # noqa: B023
 
                 until(came, 5.0, f"a position on {key}")
                 assert recorder.samples["places"][0] == Sample(9.0, 7.0, (1.5, -2.0))
@@ -413,7 +414,7 @@ def test_what_is_no_position_and_what_does_not_come_is_told(
 
         def came() -> int:
             said.put("slam/pose", b'{"x": 1}')
-            return sensor.hear(lambda message, now: None, 0.0)
+            return sensor.receive(lambda message, now: None, 0.0)
 
         with pytest.raises(GuideError, match="cannot be read"):
             until(came, 5.0, "a sample")

@@ -1,1 +1,1 @@
-"""`acsard accuracy` shows the error budget of a running robot's odometry, cause by cause."""
+"""`acsard accuracy`: the odometry error of a running robot, cause by cause."""

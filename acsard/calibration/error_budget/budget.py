@@ -1,11 +1,13 @@
-"""The error budget of a drive: how much each cause contributes to the present odometry error.
+"""The error budget of a drive: how large the odometry error of each single cause is.
 
-Each cause is propagated alone through the odometry's own error model
-(`core/motion/uncertainty.py`). The recorded drive is repeated until 100 m are driven, which gives
-the position error, and until 360 deg are turned to one side, which gives the heading error. The
-size of a cause in each step is measured if the feedback lines show it. This holds for time,
-quantisation, gaps, wheels that contradict each other, and the gyro noise that odometry assumes. All
-other sizes come from the declarations in `[odometry]`.
+The errors of one cause are propagated alone through the error model of the odometry
+(`core/motion/uncertainty.py`). The recorded drive is repeated until the robot has driven 100 m,
+which gives the position error, and until it has turned by 360 deg to one side, which gives the
+heading error.
+
+The errors of each step of the drive are measured if the feedback lines show them. They show those
+of time, quantisation, gaps and contradicting wheels, and the gyro noise that the odometry assumes.
+All other errors are those that `[odometry]` declares.
 """
 
 from __future__ import annotations
@@ -31,28 +33,33 @@ from acsard.core.values import REST, PoseCovariance
 Cause = Literal["time", "quantisation", "gaps", "slip", "parameters", "gyro"]
 
 Basis = Literal["measured", "settings", "unknown"]
-"""Source of a share: visible in the lines, declared in `[odometry]`, or unknown."""
+"""Where the size of an error comes from: feedback lines, `[odometry]`, or no source."""
 
 METRES = 100.0
+"""Distance after which the position error is given, m."""
 
 LEAST_M, LEAST_RAD = 0.2, 0.2
 """Minimum distance (m) and minimum turn (rad) of a drive from which errors can be extrapolated."""
 
 LEAST_LINES = 20
+"""Minimum number of feedback lines of a drive."""
 
 STEP_S = 0.1
+"""Length of a step of the drive, s."""
+
 MOST_STEPS = 20_000
-"""Maximum number of steps until 100 m are driven. A slow drive gets longer steps."""
+"""Maximum number of steps until 100 m are driven. The steps of a slow drive are longer."""
 
 STRAIGHT = Steps(np.array([[0.05, 0.0] + [0.0] * 7]))
 SPIN = Steps(np.array([[0.0, 0.05] + [0.0] * 7]))
-"""Steps for which the declared errors are computed while the robot does not drive."""
+"""A step straight ahead, m, and a step of a turn on the spot, rad.
 
-ZERO = (0.0,) * 6
+The errors of a robot that stands are computed for them.
+"""
 
 
 class Share(Struct, frozen=True):
-    """Contribution of one cause alone; None if this drive does not show it."""
+    """The error of one cause alone; None if this drive does not show it."""
 
     cause: Cause
     mm_per_100_m: float | None
@@ -63,29 +70,31 @@ class Share(Struct, frozen=True):
 
 
 class Budget(Struct, frozen=True):
-    """The contributions of all causes, and facts about the drive."""
+    """The errors of all causes, and facts about the drive."""
 
     seconds: float
+    """Duration of the drive, s."""
     metres: float
     turned: float
     """Sum of the turns to both sides, deg."""
     lines: int
+    """Number of feedback lines."""
     missing: int
-    """Number of missing lines."""
+    """Number of feedback lines that were lost."""
     unseen: float
-    """Driving time without lines, s."""
+    """Driving time without feedback lines, s."""
     lateness: float
-    """RMS error of the lines' time stamps, s."""
+    """RMS error of the stamps of feedback lines, s."""
     quantum: float
-    """Quantization step of the wheel speeds in the lines, rad/s."""
+    """Quantization step of the wheel speeds in feedback lines, rad/s."""
     counts: int
-    """Encoder counts per wheel turn, from the lines or the configuration; 0 if unknown."""
+    """Encoder counts per wheel turn, as feedback lines or the configuration show; 0 if unknown."""
     gyro: bool
     """True if the heading comes from a gyro."""
     still: bool
-    """True if the robot hardly moved, so that only configured errors can be reported."""
+    """True if the robot hardly moved, so that only the errors of the settings are given."""
     at_rest: tuple[float, float]
-    """Standard deviations (m/s, rad/s) of each report's twist due to its two decimals."""
+    """Standard deviations (m/s, rad/s) of the twist because wheel speeds have two decimals."""
     shares: tuple[Share, ...]
     multiplier: float = 1.0
     """Configured ratio of effective track to wheel separation."""
@@ -97,12 +106,12 @@ class Budget(Struct, frozen=True):
     """True if odometry uses `learned` when it has only the wheels to measure a turn."""
 
     def largest(self, *bases: Basis) -> Share | None:
-        """Return the share with the largest position error among these bases, or else heading
-        error.
+        """Return the share with the largest position error, among the shares with these bases.
 
-        Returns None if no share with one of these bases is greater than 0.
+        If no position error is greater than 0, return the share with the largest heading error. If
+        no heading error is greater than 0 either, return None.
         """
-        known = [one for one in self.shares if one.basis in bases]
+        known = [share for share in self.shares if share.basis in bases]
         for size in (_millimetres, _degrees):
             found = max(known, key=size, default=None)
             if found is not None and size(found) > 0.0:
@@ -110,57 +119,68 @@ class Budget(Struct, frozen=True):
         return None
 
     def total(self) -> tuple[float | None, float | None]:
-        """Return the combined error of all causes in mm and deg; the causes are independent."""
-        return _squares([one.mm_per_100_m for one in self.shares]), _squares(
-            [one.deg_per_turn for one in self.shares]
+        """Return the error of all causes together, in mm after 100 m and deg after a turn.
+
+        The causes are independent, so their squares are added. An error is None if it is None for
+        every cause.
+        """
+        return _squares([share.mm_per_100_m for share in self.shares]), _squares(
+            [share.deg_per_turn for share in self.shares]
         )
 
 
-class Heard(Struct, frozen=True):
-    """The data that was received from the bus."""
+class Received(Struct, frozen=True):
+    """The drive of a robot, as the bus showed it."""
 
     lines: list[Line]
+    """The feedback lines."""
     sent: list[float]
-    """Times at which lines were sent to the microcontroller, s."""
+    """Times at which the daemon sent lines to the microcontroller, s."""
     whole: bool = True
-    """True if every line that the daemon received is included."""
+    """True if `lines` has every feedback line that the daemon received."""
     counted: bool = False
-    """True if the lines carry encoder counts and the microcontroller's time."""
+    """True if feedback lines carry encoder counts and the microcontroller's time."""
     gyro: bool = False
     """True if the heading comes from a gyro."""
     learned: float | None = None
-    """Effective track that the gyro implies, relative to the configured one; None if unknown."""
+    """Effective track that the gyro implies, divided by the configured one; None if unknown."""
     deviation: float = 0.0
     """Relative standard deviation of `learned`."""
     used: bool = False
     """True if odometry uses `learned` when it has only the wheels to measure a turn."""
 
 
-def budget(heard: Heard, config: Config, metres: float = METRES) -> Budget:
-    """Return the error budget of a daemon with this configuration; `metres` replaces the 100 m."""
-    model, lines = _Model(config, metres), heard.lines
-    still = _standing(heard, config, model)
+def budget(received: Received, config: Config, metres: float = METRES) -> Budget:
+    """Return the error budget of a drive.
+
+    Args:
+        received: the drive.
+        config: the configuration of the daemon.
+        metres: the distance after which the position error is given.
+    """
+    model, lines = _Model(config, metres), received.lines
+    still = _standing(received, config, model)
     if len(lines) < LEAST_LINES:
         return still
-    moved = motion(lines, np.array(heard.sent), model.kinematics, heard.whole)
+    moved = motion(lines, np.array(received.sent), model.kinematics, received.whole)
     rolled, turned = float(np.abs(moved.distance).sum()), float(np.abs(moved.turn).sum())
     if rolled < LEAST_M and turned < LEAST_RAD:
         return still
-    found = rounding(np.array([one.speeds for one in lines]), moved.period)
+    found = rounding(np.array([line.speeds for line in lines]), moved.period)
     counts = still.counts or (round(math.tau / found.count) if found.count else 0)
     creeping = metres / max(rolled, LEAST_M) * moved.seconds / MOST_STEPS
-    driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), heard.gyro)
+    driving = Driving(lines, moved, found, model.kinematics, max(STEP_S, creeping), received.gyro)
     model.rolls, model.turns = rolled >= LEAST_M, turned >= LEAST_RAD
     return replace(
         still, metres=rolled, turned=math.degrees(turned), missing=moved.missing,
         unseen=moved.unseen, lateness=moved.lateness, quantum=found.quantum, counts=counts,
-        still=False, shares=tuple(_causes(heard, model, driving, counts)),
+        still=False, shares=tuple(_causes(received, model, driving, counts)),
     )  # fmt: skip
 
 
-def _standing(heard: Heard, config: Config, model: _Model) -> Budget:
-    """Return the budget of a robot that stands, from the settings alone."""
-    lines, odometry, known = heard.lines, config.odometry, model.declares_parameters
+def _standing(received: Received, config: Config, model: _Model) -> Budget:
+    """Return the budget of a robot that stands, which follows from the settings alone."""
+    lines, odometry, known = received.lines, config.odometry, model.declares_parameters
     shares = (
         model.share("slip", "settings", STRAIGHT, SPIN, _only(odometry, noise=True)),
         model.share(
@@ -170,18 +190,18 @@ def _standing(heard: Heard, config: Config, model: _Model) -> Budget:
     )  # fmt: skip
     spread = TwistUncertainty(ErrorModel(_only(odometry), model.kinematics), 0).of(REST, 0.0)
     configured = model.kinematics.multipliers[2]
-    learned = None if heard.learned is None else heard.learned * configured
+    learned = None if received.learned is None else received.learned * configured
     return Budget(
         lines[-1].at - lines[0].at if lines else 0.0, 0.0, 0.0, len(lines), 0, 0.0, 0.0, DECIMAL,
-        config.mcu.encoder_counts if heard.counted else 0, heard.gyro, still=True,
+        config.mcu.encoder_counts if received.counted else 0, received.gyro, still=True,
         at_rest=(math.sqrt(spread.linear), math.sqrt(spread.angular)), shares=shares,
-        multiplier=configured, learned=learned, learned_std=(learned or 0.0) * heard.deviation,
-        learned_used=heard.used,
+        multiplier=configured, learned=learned, learned_std=(learned or 0.0) * received.deviation,
+        learned_used=received.used,
     )  # fmt: skip
 
 
-def _causes(heard: Heard, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
-    """Yield the share of each cause alone."""
+def _causes(received: Received, model: _Model, driving: Driving, counts: int) -> Iterator[Share]:
+    """Yield the error of each cause alone."""
     odometry, plain = model.odometry, driving.plain()
 
     def share(
@@ -191,9 +211,9 @@ def _causes(heard: Heard, model: _Model, driving: Driving, counts: int) -> Itera
         left, only = steps.to_the_left(), only or _only(odometry)
         return model.share(cause, basis, steps, left, only, counts, scale)
 
-    # Counts are cumulative, so late and missing lines cause no error.
-    counted = heard.counted
-    basis: Basis = "measured" if counted or heard.whole else "unknown"
+    # Encoder counts are cumulative, so late and lost feedback lines cause no error.
+    counted = received.counted
+    basis: Basis = "measured" if counted or received.whole else "unknown"
     yield share("time", basis, plain if counted else driving.late())
     yield share("quantisation", basis, plain if counted else driving.rounded(), counts=counts)
     yield share("gaps", basis, plain if counted else driving.missed())
@@ -204,20 +224,20 @@ def _causes(heard: Heard, model: _Model, driving: Driving, counts: int) -> Itera
 
     kind = _only(odometry, parameters=True)
     basis = "settings" if model.declares_parameters else "unknown"
-    if heard.learned is not None:
-        off = heard.deviation if heard.used else abs(heard.learned - 1.0)
+    if received.learned is not None:
+        off = received.deviation if received.used else abs(received.learned - 1.0)
         off *= model.kinematics.multipliers[2]
         kind, basis = replace(kind, wheel_separation_multiplier_std=off), "measured"
     yield share("parameters", basis, plain, kind)
 
-    if heard.gyro:
+    if received.gyro:
         known = odometry.covariance == "model" and driving.tells_gyro
         basis = "measured" if known else "unknown"
         yield share("gyro", basis, driving.turned_by_gyro(), scale=GYRO_SCALE)
 
 
 class _Model:
-    """The odometry's covariance model, which is asked for the error of one cause at a time."""
+    """The error model of the odometry, used for one cause at a time."""
 
     def __init__(self, config: Config, metres: float) -> None:
         self.odometry, self.kinematics = config.odometry, Kinematics(config.drive)
@@ -237,10 +257,12 @@ class _Model:
         """Return the error of one cause.
 
         Args:
+            cause: the cause.
+            basis: the source of the size of the error.
             ahead: the steps that are repeated until the distance is driven.
-            left: the steps that are repeated until a turn is made.
+            left: the steps that are repeated until a whole turn is made.
             only: the settings, without the errors of other causes.
-            counts: the encoders' counts per wheel turn; 0 if their resolution is not the cause.
+            counts: encoder counts per wheel turn; 0 if their resolution is not the cause.
             scale: the relative standard deviation of the gyro's scale.
         """
         if basis == "unknown":
@@ -258,7 +280,10 @@ class _Model:
         self, steps: Steps, only: OdometryConfig, counts: int, scale: float, metres: float,
         angle: float,
     ) -> PoseCovariance:  # fmt: skip
-        """Return the covariance after `metres` m or `angle` rad of these steps, repeated."""
+        """Return the covariance of the pose after these steps were repeated.
+
+        They are repeated until the robot has driven `metres` m or turned by `angle` rad.
+        """
         pose, path = PoseUncertainty(ErrorModel(only, self.kinematics), counts), Path()
         rolled = turned = 0.0
         for distance, turn, along, yaw, *missed, by_gyro in cycle(steps.rows.tolist()):
@@ -278,8 +303,12 @@ class _Model:
 def _only(
     odometry: OdometryConfig, *, noise: bool = False, parameters: bool = False
 ) -> OdometryConfig:
-    """Return the odometry's model with a single kind of error."""
-    made = replace(odometry, pose_covariance_diagonal=ZERO)
+    """Return the settings with the errors of the chosen kind only, and without any by default.
+
+    `noise` keeps the variances per metre and radian. `parameters` keeps the standard deviations of
+    the multipliers and of the scale.
+    """
+    made = replace(odometry, pose_covariance_diagonal=(0.0,) * 6)
     if not noise:
         made = replace(
             made, distance_variance_per_metre=0.0, yaw_variance_per_metre=0.0,

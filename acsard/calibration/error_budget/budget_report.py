@@ -1,4 +1,4 @@
-"""An error budget as text: a table for people, and advice on the largest error."""
+"""Prints an error budget: a table of the causes, and advice on the largest one."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ from rich.table import Table
 
 from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.core.motion.uncertainty import COARSE_COUNTS
-from acsard.terminal.tables import table
+from acsard.terminal.output import table
 
 MEANING: dict[Cause, str] = {
-    "time": "errors in the times of the lines",
-    "quantisation": "rounding of the values in a line",
-    "gaps": "distance driven while no lines came",
+    "time": "errors in the times of feedback lines",
+    "quantisation": "rounding of the values in a feedback line",
+    "gaps": "distance driven while no feedback lines came",
     "slip": "wheels that skid",
     "parameters": "wheel radii and track",
     "gyro": "bias, noise and scale of the gyro",
 }
 
-MENDS: dict[Cause, str] = {
-    "time": "lines are late by {late:.1f} ms: set the adapter's latency_timer to 1 (the udev "
-    "rules do that), or let the lines carry the microcontroller's clock and counts "
-    "(mcu.link_check, mcu.encoder_counts)",
-    "gaps": "{missing} lines were lost, so {unseen:.2f} s of driving were not measured: look "
-    "for a loose cable, noise on the wire or a busy machine (`acsard top`), or let the "
-    "lines carry counts, which lose no distance (mcu.link_check, mcu.encoder_counts)",
+ADVICE: dict[Cause, str] = {
+    "time": "the times of feedback lines are wrong by {late:.1f} ms: set the latency_timer of the "
+    "serial adapter to 1 (the udev rules do that), or let the feedback lines carry the "
+    "microcontroller's clock and encoder counts (mcu.link_check, mcu.encoder_counts)",
+    "gaps": "{missing} feedback lines were lost, so {unseen:.2f} s of driving were not measured: "
+    "look for a loose cable, noise on the wire or a busy machine (`acsard top`), or let the "
+    "feedback lines carry encoder counts, which lose no distance (mcu.link_check, "
+    "mcu.encoder_counts)",
     "slip": "drive on other ground or turn less on the spot; a gyro measures turns that "
     "skidding wheels do not show ([odometry] gyro)",
     "parameters": "run `acsard calibrate`: it measures wheel radii and effective track",
     "gyro": "let the robot stand for a second now and then, so that it learns the gyro's bias",
 }
 
-TOLD: dict[Basis, str] = {
+BASIS: dict[Basis, str] = {
     "measured": "measurements",
     "settings": "[odometry]",
     "unknown": "nothing",
@@ -43,11 +44,11 @@ CALIBRATE = (
     "the error of wheel radii and track width is unknown, and on wheels that skid it is mostly "
     "the largest: run `acsard calibrate`"
 )
-"""Advice while the robot is not calibrated."""
+"""Advice for a robot that is not calibrated."""
 
 
 def parts(budget: Budget) -> Iterator[RenderableType]:
-    """Yield the table, the data that it is based on, and advice on the largest share."""
+    """Yield a sentence about the drive, the table, and advice on the largest cause."""
     if budget.still:
         yield _standing(budget)
     else:
@@ -59,37 +60,45 @@ def parts(budget: Budget) -> Iterator[RenderableType]:
 
 
 def advice(budget: Budget) -> str:
-    """Return advice on the largest measured share, and on a declared one that is larger."""
+    """Return advice on the largest measured cause, and on a declared cause that is larger."""
     if budget.still:
         return (
-            "drive the robot, also around curves, while this measures: most causes show only then"
+            "drive the robot, also around curves, while the tool measures: a robot that stands "
+            "does not show most causes"
         )
-    seen, all_ = budget.largest("measured"), budget.largest("measured", "settings")
-    told = [] if seen is None else [f"the largest is {seen.cause}: {_mend(seen, budget)}"]
-    if seen is not all_ and all_ is not None:
-        told = [f"of the measured causes {one}" for one in told]
-        told.insert(0, f"[odometry] declares {all_.cause} the largest: {_mend(all_, budget)}")
-    if any(one.cause == "parameters" and one.basis == "unknown" for one in budget.shares):
-        told.insert(0, CALIBRATE)
-    return "; ".join(told) or "nothing here makes odometry wrong"
+    measured, largest = budget.largest("measured"), budget.largest("measured", "settings")
+    advice = []
+    if any(share.cause == "parameters" and share.basis == "unknown" for share in budget.shares):
+        advice.append(CALIBRATE)
+    if largest is not None and largest is not measured:
+        advice.append(
+            f"the largest cause is {largest.cause}, by the settings in [odometry]: "
+            f"{_advice_on(largest, budget)}"
+        )
+    if measured is not None:
+        advice.append(
+            f"the largest measured cause is {measured.cause}: {_advice_on(measured, budget)}"
+        )
+    return "; ".join(advice) or "this drive shows no error of the odometry"
 
 
 def _driven(budget: Budget) -> str:
     missing = f" ({budget.missing} missing)" if budget.missing else ""
     return (
         f"{budget.seconds:.1f} s, {budget.metres:.2f} m, {budget.turned:.0f} deg turned, "
-        f"{budget.lines} lines{missing}; heading from the "
+        f"{budget.lines} feedback lines{missing}; heading from the "
         f"{'gyro' if budget.gyro else 'wheels'}. If the drive goes on like this, each cause "
-        "alone makes:"
+        "alone makes this error:"
     )
 
 
 def _table(budget: Budget) -> Table:
-    known = [(s.cause, s.mm_per_100_m, s.deg_per_turn, MEANING[s.cause], TOLD[s.basis])
-             for s in budget.shares]  # fmt: skip
+    causes = [(s.cause, s.mm_per_100_m, s.deg_per_turn, MEANING[s.cause], BASIS[s.basis])
+              for s in budget.shares]  # fmt: skip
     total = ("all", *budget.total(), "root of the sum of their squares", "")
     rows = [
-        (name, _number(mm, 0), _number(deg, 2), *told) for name, mm, deg, *told in [*known, total]
+        (name, _number(mm, 0), _number(deg, 2), *words)
+        for name, mm, deg, *words in [*causes, total]
     ]
     return table(rows, ("", "mm in 100 m", "deg a turn", "", "based on"), right={1, 2})
 
@@ -98,15 +107,15 @@ def _track(budget: Budget, learned: float) -> str:
     implied = f"{learned:.3f} (standard deviation {budget.learned_std:.3f})"
     if budget.learned_used:
         return (
-            f"By the gyro drive.wheel_separation_multiplier is {implied}. This value is used "
-            "while only the wheels measure the turn; the configured value is "
+            f"By the gyro drive.wheel_separation_multiplier is {implied}. Odometry uses this "
+            "value while only the wheels measure the turn; the configured value is "
             f"{budget.multiplier:.3f}."
         )
     return (
-        f"By the gyro drive.wheel_separation_multiplier would be {implied}; the configured "
-        f"value, which is used, is {budget.multiplier:.3f}. If both differ on the ground that "
-        "matters, `acsard calibrate` measures it; [odometry] learned_track uses the learned "
-        "value while the gyro is silent."
+        f"By the gyro drive.wheel_separation_multiplier would be {implied}. Odometry uses the "
+        f"configured value, {budget.multiplier:.3f}. If both differ on the ground that matters, "
+        "run `acsard calibrate`, or set [odometry] learned_track, which uses the gyro's value "
+        "while the gyro is silent."
     )
 
 
@@ -114,10 +123,14 @@ def _standing(budget: Budget) -> str:
     along, turning = budget.at_rest
     counts = budget.counts
     return (
-        f"the robot stands still ({budget.lines} lines in {budget.seconds:.1f} s), so errors of "
-        "driving cannot be measured. By the settings, two decimals of rad/s leave each line "
-        f"uncertain by {1e3 * along:.2f} mm/s and {1e3 * turning:.1f} mrad/s, "
-        + (f"the encoders have {counts} counts" if counts else "the encoders' counts are not known")
+        f"the robot stands still ({budget.lines} feedback lines in {budget.seconds:.1f} s), so "
+        "errors of driving cannot be measured. Wheel speeds in two decimals of rad/s leave the "
+        f"twist uncertain by {1e3 * along:.2f} mm/s and {1e3 * turning:.1f} mrad/s; "
+        + (
+            f"the encoders have {counts} counts per wheel turn"
+            if counts
+            else "the counts of the encoders are not known"
+        )
         + f"; {_declared(budget)}"
     )
 
@@ -126,9 +139,9 @@ def _declared(budget: Budget) -> str:
     known = {share.cause: share for share in budget.shares}
     share = known.get("parameters")
     if share is None or share.basis == "unknown":
-        return "radii and track were never calibrated"
+        return "wheel radii and track were never calibrated"
     return (
-        f"radii and track are known to {_number(share.mm_per_100_m, 0)} mm in 100 m straight on "
+        f"wheel radii and track are known to {_number(share.mm_per_100_m, 0)} mm in 100 m ahead "
         f"and {_number(share.deg_per_turn, 2)} deg a turn"
     )
 
@@ -141,13 +154,17 @@ def _number(value: float | None, digits: int) -> str:
     )
 
 
-def _mend(share: Share, budget: Budget) -> str:
+def _advice_on(share: Share, budget: Budget) -> str:
     if share.cause != "quantisation":
-        return MENDS[share.cause].format(
+        return ADVICE[share.cause].format(
             late=1e3 * budget.lateness, missing=budget.missing, unseen=budget.unseen
         )
     if 0 < budget.counts <= COARSE_COUNTS:
         return (
-            f"the encoders have {budget.counts} counts a turn: use finer ones, on the motor's shaft"
+            f"the encoders have {budget.counts} counts per wheel turn: use finer encoders, on the "
+            "shafts of the motors"
         )
-    return "a plain line has only two decimals: let the lines carry counts (mcu.link_check)"
+    return (
+        "a plain feedback line has only two decimals: let the feedback lines carry encoder counts "
+        "(mcu.link_check)"
+    )

@@ -1,13 +1,19 @@
-"""Converts messages of a running daemon to the input of the error budget."""
+"""Follows a running daemon, and collects its messages as the input of the error budget."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
+from collections.abc import Iterator, Mapping
 
-from acsard.calibration.error_budget.budget import Heard
+from acsard.calibration.error_budget.budget import Budget, Received, budget
 from acsard.calibration.error_budget.drive_log import Line
+from acsard.client import Client, Subscription
+from acsard.client.follower import FIRST_S
+from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config
+from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import (
     DiagnosticArray,
     JointState,
@@ -17,26 +23,72 @@ from acsard.core.messages.schema import (
     TwistStamped,
 )
 from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.subscription import encoded
+from acsard.host.errors import ReplyError
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Keys to subscribe to."""
 
 MOST = 60_000
-"""Maximum number of kept lines: ten minutes at 100 Hz."""
+"""Maximum number of feedback lines that are kept: ten minutes at 100 Hz."""
 
 LEAST_LOST, SHARE_LOST = 3, 0.01
-"""Lines of the daemon that may be missing here, as a number and as a share, the larger counts.
-Fewer are explained by the boundaries of the observed time."""
+"""Number and fraction of the daemon's feedback lines that may be missing here.
+
+The larger limit counts. A few are missing because the counters and the messages do not begin and
+end at the same moment.
+"""
 
 SAMPLED = "checked with samples"
 """Name of the link check whose lines carry the encoder counts, as in `diagnostics`."""
 
+LOOK_S = 0.05
+"""Time between two looks for messages, s."""
+
+
+def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
+    """Yield the error budget of the drive so far, every `seconds` s.
+
+    Raises `ReplyError` if no feedback lines come, and if a message cannot be read.
+    """
+    queues = {key: robot.subscribe(key) for key in KEYS}
+    _await_line(robot, queues["wheel_states"])
+    feed = Feed(config, robot.get("state"))
+    while True:
+        _follow(feed, queues, seconds)
+        yield budget(feed.received(robot.get("state"), robot.get("diagnostics")), config)
+
+
+def _await_line(robot: Client, lines: Subscription) -> None:
+    """Wait for the first feedback line, after which all keys are published."""
+    end = time.monotonic() + FIRST_S
+    while lines.try_recv() is None:
+        if time.monotonic() > end:
+            raise ReplyError(f"no feedback lines come: {robot.get('state').reason}")
+        time.sleep(LOOK_S)
+
+
+def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> None:
+    """Pass all messages of the next `seconds` s to `feed`."""
+    decoders = {key: decoder(key) for key in queues}
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(LOOK_S)
+        for key, queue in queues.items():
+            while (sample := queue.try_recv()) is not None:
+                try:
+                    feed.add(decoders[key].decode(*encoded(sample)))
+                except DecodeError as error:
+                    raise ReplyError(
+                        f"cannot read {key} ({error}); does the daemon have another version?"
+                    ) from None
+
 
 class Feed:
-    """Collects a daemon's messages: `add` each one, then call `heard`."""
+    """Collects the messages of a daemon: `add` each of them, then call `received`."""
 
     def __init__(self, config: Config, first: RobotState) -> None:
-        """Start the collection; `first` is the state just before the first message."""
+        """Start the collection. `first` is the daemon's state just before the first message."""
         self._config, self._first = config, first
         self._start_ns = first.stamp.to_ns()
         self._odom: dict[int, Odometry] = {}
@@ -46,7 +98,7 @@ class Feed:
         self._count = 0
 
     def add(self, message: Message) -> None:
-        """Add a message of one of `KEYS`; the messages of each key must be in order."""
+        """Add a message of one of `KEYS`. The messages of each key must come in their order."""
         if isinstance(message, TwistStamped):
             self._sent.append(message.header.stamp.to_ns())
         elif isinstance(message, Odometry):
@@ -56,11 +108,11 @@ class Feed:
             self._wheels[message.header.stamp.to_ns()] = message
             self._join(message.header.stamp.to_ns())
 
-    def heard(self, last: RobotState, diagnostics: DiagnosticArray) -> Heard:
-        """Return all data so far; both arguments must be current."""
+    def received(self, last: RobotState, diagnostics: DiagnosticArray) -> Received:
+        """Return the drive so far. `last` and `diagnostics` are the daemon's present values."""
         lines, zero = [line for _, line in self._lines], self._start_ns
         learned, deviation, used = _learned(diagnostics)
-        return Heard(
+        return Received(
             lines,
             [(at - zero) / NS_PER_S for at in self._sent],
             whole=self._whole(last),
@@ -72,14 +124,14 @@ class Feed:
         )
 
     def _join(self, stamp_ns: int) -> None:
-        """Combine the two messages of a line, matched by stamp.
+        """Combine the `odom` and the `wheel_states` message with this stamp to a feedback line.
 
-        Messages with the same stamp pair in order.
+        If one of them has not arrived yet, do nothing.
         """
         odom, wheels = self._odom.get(stamp_ns), self._wheels.get(stamp_ns)
         if odom is None or wheels is None:
             for waiting in (self._odom, self._wheels):
-                if len(waiting) > 100:  # the other message was lost
+                if len(waiting) > 100:  # the other message of the oldest one was lost
                     del waiting[next(iter(waiting))]
             return
         del self._odom[stamp_ns], self._wheels[stamp_ns]
@@ -92,6 +144,7 @@ class Feed:
         self._count += 1
 
     def _whole(self, last: RobotState) -> bool:
+        """Return whether nearly every feedback line of the daemon arrived here."""
         rates, before = self._config.rates, self._first.counters
         if rates.odom or rates.wheel_states:
             return False
@@ -104,16 +157,17 @@ class Feed:
 
 
 def _value(diagnostics: DiagnosticArray, key: str) -> str:
-    """Return the first value with this key in any row, or ""."""
+    """Return the first value with this key in the diagnostics, or ""."""
     rows = (value for status in diagnostics.status for value in status.values)
     return next((value.value for value in rows if value.key == key), "")
 
 
 def _learned(diagnostics: DiagnosticArray) -> tuple[float | None, float, bool]:
-    """Return the track implied by the gyro, its deviation, and whether it is used.
+    """Return what the diagnostics say about the effective track that the gyro implies.
 
-    The track is relative to the configured one, and its standard deviation is relative to itself.
-    The track is None if unknown.
+    Returns:
+        The track divided by the configured one, or None if it is unknown; its standard deviation
+        divided by the track; and whether odometry uses the track.
     """
     names = ("learned_multiplier", "wheel_separation_multiplier", "learned_multiplier_std")
     learned, configured, std = (_value(diagnostics, name) for name in names)

@@ -1,16 +1,17 @@
 """Divides a drive into steps, each with the errors of one cause.
 
-An error is either independent of all others, and then it is a variance. Or it has the same sign in
-each step and adds up. Then it is treated like a motion that the pose missed, as in a gap.
+An error that is independent from step to step is given as a variance. An error that has the same
+sign in each step adds up; it is given as motion that the pose missed, like the motion in a gap.
 
-Rounding is an error because a line carries speeds with two decimals. Independent rounding has a
-standard deviation of q / sqrt(12), where q is the quantization step. A wheel at a constant speed
-repeats the same error, so a run of equal values counts as one error of the run's length. A run that
-a wheel passes on its way from slower to faster is different: the errors of its two halves cancel.
+Rounding is an error because a feedback line carries wheel speeds with two decimals. Independent
+rounding errors have a standard deviation of q / sqrt(12), where q is the quantization step. A wheel
+at a constant speed repeats the same error, so a run of n equal values is one error of n times this
+size. If a wheel passes through a value while it becomes faster or slower, the run is different: the
+errors of its first and second half cancel.
 
-A firmware that counts encoder edges in each period reports multiples of one count's speed. An edge
-that it misses in one period is counted in the next, so only the rounding of each multiple adds up,
-and that is known.
+Some firmware counts encoder edges in each period and reports multiples of the speed of one count.
+An edge that it misses in one period is counted in the next one. Only the rounding of the reported
+multiple to two decimals adds up then, and this rounding is known.
 """
 
 from __future__ import annotations
@@ -28,30 +29,32 @@ from acsard.core.values import WheelSpeeds
 Floats = npt.NDArray[np.float64]
 
 TOGETHER = 0.8
-"""Share of lines with equal values from which two wheels are assumed to have the same error."""
-
+"""Part of the feedback lines with equal values from which two wheels have the same errors."""
 
 LEAST_VALUES = 3
-"""Distinct speeds that are needed to find a quantization step. One or two prove nothing."""
+"""Number of different speeds that are needed to find a quantization step."""
 
 
 class Rounding(Struct, frozen=True):
-    """Rounding errors; rows are lines, columns are wheels in `values.WHEELS` order."""
+    """Rounding errors. Rows are feedback lines, columns are wheels in `values.WHEELS` order."""
 
     variance: Floats
-    """Variance of each value, rad2; the entries are independent."""
+    """Variance of the angle that a wheel rolled, rad2. The entries are independent."""
     offset: Floats
-    """Known excess of each value, rad."""
+    """Known error of the angle that a wheel rolled, rad."""
     alike: Floats
-    """For each pair of wheels 1 if their errors are the same, otherwise 0."""
+    """Shape (4, 4): 1 for a pair of wheels with the same errors, otherwise 0."""
     quantum: float
     """Quantization step, rad/s."""
     count: float
-    """Wheel rotation per encoder count, rad; 0 if the lines do not show it."""
+    """Wheel rotation per encoder count, rad; 0 if the feedback lines do not show it."""
 
 
 def rounding(speeds: Floats, period: float) -> Rounding:
-    """Estimate the rounding errors of wheel speeds in rad/s; each line covers `period` s."""
+    """Estimate the rounding errors of wheel speeds.
+
+    `speeds` has one row for each feedback line, in rad/s. A feedback line covers `period` s.
+    """
     moving = np.any(speeds != 0.0, axis=1)
     same = speeds[moving][:, :, None] == speeds[moving][:, None, :]
     alike = (same.mean(axis=0) >= TOGETHER).astype(float) if moving.any() else np.eye(4)
@@ -65,9 +68,10 @@ def rounding(speeds: Floats, period: float) -> Rounding:
 
 
 def _runs(values: Floats) -> Floats:
-    """Return the variance of each run at its last line, in units of q^2 / 12.
+    """Return the variance of each run of equal values of a wheel, in units of q^2 / 12.
 
-    It is the square of the run's length, or 1 for a run that is passed through.
+    The variance is in the row of the run's last value, and the other rows are 0. It is the square
+    of the number of values, or 1 if the wheel passed through the value.
     """
     found = np.zeros(len(values))
     ends = np.append(np.flatnonzero(np.diff(values)), len(values) - 1)
@@ -84,8 +88,8 @@ def _runs(values: Floats) -> Floats:
 
 
 def _quantum(speeds: Floats) -> float:
-    """Return the speed in rad/s of which all speeds are multiples, or 0 if there is none."""
-    # A value that is held for a whole drive is no more evidence than one line of it.
+    """Return the speed in rad/s of which all speeds are multiples, or 0 without such a speed."""
+    # A value that is repeated for a whole drive is no more evidence than a single one.
     seen = np.unique(np.abs(speeds[speeds != 0.0])).tolist()
     if len(seen) < LEAST_VALUES:
         return 0.0
@@ -96,26 +100,32 @@ def _quantum(speeds: Floats) -> float:
 
 
 class Steps(Struct, frozen=True):
-    """The steps of a drive with the errors of one cause.
-
-    A row has the distance in m and the turn in rad; the variances (m2, rad2) that are independent
-    of other steps; the motion that the pose missed in each step in the same sense (m, rad) with its
-    variances (m2, rad2); and the variance (rad2) of a turn that a gyro measured.
-    """
+    """The steps of a drive with the errors of one cause."""
 
     rows: Floats
+    """One row for each step, with nine columns:
+
+    - 0, 1: distance (m) and turn (rad) of the step
+    - 2, 3: variances of both (m2, rad2) that are independent of other steps
+    - 4, 5: motion that the pose missed (m, rad), with the same sign in each step
+    - 6, 7: variances of the missed motion (m2, rad2)
+    - 8: variance of the turn if a gyro measured it (rad2)
+    """
     by_gyro: bool = False
     """Whether a gyro measured the turns. Otherwise the wheels did."""
 
     def to_the_left(self) -> Steps:
-        """Return the steps with every turn to the left, and its errors as well."""
+        """Return the steps with every turn to the left.
+
+        The missed turn of a step to the right changes its sign as well.
+        """
         rows = self.rows.copy()
         rows[rows[:, 1] < 0.0] *= (1, -1, 1, 1, 1, -1, 1, 1, 1)
         return Steps(rows, self.by_gyro)
 
 
 class Driving:
-    """A drive, divided into steps of about `step_s` seconds."""
+    """A drive, divided into steps of about `step_s` s, with the errors of each cause."""
 
     def __init__(
         self, lines: list[Line], motion: Motion, rounding: Rounding, kinematics: Kinematics,
@@ -124,7 +134,7 @@ class Driving:
         self._lines, self._motion, self._rounding, self._gyro = lines, motion, rounding, gyro
         self._each = max(1, round(step_s / motion.period))
         twists = [kinematics.twist(WheelSpeeds(*row)) for row in np.eye(4).tolist()]
-        self._weights = np.array([[one.linear for one in twists], [one.angular for one in twists]])
+        self._weights = np.array([[t.linear for t in twists], [t.angular for t in twists]])
         """Motion of the robot for 1 rad of each wheel: a row of m and a row of rad."""
 
     def plain(self) -> Steps:
@@ -133,7 +143,7 @@ class Driving:
 
     @property
     def tells_gyro(self) -> bool:
-        """Whether the lines show the noise of the gyro."""
+        """Whether the feedback lines show the noise of the gyro."""
         return self._motion.yaw_variance is not None
 
     def turned_by_gyro(self) -> Steps:
@@ -141,9 +151,9 @@ class Driving:
         return self._steps(gyro=self._motion.yaw_variance)
 
     def late(self) -> Steps:
-        """Return the steps with the errors of late lines.
+        """Return the steps with the errors of wrong times of feedback lines.
 
-        Correlated errors are summed before they are squared.
+        The errors within `BLOCK_S` are correlated, so they are summed before they are squared.
         """
         late = self._motion.late
         starts = np.arange(0, len(late), max(1, round(BLOCK_S / self._motion.period)))
@@ -153,12 +163,12 @@ class Driving:
 
     def missed(self) -> Steps:
         """Return the steps with the errors of gaps."""
-        return self._steps(self._motion.bridged, self._motion.stood)
+        return self._steps(self._motion.filled, self._motion.unfilled)
 
     def rounded(self) -> Steps:
-        """Return the steps with the rounding errors of lines.
+        """Return the steps with the rounding errors of feedback lines.
 
-        An encoder's own resolution is not included.
+        The resolution of the encoders is not included.
         """
         found = self._rounding
         if found.count:
@@ -170,10 +180,10 @@ class Driving:
         return self._steps(np.column_stack(variances))
 
     def contradicted(self) -> Steps:
-        """Return the steps with the errors that contradicting wheels imply.
+        """Return the steps with the errors of wheels that contradict each other.
 
-        If the front and the rear wheel of a side disagree and one is right, their mean is off by
-        half the difference.
+        If the front and the rear wheel of a side differ and one of them is right, the mean of both
+        is wrong by half of the difference.
         """
         turned = np.diff([line.positions for line in self._lines], axis=0)
         front_right, front_left, rear_left, rear_right = turned.T
@@ -181,7 +191,7 @@ class Driving:
         return self._steps(missed=self._of_wheels(np.column_stack([right, left, left, right])))
 
     def _of_wheels(self, off: Floats) -> Floats:
-        """Return the motion that the pose missed by angles of the wheels, which are certain."""
+        """Return the missed motion for wheel angles that are wrong by exactly `off`, rad."""
         moved = off @ self._weights.T
         return np.hstack([moved, np.zeros_like(moved)])
 
@@ -189,7 +199,7 @@ class Driving:
         self, variances: Floats | None = None, missed: Floats | None = None,
         gyro: Floats | None = None,
     ) -> Steps:  # fmt: skip
-        """Sum the lines' errors into steps; the arguments have one row for each line."""
+        """Return the steps with these errors. The arguments have one row for each feedback line."""
         moved, count = self._motion, len(self._motion.distance)
         errors = [
             np.zeros((count, width)) if given is None else given.reshape(count, width)

@@ -1,6 +1,8 @@
-"""`acsard calibrate` without a log: instructions, legs and measurements of a guided drive.
+"""`acsard calibrate` without a log: the tool drives the robot and asks a person for measurements.
 
-Each way of calibration is a table of legs (`ways.py`): what to tell the person, what to drive, what
-to ask, and what the numbers measure. `runner.py` goes through such a table. `leg_driver.py` decides
-the commands of one leg from messages and keys, and `robot_on_bus.py` sends them.
+Each method of calibration is a table of legs (`methods.py`). A leg is one drive with its
+instructions, its commands and the numbers that the person reads off afterwards. `runner.py` goes
+through the legs of a method. `leg_driver.py` decides the commands of one leg, `leg_recorder.py`
+keeps its samples, and `robot_on_bus.py` connects both to the robot. The tape readings go to
+`tape_readings.py` and `tape_calibration.py`.
 """

@@ -1,6 +1,6 @@
-"""The robot on the bus during a calibration: it drives legs, and its messages are recorded.
+"""Connects a guided drive to the robot: sends the commands of a leg, and records the messages.
 
-`leg_driver.py` decides which command to send.
+`leg_driver.py` decides which command to send, and `leg_recorder.py` keeps the samples.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from typing import Any
 
 import zenoh
 
-from acsard.calibration.guided.leg_driver import LegDriver, Recorder
-from acsard.calibration.guided.legs import GuideError, Leg
+from acsard.calibration.guided.drive_plan import GuideError, Leg
+from acsard.calibration.guided.leg_driver import LegDriver
+from acsard.calibration.guided.leg_recorder import Recorder
 from acsard.calibration.runs import Run
 from acsard.client.commander import OPENING_PERIOD_S, OPENING_S, SEND_PERIOD_S, ZEROS
 from acsard.client.follower import FIRST_S
@@ -23,37 +24,37 @@ from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped
 from acsard.core.messages.topics import by_key
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
-from acsard.prompts.prompt import Prompt
+from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
 
 LOOK_S = 0.005
-"""Period in which keys and messages are polled, s.
-
-A key press stops the robot at most this much later.
-"""
+"""Period in which keys and messages are polled, s. A key press takes effect within it."""
 
 SHOWN_S = 0.2
+"""Period in which the progress of a leg is shown, s."""
 
 POSITIONS = (Odometry, PoseStamped)
-"""Types of a position message, in the order of decoding attempts.
+"""Types of a position message, in the order in which they are tried.
 
-CDR does not name its type, and a payload that is too short for odometry is a pose.
+A CDR payload does not name its type. Decoding it as odometry fails if it is a pose, because a pose
+is shorter.
 """
 
 Take = Callable[[Any, float], object]
+"""Receives a message and its time of arrival, s."""
 
 
 class Sensor:
-    """The messages of one key, decoded as the first of `types` that fits."""
+    """A subscription to one key. Its messages are decoded as the first of `types` that fits."""
 
     def __init__(self, session: zenoh.Session, key: str, types: tuple[type, ...]) -> None:
         self.key = key
         self._samples = Subscription(queue_on(session, key, latched=False), key)
-        self._decoders: list[Decoder[Any]] = [Decoder(one) for one in types]
+        self._decoders: list[Decoder[Any]] = [Decoder(type_) for type_ in types]
 
-    def hear(self, take: Take, now: float) -> int:
-        """Pass every message that has arrived to `take` and return their number.
+    def receive(self, take: Take, now: float) -> int:
+        """Pass the messages that have arrived to `take`, and return their number.
 
         Raises `GuideError` if a message cannot be decoded.
         """
@@ -64,9 +65,12 @@ class Sensor:
         return count
 
     def await_first(self, what: str) -> None:
-        """Wait for the first message. Raises `GuideError` if none arrives within `FIRST_S`."""
+        """Wait for the first message. Raises `GuideError` if none arrives within `FIRST_S`.
+
+        `what` names the expected message in the text of the error.
+        """
         end = time.monotonic() + FIRST_S
-        while not self.hear(lambda message, now: None, 0.0):
+        while not self.receive(lambda message, now: None, 0.0):
             if time.monotonic() > end:
                 raise GuideError(f"{what} does not arrive on {self.key}")
             time.sleep(LOOK_S)
@@ -85,7 +89,7 @@ class Sensor:
 
 
 class RobotOnBus:
-    """The robot on the bus: sends the commands of a leg and records the sensors meanwhile."""
+    """The robot of a guided drive: follows the commands of a leg while its sensors are recorded."""
 
     def __init__(self, client: Client, config: Config, prompt: Prompt) -> None:
         self._client, self._prompt = client, prompt
@@ -95,22 +99,22 @@ class RobotOnBus:
         self._watch = Watch(client, time.monotonic())
 
     def gyro(self, key: str) -> None:
-        """Record turn rates from a key. Raises `GuideError` if none arrive."""
+        """Record the turn rates on `key` in each leg. Raises `GuideError` if none arrive."""
         sensor = Sensor(self._client.session, self._full(key), (Imu,))
         sensor.await_first("a gyro's turn rate")
         self._sensors.append((sensor, "gyro"))
 
     def positions(self, key: str, session: zenoh.Session | None) -> None:
-        """Record positions from a key, by `session` if it is given.
+        """Record the positions on `key` in each leg. Raises `GuideError` if none arrive.
 
-        Raises `GuideError` if none arrive.
+        `session` receives them; None means the session that also commands the robot.
         """
         sensor = Sensor(session or self._client.session, self._full(key), POSITIONS)
         sensor.await_first("a position (PoseStamped or Odometry)")
         self._sensors.append((sensor, "place"))
 
     def ride(self, leg: Leg) -> Run:
-        """Drive a leg and return its recording. Raises `GuideError` if the leg is cut short."""
+        """Drive a leg and return its recording. Raises `GuideError` if the leg was halted."""
         recorder = Recorder(self._joints)
         self._drain()
         sender = self._client.sender
@@ -135,7 +139,7 @@ class RobotOnBus:
             for key in self._prompt.keys(LOOK_S):
                 driver.key(key, time.monotonic())
             now = time.monotonic()
-            self._hear(driver, recorder, now)
+            self._receive(driver, recorder, now)
             command = driver.step(now)
             period = OPENING_PERIOD_S if now - begun < OPENING_S else SEND_PERIOD_S
             if command != last or now - sent >= period:
@@ -146,23 +150,23 @@ class RobotOnBus:
                 shown = now
         self._prompt.progress(1.0)
 
-    def _hear(self, driver: LegDriver, recorder: Recorder, now: float) -> None:
+    def _receive(self, driver: LegDriver, recorder: Recorder, now: float) -> None:
         for state in self._watch.look(now):
             driver.state(state, now)
 
-        def turned(message: JointState, came: float) -> None:
+        def wheels(message: JointState, came: float) -> None:
             driver.wheels(recorder.wheels(message, came), came)
 
-        self._wheels.hear(turned, now)
+        self._wheels.receive(wheels, now)
         for sensor, name in self._sensors:
-            sensor.hear(getattr(recorder, name), now)
+            sensor.receive(getattr(recorder, name), now)
 
     def _drain(self) -> None:
         """Discard the messages that arrived before the leg."""
-        for sensor in (self._wheels, *(one for one, _ in self._sensors)):
-            sensor.hear(lambda message, now: None, 0.0)
+        for sensor in (self._wheels, *(sensor for sensor, _ in self._sensors)):
+            sensor.receive(lambda message, now: None, 0.0)
         self._watch.look(time.monotonic())
 
     def _full(self, key: str) -> str:
-        """Return a key of the table below this robot's id, and any other key as it is written."""
+        """Return the full key: a name that `acsard topics` lists gets this robot's id in front."""
         return self._client.key(key) if by_key(key) is not None else key

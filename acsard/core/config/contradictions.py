@@ -1,7 +1,8 @@
-"""The rules between the keys of a configuration: contradictions, and warnings about surprises.
+"""Finds contradictions between the keys of a configuration, and surprising effects.
 
-Each contradiction is a line with key, value and fix; each warning is a sentence. The rules about
-motion are in `motion_rules.py`, those about simulated faults in `named_faults.py`.
+A contradiction is a mistake: its line has the key, its value and the fix. A surprising effect gives
+a warning, which is a sentence. The rules about motion are in `motion_rules.py`, and those about
+simulated faults in `named_faults.py`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import ipaddress
 import math
 
 from acsard.core.config import motion_rules, named_faults
-from acsard.core.config.partial import Rule, told
+from acsard.core.config.partial import Rule, mistakes
 from acsard.core.config.settings import BusConfig, Config, McuConfig
 from acsard.core.config.validation import show
 from acsard.core.config.wire_time import (
@@ -23,12 +24,15 @@ from acsard.core.config.wire_time import (
 )
 from acsard.core.values import ROOT, WHEELS
 
-LEAST_BRIDGE = 2
-"""Control periods for which encoder counts must not wrap, so that one lost line does no harm."""
+LEAST_WRAP_PERIODS = 2
+"""Shortest time in which encoder counts may wrap, in control periods.
+
+With two periods, one lost feedback line does no harm.
+"""
 
 
 def warnings(config: Config) -> list[str]:
-    """Return the warnings about settings that are allowed but may surprise, one sentence each."""
+    """Return a sentence about each setting that is allowed but may surprise."""
     found = []
     count = config.mcu.line_bytes
     use = wire_use(config.rate_hz, config.mcu.baud_rate, count)
@@ -89,8 +93,8 @@ def _count_warnings(config: Config) -> list[str]:
 
 
 def contradictions(config: Config) -> list[str]:
-    """Return the contradictions, one line each."""
-    return told(RULES, config)
+    """Return the contradictions in a configuration, one line each."""
+    return mistakes(RULES, config)
 
 
 def _wire_problems(config: Config) -> list[str]:
@@ -110,28 +114,28 @@ def _wire_problems(config: Config) -> list[str]:
 
 
 def _shorter_lines(mcu: McuConfig, rate: float) -> str:
-    """Return the fix that shortens the lines, if it makes them fit, else ""."""
-    ways = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
-    for check, way in ways:
+    """Return the end of a message with a setting that makes the lines short enough, or ""."""
+    fixes = ((True, "mcu.encoder_counts = 0"), (False, 'mcu.link_check = "off"'))
+    for check, fix in fixes:
         count = line_bytes(mcu.trailing_comma, check)
         if count < mcu.line_bytes and wire_use(rate, mcu.baud_rate, count) <= 1.0:
-            return f", or {way} (lines of {count} B)"
+            return f", or {fix} (lines of {count} B)"
     return ""
 
 
 def _count_problems(config: Config) -> list[str]:
-    """Find counts that wrap too soon.
+    """Find encoder counts that wrap too soon.
 
-    The difference of two counts could then be read as a motion in the other direction.
+    The difference of two counts would then look like a motion in the other direction.
     """
     counts, fastest = config.mcu.encoder_counts, config.feedback.wheel_speed / math.tau
-    lasts = LEAST_BRIDGE / config.rate_hz
+    lasts = LEAST_WRAP_PERIODS / config.rate_hz
     if fastest * counts * lasts <= FIELD / 2:
         return []
     return [
         f"mcu.encoder_counts = {counts}: at feedback.wheel_speed = "
         f"{config.feedback.wheel_speed:g} rad/s the counts could wrap in "
-        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, but they must last {LEAST_BRIDGE} "
+        f"{FIELD / 2 / fastest / counts * 1000:.0f} ms, but they must last {LEAST_WRAP_PERIODS} "
         f"control periods ({lasts * 1000:.0f} ms); write "
         f"{int(FIELD / 2 / fastest / lasts)} at most (count fewer edges), a "
         "lower feedback.wheel_speed, or 0"
@@ -195,7 +199,7 @@ def _source_problems(config: Config) -> list[str]:
     return found
 
 
-def _way_problems(config: Config) -> list[str]:
+def _reachability_problems(config: Config) -> list[str]:
     """Find a configuration in which no client, or no client over TLS, could reach the daemon."""
     bus, found = config.bus, []
     if bus.mode == "client" and not bus.connect:
@@ -258,15 +262,17 @@ def _ros_problems(config: Config) -> list[str]:
 
 
 def _endpoints(bus: BusConfig) -> dict[str, tuple[str, ...]]:
-    """Return the endpoints that are used, by key. A Zenoh client does not listen."""
+    """Return the endpoints of `bus.listen` and `bus.connect`. A Zenoh client does not listen."""
     listen = {"listen": bus.listen} if bus.mode == "peer" else {}
     return listen | {"connect": bus.connect}
 
 
 def _host(endpoint: str) -> str | None:
+    """Return the host of an endpoint such as "tcp/127.0.0.1:7448", or None if it is not valid."""
     scheme, _, address = endpoint.partition("/")
     if set(endpoint) & set("#?;= \t"):
-        # Zenoh's own endpoint options could switch off the protection that these rules ensure.
+        # An endpoint can carry options for Zenoh. They could switch off the protection of these
+        # rules.
         return None
     host, _, port = address.rpartition(":")
     good = (
@@ -298,11 +304,11 @@ RULES: tuple[Rule, ...] = (
     _gyro_problems,
     *motion_rules.RULES,
     _source_problems,
-    _way_problems,
+    _reachability_problems,
     lambda config: _endpoint_problems(config, "listen"),
     lambda config: _endpoint_problems(config, "connect"),
     _access_problems,
     _ros_problems,
     *named_faults.RULES,
 )
-"""The rules, one function each. A rule that reads a key without a valid value is skipped."""
+"""The rules. Each is a function of its own, because a rule that reads an invalid key is skipped."""

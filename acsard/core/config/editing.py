@@ -1,6 +1,6 @@
-"""Changes values in the text of an `acsard.toml` and keeps its comments, order and line ends.
+"""Changes values in the text of an `acsard.toml`, and keeps its comments, order and line ends.
 
-Needs the library tomlkit (extras `tls` and `write`).
+This module needs the library tomlkit (extras `tls` and `write`).
 """
 
 from __future__ import annotations
@@ -13,10 +13,15 @@ from acsard.core.config.validation import write
 
 
 def edited(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text with dotted keys set to new values.
+    """Return the text with new values for some settings.
 
-    Raises `ConfigError` if the old or the new text is not a valid configuration, and `ValueError`
-    if the text is written in a way that cannot be changed safely.
+    Args:
+        text: the text of the file.
+        keys: the new values by dotted key.
+
+    Raises:
+        ConfigError: the old or the new text is not a valid configuration.
+        ValueError: the form of the text does not allow a safe change.
     """
     from tomlkit.exceptions import TOMLKitError
 
@@ -37,7 +42,7 @@ def edited(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _changed(text: str, keys: Mapping[str, object]) -> str:
-    """Return the text with new values, and with the line ends of the original text."""
+    """Return the text with new values, in the same form and with the same line ends."""
     import tomlkit
 
     crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
@@ -56,10 +61,13 @@ def _changed(text: str, keys: Mapping[str, object]) -> str:
 
 
 def _dotted(text: str, keys: Mapping[str, object]) -> tuple[str, dict[str, object]]:
-    """Insert new keys of tables that are written as top-level dotted keys (`mcu.port = ...`).
+    """Insert new keys into tables that the text writes as dotted keys, such as `mcu.port = ...`.
 
-    The new keys get the same form, because tomlkit would open a table in the middle of the dotted
-    keys. Returns the text and the keys that are still to be set.
+    The inserted keys are dotted keys as well, because tomlkit would open a table in the middle of
+    the dotted keys.
+
+    Returns:
+        The text, and the settings that are still to be changed.
     """
     import tomlkit
 

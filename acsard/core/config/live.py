@@ -1,9 +1,8 @@
-"""The settings that may change while the daemon runs, and the check of such a change.
+"""Changes settings while the daemon runs: the table of these settings, and the check of a change.
 
-The module holds the table of these settings and when each may change. A change must satisfy the
-same rules as the file, and is applied completely or not at all. Each part of the robot decides in
-its own `use` how a change affects it. All other settings shape the wire, the bus or the base, and
-take effect only at the next start.
+A change must satisfy the same rules as the file, and is applied completely or not at all. Each part
+of the robot has a method `use`, which decides how a change affects it. All settings that are not in
+the table take effect only at the next start of the daemon.
 """
 
 from __future__ import annotations
@@ -29,17 +28,19 @@ WHEN: dict[When, str] = {
 }
 """When a setting may change, in words.
 
-With a lower deceleration, a robot that still drives faster than its new limits allow could not stop
-in time. The limit of the wheels cuts a speed off at once. New timeouts forget the present
-commander.
+- Some settings may only be lowered while the robot stands, because a driving robot could not stop
+  in time with a lower deceleration.
+- Some may change only while the robot stands: a lower `limits.wheel_speed` would cut the speed at
+  once, and new timeouts make the robot forget the program that commands it.
 """
 
 
 class Live(Struct, frozen=True):
-    """A setting that may change: when, and its description."""
+    """A setting that may change while the daemon runs."""
 
     when: When
     what: str
+    """Description of the setting."""
 
 
 LIVE: dict[str, Live] = {
@@ -80,15 +81,16 @@ LIVE: dict[str, Live] = {
     "rates.diagnostics": Live("always", "how often diagnostics are published"),
     "log.level": Live("always", "lowest level that is logged"),
 }
-"""The settings by dotted key as in `acsard.toml`. A source is named in place of its index, and
-"*" stands for every source.
+"""The settings by their dotted keys as in `acsard.toml`.
+
+The name of a source stands in place of its index, and "*" stands for every source.
 """
 
 SECTIONS: dict[str, type[Struct]] = {field.name: field.type for field in fields(Config)}
 
 
 def live(key: str) -> Live | None:
-    """Return the row of a key, or None if the key takes effect only at a start."""
+    """Return the row of a setting, or None if it takes effect only at the next start."""
     parts = key.split(".")
     if parts[:2] == ["commands", "sources"] and len(parts) == 4:
         parts[2] = "*"
@@ -96,7 +98,10 @@ def live(key: str) -> Live | None:
 
 
 def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield every leaf with its dotted name; a table in a list is named by its own name."""
+    """Yield each value of nested tables with its dotted name.
+
+    A table in a list, such as a source, gets the value of its key `name` in place of its index.
+    """
     if isinstance(value, Mapping):
         for key, inner in value.items():
             yield from flat(inner, f"{name}.{key}" if name else str(key))
@@ -109,24 +114,32 @@ def flat(value: object, name: str = "") -> Iterator[tuple[str, object]]:
 
 
 def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tuple[Config, str]:
-    """Return the configuration with these settings, and a description of the changes ("" if none).
+    """Return the configuration with these settings, and a description of the changes.
 
-    Raises `ConfigError` with every problem; then nothing changes. A setting that already has the
-    wished value is not a change, even if it cannot be set. `at_rest` says that the robot stands.
+    A setting that already has the wanted value is not a change, and is not refused either. The
+    description is "" if nothing changes.
+
+    Args:
+        config: the present configuration.
+        wishes: the wanted values by dotted key.
+        at_rest: whether the robot stands.
+
+    Raises:
+        ConfigError: the change is refused as a whole; the error has every reason.
     """
     tables: dict[str, Any] = effective(config)
     before = dict(flat(tables))
-    news = {key: value for key, value in wishes.items() if not _same(before.get(key), value)}
-    fixed = [key for key in news if live(key) is None or key not in before]
+    new = {key: value for key, value in wishes.items() if not _same(before.get(key), value)}
+    fixed = [key for key in new if live(key) is None or key not in before]
     if fixed:
         more = [f"and {len(fixed) - 1} more that cannot be set"] if len(fixed) > 1 else []
-        raise ConfigError([_refusal(fixed[0], news[fixed[0]], before), *more])
+        raise ConfigError([_refusal(fixed[0], new[fixed[0]], before), *more])
     problems: list[str] = []
     # The rules between tables need a list of tables here, not a tuple of structs.
     tables["commands"]["sources"] = list(tables["commands"]["sources"])
-    for key, value in news.items():
+    for key, value in new.items():
         _put(tables, key.split("."), value)
-    sections = {key.partition(".")[0] for key in news}
+    sections = {key.partition(".")[0] for key in new}
     built = {name: build(SECTIONS[name], tables[name], name, problems) for name in sections}
     if problems:
         raise ConfigError(problems)
@@ -134,11 +147,10 @@ def changed(config: Config, wishes: Mapping[str, object], at_rest: bool) -> tupl
     after = dict(flat(effective(made)))
     problems = contradictions(made)
     if not at_rest:
-        problems += [line for key in news if (line := _must_stand(key, before[key], after[key]))]
+        problems += [line for key in new if (line := _must_stand(key, before[key], after[key]))]
     if problems:
         raise ConfigError(problems)
-    told = [f"{key} = {show(after[key])} (was {show(before[key])})" for key in news]
-    return made, ", ".join(told)
+    return made, ", ".join(f"{key} = {show(after[key])} (was {show(before[key])})" for key in new)
 
 
 def _same(before: object, value: object) -> bool:
@@ -167,7 +179,7 @@ def _put(tables: dict[str, Any], path: list[str], value: object) -> None:
 
 
 def _must_stand(key: str, before: object, after: object) -> str:
-    """Return why this change must wait until the robot stands; "" if it may happen now."""
+    """Return the reason why this change must wait until the robot stands, or "" if it need not."""
     row = live(key)
     if row is None or row.when == "always":
         return ""

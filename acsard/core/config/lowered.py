@@ -1,8 +1,8 @@
-"""Limits that `set` made lower than in the configuration file, which stay so after a restart.
+"""Keeps limits that `acsard set` lowered below their values in the file, also over a restart.
 
-A limit counts as lowered while its value is below the one in the file, until `set` raises it again.
-Decelerations are not kept: with a lower one the robot brakes more softly, which is not safer. A
-jerk of 0 means "no limit", so it counts as the highest value.
+A limit is lowered while its value is below that of the file. Decelerations are not kept, because a
+robot with a lower deceleration brakes more softly, which is not safer. A jerk of 0 means "no
+limit", so it counts as the highest value.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ TABLE = "limits."
 
 
 def stays(key: str) -> bool:
-    """Return whether the setting with this dotted key survives a restart if it was lowered."""
+    """Return whether a lower value of the setting with this dotted key is kept over a restart."""
     return key.startswith(TABLE) and not key.endswith("_deceleration")
 
 
 def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
-    """Return the value of each limit but the decelerations that is now below that of the file."""
+    """Return the present values of the lowered limits, by dotted key."""
     return {
         TABLE + name: getattr(now, name)
         for name in file.__struct_fields__
@@ -34,10 +34,11 @@ def lowered(file: LimitsConfig, now: LimitsConfig) -> dict[str, float]:
 
 
 def with_lowered(config: Config, kept: Mapping[str, float]) -> tuple[Config, list[Event]]:
-    """Return the configuration with each kept limit that is below its own, and events for the log.
+    """Return the configuration with the limits that were lowered before the restart, and events.
 
-    A kept limit may contradict the rest, for example after an upgrade. Then each of them is tried
-    alone, and an event names those that were dropped.
+    A limit is applied only if it is below that of `config`. If the limits contradict the
+    configuration, because the file has changed, each of them is applied alone. An event names a
+    limit that is dropped.
     """
     limits = config.limits
     wishes: dict[str, object] = {
@@ -71,5 +72,5 @@ def _applied(config: Config, wishes: Mapping[str, object]) -> tuple[Config, list
 
 
 def _rank(name: str, value: float) -> float:
-    """Return a number that grows with what the limit allows."""
+    """Return a number that is larger for a limit that allows more."""
     return math.inf if name.endswith("_jerk") and value == 0.0 else value

@@ -1,6 +1,7 @@
-"""The rules about motion: the robot must stop soon enough, and ordinary motion must not be a fault.
+"""Finds contradictions between settings of motion.
 
-Each contradiction is a line with key, value and fix. The other rules are in `contradictions.py`.
+The robot must stop soon enough, and motion that the limits allow must not count as a fault. The
+other rules are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -9,49 +10,52 @@ import math
 
 from msgspec import Struct
 
-from acsard.core.config.partial import Rule, told
+from acsard.core.config.partial import Rule, mistakes
 from acsard.core.config.settings import Config
 
 LEAST_JERK = 0.01
-"""Smallest jerk limit, m/s3 or rad/s3. With less, walking pace takes over ten seconds."""
+"""Smallest jerk limit, m/s3 or rad/s3. Below it, walking pace takes over ten seconds to reach."""
 
 LONGEST_STOP_S = 2.0
-"""Longest time from full speed to rest by a stop, s: the longest that a person who stops the
-robot should wait.
-"""
+"""Longest time from full speed to rest after a stop, s, for which a person should have to wait."""
 
 LONGEST_RAMP_S = 5.0
-"""Longest time from full speed to rest when commands end, s, because nobody steers any more."""
+"""Longest time from full speed to rest after commands have ended, s. Nobody steers meanwhile."""
 
 HEADROOM = 1.1
 """Factor by which a healthy wheel may exceed its commanded speed for a moment."""
 
 MOST_WHEEL_SPEED = 99.99
-"""Highest wheel speed that a line can express, rad/s."""
+"""Highest wheel speed that a serial line can express, rad/s."""
 
 LONGEST_REPLY_S = 0.25
-"""Longest time between two feedback lines, s. With two lines lost, the next one still arrives
-within one second, after which the board would count as restarted.
+"""Longest time between two feedback lines, s.
+
+A board that is silent for one second counts as restarted. With this period, the next line still
+comes in time if two lines are lost.
 """
 
 LINES_OF_EVIDENCE = 2
-"""Number of feedback lines on which a fault must rest, so that one lost line is not a fault."""
+"""Number of feedback lines that must show a wheel fault, so that one line is not enough."""
 
 
 class _Reach(Struct, frozen=True):
-    """The highest speeds that the limits allow: m/s, rad/s, and rad/s of any wheel."""
+    """The highest speeds that the limits allow."""
 
     linear: float
+    """Linear speed, m/s."""
     angular: float
+    """Turn rate, rad/s."""
     wheel: float
+    """Speed of any wheel, rad/s."""
 
 
 def _reach(config: Config) -> _Reach:
     drive, limits = config.drive, config.limits
     sides = (drive.left_wheel_radius_multiplier, drive.right_wheel_radius_multiplier)
     half_track = drive.wheel_separation * drive.wheel_separation_multiplier / 2
-    # If the wheels of one side are larger, the fastest turn also moves the robot forward, because
-    # each side runs at its own rim speed. The mean of the two rim speeds bounds either axis.
+    # Both sides may turn at the same largest wheel speed. If the wheels of one side are larger, the
+    # speeds of the two rims differ. Their mean bounds the linear speed and the speed of a turn.
     rim = limits.wheel_speed * drive.wheel_radius * sum(sides) / 2
     fastest_rim = limits.linear_speed + limits.angular_speed * half_track
     wished = fastest_rim / (drive.wheel_radius * min(sides))
@@ -93,7 +97,7 @@ def _jerk_problems(config: Config, name: str) -> list[str]:
 
 
 def _feedback_problems(config: Config, asked: float) -> list[str]:
-    """Find a feedback limit that would drop lines or latch faults in allowed motion."""
+    """Find a feedback limit that the feedback of allowed commands would exceed."""
     most = config.feedback.wheel_speed
     needed = min(_rounded_up(HEADROOM * asked), MOST_WHEEL_SPEED)
     if most >= needed:
@@ -106,28 +110,31 @@ def _feedback_problems(config: Config, asked: float) -> list[str]:
 
 
 def _reply_problems(config: Config) -> list[str]:
-    """Find a reply period so long that one lost line would be a fault or look like a restart."""
+    """Find a period of feedback lines with which one lost line would look like a fault."""
     period, fault_s = config.mcu.reply_period, config.feedback.fault_time
     most = longest_reply(fault_s)
     if period <= most:
         return []
-    way = ""
+    fix = ""
     if period <= LONGEST_REPLY_S:
-        way = f", or feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
+        fix = f", or feedback.fault_time = {_rounded_up(period * LINES_OF_EVIDENCE):g}"
     return [
         f"mcu.reply_period = {period:g}: one lost line would look like a wheel fault or like a "
-        f"restart of the board; write {most:g} at most (the firmware must report more often){way}"
+        f"restart of the board; write {most:g} at most (the firmware must report more often){fix}"
     ]
 
 
 def longest_reply(fault_s: float) -> float:
-    """Return the longest allowed `mcu.reply_period`, s, for this `feedback.fault_time` (0: off)."""
+    """Return the longest allowed `mcu.reply_period`, s.
+
+    `fault_s` is `feedback.fault_time`, s; 0 means that wheel faults are not watched.
+    """
     share = math.floor(round(fault_s / LINES_OF_EVIDENCE * 1000, 6)) / 1000
     return min(LONGEST_REPLY_S, share) if fault_s else LONGEST_REPLY_S
 
 
 def _rounded_up(value: float) -> float:
-    """Round up to three decimals, so that an advised value is sufficient."""
+    """Return a value rounded up to three decimals, so that the value in a message is sufficient."""
     return math.ceil(round(value * 1000, 6)) / 1000
 
 
@@ -143,4 +150,4 @@ RULES: tuple[Rule, ...] = (
 
 def problems(config: Config) -> list[str]:
     """Return the contradictions, one line each."""
-    return told(RULES, config)
+    return mistakes(RULES, config)

@@ -1,7 +1,7 @@
-"""The names of the simulator's faults: `mute`, `stuck_encoder=b`, `stalls=5:0.15`.
+"""Reads the names of the simulator's faults, such as `mute`, `stuck_encoder=b` or `stalls=5:0.15`.
 
-The module holds the table of the names, reads a name with its arguments, and finds mistakes in
-`[sim] faults`. The faults themselves are methods of the same names in `core/simulator/faults.py`.
+The module has the table of the names and finds mistakes in `[sim] faults`. The faults themselves
+are methods of the same names in `core/simulator/faults.py`.
 """
 
 from __future__ import annotations
@@ -34,33 +34,37 @@ ARGUMENTS = {
 """Faults with arguments: `m` stands for a motor, 0 to 3 for a to d, and `n` for a number."""
 
 RESET = "reset"
-"""Fault that restarts the simulated board again and again after this many seconds. It needs a
-timer, so only `acsard sim --fault` has it.
+"""Fault that restarts the simulated board again and again, with a number of seconds in between.
+
+It needs a timer, so only `acsard sim --fault` has it.
 """
 
 MOTORS = "abcd"
 
 MOST = 1e6
-"""Largest absolute value of a number. Beyond it sums overflow, and no robot has such values."""
+"""Largest absolute value of a number in an argument, so that sums do not overflow."""
 
 SHORTEST_S = 0.001
 """Shortest stall, s. A shorter one has no visible effect."""
 
 
 class NamedFault(Struct, frozen=True):
-    """A fault with its arguments; motors are 0 to 3."""
+    """A fault with its arguments. A motor is a number from 0 to 3."""
 
     name: str
     values: tuple[int | float, ...] = ()
 
 
 def forms() -> list[str]:
-    """Return the faults with arguments, as they are written."""
+    """Return the faults with arguments as a user writes them, such as "stuck_encoder=MOTOR"."""
     return [_form(name, kinds) for name, kinds in ARGUMENTS.items()]
 
 
 def named(text: str) -> NamedFault:
-    """Parse a fault; raise `ValueError` with a description that does not repeat the text."""
+    """Parse a fault such as "stalls=5:0.15".
+
+    Raises `ValueError` with the mistake and the fix. The caller names the text.
+    """
     name, _, given = text.partition("=")
     known = {RESET: "n", **dict.fromkeys(FAULTS, ""), **ARGUMENTS}
     if name not in known:
@@ -86,7 +90,7 @@ def named(text: str) -> NamedFault:
 
 
 def warnings(config: Config) -> list[str]:
-    """Warn that the simulator has faults, so that nobody searches for them in the robot."""
+    """Return a warning if the simulator has faults, which look like faults of the robot."""
     faults = config.sim.faults
     if not faults or not config.mcu.simulated:
         return []

@@ -1,4 +1,4 @@
-"""Suggests the known word that an unknown word probably stands for."""
+"""Suggests the known word that a user probably meant."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 80
-"""Largest number of characters compared; a stranger's word may be longer."""
+"""Number of characters that are compared. It bounds the time for a very long word."""
 
 
 def nearest(word: str, known: Iterable[str]) -> list[str]:
-    """Return the most similar known word, or an empty list."""
+    """Return a list with the most similar known word, or an empty list if no word is similar."""
     return difflib.get_close_matches(word[:LONGEST], list(known), n=1, cutoff=0.6)
 
 

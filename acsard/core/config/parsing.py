@@ -1,7 +1,6 @@
-"""Decodes `acsard.toml` to one frozen `Config`, or to an error that names every key and its fix.
+"""Decodes the text of `acsard.toml` to a `Config`, or to an error with every mistake and its fix.
 
-The keys are in `settings.py` and the rules between them in `contradictions.py`. The command line
-reads the file; this module only decodes it.
+The keys are in `settings.py`, and the rules between them in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -11,17 +10,17 @@ import tomllib
 from msgspec import convert, to_builtins
 
 from acsard.core.config.contradictions import contradictions
-from acsard.core.config.partial import without
+from acsard.core.config.partial import view_without
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import build_partly
 from acsard.core.values import AcsardError
 
 MAX_BYTES = 65536
-"""Largest size of a configuration. The reference file has a tenth of this."""
+"""Largest size of a configuration in bytes. The reference file has about a quarter of it."""
 
 
 class ConfigError(AcsardError):
-    """A configuration that cannot be used; `problems` has one line per mistake."""
+    """The configuration cannot be used. `problems` has a line with each mistake and its fix."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("\n".join(problems))
@@ -29,10 +28,9 @@ class ConfigError(AcsardError):
 
 
 def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) -> Config:
-    """Decode a configuration file.
+    """Return the configuration in the bytes of a file. Raises `ConfigError` with every mistake.
 
-    Raises `ConfigError` with every problem found. `overrides` are values from the command line, by
-    table and key; they win over the file.
+    `overrides` are values from the command line, by table and key. They replace those of the file.
     """
     if len(text) > MAX_BYTES:
         raise ConfigError(
@@ -56,25 +54,25 @@ def parse(text: bytes, overrides: dict[str, dict[str, object]] | None = None) ->
         if isinstance(inner, dict):
             inner.update(values)
     problems: list[str] = []
-    spoilt: set[str] = set()
+    invalid: set[str] = set()
     try:
-        config = build_partly(Config, table, "", problems, spoilt)
+        config = build_partly(Config, table, "", problems, invalid)
     except RecursionError:
         raise ConfigError(["lists or tables are nested too deep; no key needs that"]) from None
     if config is not None:
-        problems += contradictions(without(config, spoilt))
+        problems += contradictions(view_without(config, invalid))
     if config is None or problems:
         raise ConfigError(problems)
     return config
 
 
 def from_builtins(data: object) -> Config:
-    """Convert the result of `effective` back to a `Config`."""
+    """Return the `Config` that `effective` converted to tables."""
     return convert(data, Config)
 
 
 def effective(config: Config) -> dict[str, object]:
-    """Return the configuration in force as plain tables, with defaults filled in."""
+    """Return a configuration as plain tables, with a value for every key."""
     plain = to_builtins(config)
     assert isinstance(plain, dict)
     return plain

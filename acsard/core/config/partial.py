@@ -1,7 +1,7 @@
-"""A view of a configuration in which some keys have no valid value.
+"""Runs the rules on a configuration in which some keys have no valid value.
 
 A rule that reads such a key is skipped, because its result would be meaningless. All other rules
-still run.
+run, so that a user sees every mistake at once.
 """
 
 from __future__ import annotations
@@ -16,31 +16,34 @@ Rule = Callable[[Config], Iterable[str]]
 """Function that returns the mistakes in a configuration, one line each."""
 
 
-class SpoiltError(AcsardError):
-    """Raised when a rule reads a key without a valid value."""
+class InvalidKeyError(AcsardError):
+    """A rule has read a key that has no valid value."""
 
 
-def without(config: Config, spoilt: Set[str]) -> Config:
-    """Return a view of the configuration that raises `SpoiltError` for these dotted keys."""
-    return cast(Config, _View(config, "", spoilt)) if spoilt else config
+def view_without(config: Config, invalid: Set[str]) -> Config:
+    """Return a view of the configuration that raises `InvalidKeyError` for some keys.
+
+    `invalid` has the dotted names of these keys.
+    """
+    return cast(Config, _View(config, "", invalid)) if invalid else config
 
 
-def told(rules: Iterable[Rule], config: Config) -> list[str]:
-    """Return the results of all rules that read only valid keys."""
+def mistakes(rules: Iterable[Rule], config: Config) -> list[str]:
+    """Return the mistakes that the rules find. A rule that reads an invalid key is skipped."""
     found: list[str] = []
     for rule in rules:
         try:
             found += rule(config)
-        except SpoiltError:
+        except InvalidKeyError:
             continue
     return found
 
 
 class _View:
-    """View of one table."""
+    """A view of one table, whose dotted name with a dot behind it is `path`."""
 
-    def __init__(self, table: object, path: str, spoilt: Set[str]) -> None:
-        self._table, self._path, self._spoilt = table, path, spoilt
+    def __init__(self, table: object, path: str, invalid: Set[str]) -> None:
+        self._table, self._path, self._invalid = table, path, invalid
 
     def __getattr__(self, name: str) -> Any:
         static = getattr(type(self._table), name, None)
@@ -48,9 +51,9 @@ class _View:
             # Run the property on the view, so that the keys that it reads are checked as well.
             return static.fget(self)
         where = f"{self._path}{name}"
-        if where in self._spoilt:
-            raise SpoiltError(where)
+        if where in self._invalid:
+            raise InvalidKeyError(where)
         value = getattr(self._table, name)
         inner = f"{where}."
-        below = any(one.startswith(inner) for one in self._spoilt)
-        return _View(value, inner, self._spoilt) if below else value
+        below = any(key.startswith(inner) for key in self._invalid)
+        return _View(value, inner, self._invalid) if below else value

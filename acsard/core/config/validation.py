@@ -1,7 +1,6 @@
-"""Decodes a TOML table to a frozen struct, or finds every problem, each with key, value and fix.
+"""Decodes a TOML table to a frozen struct, or to a list of mistakes with key, value and fix.
 
-The module knows msgspec types and nothing about robots. The rules between keys are in
-`contradictions.py`.
+The module knows only the types of the struct. The rules between keys are in `contradictions.py`.
 """
 
 from __future__ import annotations
@@ -23,9 +22,13 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,80}")
 
 
 def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | None:
-    """Decode `table` into `cls`; append a line per problem to `problems` and return None then.
+    """Return `table` as a struct, or None if it has a mistake.
 
-    `path` is the dotted name of the table, "" at the root.
+    Args:
+        cls: the struct.
+        table: the TOML table.
+        path: the dotted name of the table, "" for the whole document.
+        problems: the list that gets a line for each mistake.
     """
     before = len(problems)
     made = build_partly(cls, table, path, problems, set())
@@ -33,12 +36,12 @@ def build(cls: type[T], table: object, path: str, problems: list[str]) -> T | No
 
 
 def build_partly(
-    cls: type[T], table: object, path: str, problems: list[str], spoilt: set[str]
+    cls: type[T], table: object, path: str, problems: list[str], invalid: set[str]
 ) -> T | None:
-    """Decode `table` as `build` does, with defaults in place of invalid values.
+    """Return `table` as a struct, with the default in place of each invalid value.
 
-    The dotted key of each invalid value is added to `spoilt`. Returns None if a required key lacks
-    a valid value.
+    Returns None if a required key has no valid value. `invalid` gets the dotted key of each invalid
+    value. The other arguments are those of `build`.
     """
     if not isinstance(table, Mapping):
         header = f"[[{path.partition('[')[0]}]]" if path.endswith("]") else f"[{path}]"
@@ -50,36 +53,38 @@ def build_partly(
         if key not in known:
             near = nearest(key, known)
             problems.append(_unknown(key, table[key], path, near, list(known)))
-            # The similar key may be the one that the user meant, so its value is not known.
-            spoilt |= {prefix + name for name in near}
+            # The user may have meant the similar key, so the value of that key is unknown.
+            invalid |= {prefix + name for name in near}
     values: dict[str, Any] = {}
     for name, field in known.items():
         where = prefix + name
         if name in table:
-            value = _value(field, table[name], where, problems, spoilt)
+            value = _value(field, table[name], where, problems, invalid)
             if value is not None:
                 values[field.name] = value
             elif field.required:
                 complete = False
             else:
-                spoilt.add(where)
+                invalid.add(where)
         elif field.required:
             problems.append(f"{where}: missing; write {name} = {_example(field)}")
             complete = False
     return cls(**values) if complete else None
 
 
-def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoilt: set[str]) -> Any:
+def _value(
+    field: FieldInfo, raw: object, where: str, problems: list[str], invalid: set[str]
+) -> Any:
     """Return the value, or None if it is not valid."""
     if isinstance(field.type, type) and issubclass(field.type, msgspec.Struct):
-        return build_partly(field.type, raw, where, problems, spoilt)
+        return build_partly(field.type, raw, where, problems, invalid)
     kind = inspect.type_info(field.type)
     if isinstance(kind, inspect.VarTupleType) and isinstance(kind.item_type, inspect.StructType):
         if not isinstance(raw, list):
             problems.append(f"{where} = {show(raw)}: expected tables; write them as [[{where}]]")
             return None
         item = kind.item_type.cls
-        made = [build(item, one, f"{where}[{i}]", problems) for i, one in enumerate(raw)]
+        made = [build(item, table, f"{where}[{i}]", problems) for i, table in enumerate(raw)]
         return None if None in made else tuple(made)
     if not _finite(raw):
         value = None
@@ -89,14 +94,14 @@ def _value(field: FieldInfo, raw: object, where: str, problems: list[str], spoil
         except msgspec.ValidationError:
             value = None
     if value is None:
-        problems.append(f"{where} = {show(raw)}: expected {expected(kind)}; {_mend(field, where)}")
+        problems.append(f"{where} = {show(raw)}: expected {expected(kind)}; {_fix(field, where)}")
     return value
 
 
 def _finite(raw: object) -> bool:
-    """Return whether all numbers are finite.
+    """Return whether all numbers in a value are finite.
 
-    TOML has inf and nan, and msgspec's bounds admit inf.
+    TOML allows inf and nan, and msgspec does not refuse them.
     """
     if isinstance(raw, list):
         return all(_finite(item) for item in raw)
@@ -111,7 +116,7 @@ def _unknown(key: str, value: object, path: str, near: list[str], known: list[st
 
 
 def expected(kind: inspect.Type) -> str:
-    """Describe the valid values of a type, with range and unit."""
+    """Return a description of the valid values of a type, with range and unit."""
     unit = ""
     if isinstance(kind, inspect.Metadata):
         unit = str((kind.extra or {}).get("unit", ""))
@@ -128,7 +133,7 @@ def expected(kind: inspect.Type) -> str:
         case inspect.LiteralType(values=values):
             return "one of " + ", ".join(show(value) for value in values)
         case inspect.UnionType(types=types):
-            return " or ".join(expected(one) for one in types)
+            return " or ".join(expected(type_) for type_ in types)
         case inspect.TupleType(item_types=items):
             return f"a list of {len(items)}, each {expected(items[0])}"
         case inspect.VarTupleType(item_type=item):
@@ -137,7 +142,7 @@ def expected(kind: inspect.Type) -> str:
             return "another kind of value"
 
 
-def _mend(field: FieldInfo, where: str) -> str:
+def _fix(field: FieldInfo, where: str) -> str:
     if field.required:
         return f"for example {_example(field)}"
     return f"the default is {where.rpartition('.')[2]} = {show(field.default)}"
@@ -150,13 +155,13 @@ def _example(field: FieldInfo) -> str:
 
 
 def show(value: object) -> str:
-    """Format a value as TOML, cut to one short line."""
+    """Return a value as TOML, cut to 80 characters."""
     text = write(value)
     return text if len(text) <= 80 else text[:77] + "..."
 
 
 def write(value: object) -> str:
-    """Format a value as TOML."""
+    """Return a value as TOML."""
     match value:
         case bool():
             return "true" if value else "false"

@@ -1,8 +1,4 @@
-"""Computes how long lines take on the serial wire at a baud rate, and how many fit.
-
-The functions compute with bytes, baud and ns only. They know neither the settings nor the words of
-the protocol.
-"""
+"""Computes the time that lines take on the serial wire, and the number of lines that fit."""
 
 from __future__ import annotations
 
@@ -15,20 +11,22 @@ PLAIN_BYTES = 33
 """Length of `ap12.50,bn08.75,cp15.00,dn10.25` with CR LF. A trailing comma adds one byte."""
 
 CHECK_BYTES = 8
-"""Length of `#07*585F`: sequence number and check, in both directions."""
+"""Length of `#07*585F`: the sequence number and the checksum, in either direction."""
 
 SAMPLE_BYTES = 21
-"""Length of `@` and the five sample fields of a reply. A command asks for them by one more
-letter.
+"""Length of `@` and the five sample fields of a reply.
+
+A command asks for the fields with one more letter.
 """
 
 FIELD = 65536
-"""Modulus of the milliseconds and counts in the sample fields: four hexadecimal digits."""
+"""Number of values of a sample field, which has four hexadecimal digits. Then it wraps to 0."""
 
 COMFORTABLE_USE = 0.8
-"""Share of the wire above which a line that is a little late already meets the next one. The
-rest also leaves room for replies with a space after each comma (36 bytes on their own wire, 9 %
-more).
+"""Largest comfortable use of the wire.
+
+Above it, a line that is a little late delays the next one. The remaining time also leaves room for
+boards that send a space after each comma, which makes a reply 9 % longer (36 bytes).
 """
 
 
@@ -38,19 +36,25 @@ def wire_ns(count: int, baud_rate: int) -> int:
 
 
 def line_bytes(trailing_comma: bool, check: bool = False, sample: bool = False) -> int:
-    """Return the length of the longest line of either direction; each direction has its own wire.
+    """Return the length of the longest line in bytes. Each direction has its own wire.
 
-    A plain reply is as long as its command; a sampled one is longer.
+    Args:
+        trailing_comma: whether commands end with a comma.
+        check: whether lines have a sequence number and a checksum.
+        sample: whether replies have sample fields.
     """
     checked = PLAIN_BYTES + (CHECK_BYTES if check else 0)
     return max(checked + trailing_comma + sample, checked + (SAMPLE_BYTES if sample else 0))
 
 
 def wire_use(rate_hz: float, baud_rate: int, count: int) -> float:
-    """Return the share of the wire that `count` bytes per period take; above 1 they do not fit."""
+    """Return the use of the wire by `rate_hz` lines per second of `count` bytes each.
+
+    Above 1 the lines do not fit.
+    """
     return count * BITS_PER_BYTE * rate_hz / baud_rate
 
 
 def highest_rate(baud_rate: int, count: int, use: float = 1.0) -> int:
-    """Return how many lines of `count` bytes per second use at most the share `use` of the wire."""
+    """Return the number of lines of `count` bytes per second that use at most `use` of the wire."""
     return int(use * baud_rate / (count * BITS_PER_BYTE))

@@ -1,4 +1,4 @@
-"""Writes a configuration as the text of an `acsard.toml`."""
+"""Writes settings as the text of an `acsard.toml`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from acsard.core.config.validation import write
 
 
 def document(table: dict[str, object], path: str = "") -> list[str]:
-    """Return the lines of a TOML document: plain keys first, then tables, then lists of tables."""
+    """Return the lines of a TOML document: the plain keys first, then the tables.
+
+    `path` is the dotted name of the table, or "" for the whole document.
+    """
     lines: list[str] = []
     tables: list[str] = []
     for key, value in table.items():
@@ -16,15 +19,15 @@ def document(table: dict[str, object], path: str = "") -> list[str]:
         if isinstance(value, dict):
             tables += ["", f"[{where}]", *document(value, where)]
         elif isinstance(value, list | tuple) and value and isinstance(value[0], dict):
-            for one in value:
-                tables += ["", f"[[{where}]]", *document(one, where)]
+            for item in value:
+                tables += ["", f"[[{where}]]", *document(item, where)]
         else:
             lines.append(f"{key} = {write(value)}")
     return lines + tables
 
 
 def excerpt(keys: Mapping[str, object]) -> list[str]:
-    """Return dotted keys as lines of TOML, grouped by table."""
+    """Return settings by their dotted keys as lines of TOML, with a header for each table."""
     lines: list[str] = []
     table = ""
     for key, value in sorted(keys.items(), key=lambda item: item[0].count(".")):

@@ -8,6 +8,7 @@ daemon reads, a wildcard key, a DELETE, and a sender id that belongs to another 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Literal
 
 from msgspec import UNSET, Struct, UnsetType
@@ -272,6 +273,8 @@ class Voice(Struct, frozen=True):
     own."""
 
 
+# Each command needs the parts of its key twice, and few keys ever command.
+@lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
     """Split the key of a command into kind, source and certificate, "" for none."""
     kind, _, rest = key.partition("/")
@@ -333,8 +336,9 @@ def sender(arrival: Arrival) -> str:
 
 
 def _twist_payload(arrival: Arrival) -> _TwistPayload:
-    if detect(arrival.encoding, arrival.payload) != "cdr":
-        return _twists.decode(arrival.encoding, arrival.payload)
+    form = detect(arrival.encoding, arrival.payload)
+    if form != "cdr":
+        return _twists.decode_as(form, arrival.payload)
     named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
     # Without a type name the size decides. DDS pads to a multiple of four.
     plain, told = named in TWISTS, named in TWISTS + STAMPED_TWISTS

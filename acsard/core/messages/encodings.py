@@ -25,6 +25,7 @@ _MIME: dict[Format, str] = {
     "json": "application/json",
     "cdr": "application/cdr",
 }
+_FORM_OF: dict[str, Format] = {mime: form for form, mime in _MIME.items()} | {"text/json": "json"}
 _pack = msgspec.msgpack.Encoder()
 _text = msgspec.json.Encoder()
 
@@ -63,12 +64,9 @@ def _codec(cls: type[T]) -> Cdr[T]:
 
 def detect(encoding: str, payload: bytes) -> Format:
     """Return the encoding of the payload; raise `DecodeError` if it is unknown."""
-    mime = encoding.partition(";")[0]
-    for form in FORMATS:
-        if mime == _MIME[form]:
-            return form
-    if mime == "text/json":
-        return "json"
+    form = _FORM_OF.get(encoding.partition(";")[0])
+    if form is not None:
+        return form
     first = payload.lstrip(b" \t\r\n")[:1]
     if first == b"{":
         return "json"
@@ -92,7 +90,10 @@ class Decoder(Generic[T]):
 
     def decode(self, encoding: str, payload: bytes) -> T:
         """Decode a message; raise `DecodeError` if the payload is not a valid one."""
-        form = detect(encoding, payload)
+        return self.decode_as(detect(encoding, payload), payload)
+
+    def decode_as(self, form: Format, payload: bytes) -> T:
+        """Decode a message in a known encoding; raise `DecodeError` if it is not a valid one."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:

@@ -9,15 +9,17 @@ from acsard.core.config.parsing import parse
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
 from acsard.terminal.output import SENTENCES, plain
-from tests.unit.calibration.cut import calibrated, usual
+from tests.unit.calibration.cut import calibrated, table, usual
 
-FOUND = calibrated(usual().csv(places=False))
+FOUND = calibrated(table(usual(), places=False))
 REPORT = report("a.csv", FOUND, DriveConfig(), "")
 
 
 def test_the_object_has_every_parameter_with_its_deviation() -> None:
     made = msgspec.to_builtins(REPORT)
-    for name, value, std in zip(NAMES, FOUND.found.values, FOUND.found.std, strict=True):
+    for name, value, std in zip(
+        NAMES, FOUND.multipliers.values, FOUND.multipliers.std, strict=True
+    ):
         assert (made[name], made[f"{name}_std"]) == (value, std)
     assert made["effective_track"] == made["wheel_separation_multiplier"] * 0.3
     assert made["turn_error_before"] > 200 > 30 > made["turn_error_after"]

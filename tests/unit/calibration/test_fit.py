@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.evidence import COUNT, LEFT, RIGHT, TURN, Base, of_rows
-from acsard.calibration.fit import USUAL, Fit, Multipliers, Rates, configured, fit, found, rates
-from tests.unit.calibration.cut import BASE, ideal, ready
+from acsard.calibration.evidence import COUNT, INVERSE_TRACK, LEFT, RIGHT, Base, of_rows
+from acsard.calibration.fit import (
+    USUAL,
+    Fit,
+    Multipliers,
+    Rates,
+    configured,
+    fit,
+    multipliers,
+    rates,
+)
+from tests.unit.calibration.cut import BASE, ideal, ready, table
 
 START = np.array([1.0, 1.0, 1.0, *[0.0] * (COUNT - 3)])
 TRUTH = np.array([0.99, 1.01, 0.7])
@@ -62,12 +71,14 @@ def test_without_a_block_is_what_a_fit_without_it_gives() -> None:
     out = np.arange(20) == 4
     normal = found.normal[~out].sum(axis=0)[:3, :3]
     score = (found.score + found.normal @ found.parameters)[~out].sum(axis=0)[:3]
-    assert found.without(out)[[LEFT, RIGHT, TURN]] == pytest.approx(np.linalg.solve(normal, score))
+    assert found.without(out)[[LEFT, RIGHT, INVERSE_TRACK]] == pytest.approx(
+        np.linalg.solve(normal, score)
+    )
 
 
 def test_parameters_can_be_told_apart_by_the_normal_equations_of_the_three() -> None:
     found = fitted(np.random.default_rng(5), 0.0, 0.05)
-    assert np.linalg.cond(found.apart()) < 3
+    assert np.linalg.cond(found.marginal()) < 3
 
 
 def fit_of(rate: float, varies: float) -> Fit:
@@ -86,25 +97,29 @@ def fit_of(rate: float, varies: float) -> Fit:
     )
 
 
+def multipliers_of(fitted: Fit, rate: Rates) -> Multipliers:
+    return multipliers(fitted.parameters, fitted.covariance(), rate, fitted.varies)
+
+
 def test_a_constant_track_is_the_inverse_of_the_turn() -> None:
-    made = found(fit_of(0.0, 0.0), Rates(0.5, 1.0))
+    made = multipliers_of(fit_of(0.0, 0.0), Rates(0.5, 1.0))
     assert made.values == pytest.approx([1.6, 0.99, 1.01])
     assert made.std == pytest.approx([0, 0, 0], abs=1e-4)
 
 
 def test_a_track_that_grows_is_taken_at_the_mean_rate_and_covers_the_slowest() -> None:
-    made = found(fit_of(0.08, 0.0), Rates(0.5, 1.0))
+    made = multipliers_of(fit_of(0.08, 0.0), Rates(0.5, 1.0))
     assert made.values[0] == pytest.approx(1.6 / (1 - 0.04))
     assert made.std[0] == pytest.approx(made.values[0] * 0.04, rel=1e-3)
 
 
 def test_a_track_that_differs_from_block_to_block_is_as_unsure() -> None:
-    made = found(fit_of(0.0, 0.1), Rates(0.5, 1.0))
+    made = multipliers_of(fit_of(0.0, 0.1), Rates(0.5, 1.0))
     assert made.std[0] == pytest.approx(0.16, rel=1e-3)
 
 
 def test_rates_are_those_of_the_turns() -> None:
-    rows = ready(ideal().csv(places=False)).rows
+    rows = ready(table(ideal(), places=False)).rows
     made = rates(rows, rows.turned)
     assert 0.5 < made.mean < made.fastest < 1.0
 

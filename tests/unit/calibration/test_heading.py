@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from acsard.calibration import heading
-from acsard.calibration.evidence import AHEAD, ASIDE, COUNT, LATE, huber
+from acsard.calibration.evidence import COUNT, DELAY, SENSOR_X, SENSOR_Y, huber
 from acsard.calibration.heading import of_gyro, of_yaw, rows
 from acsard.calibration.log_table import LogError
-from acsard.calibration.paths import blocks, wheels
-from tests.unit.calibration.cut import BASE, ideal, log_of, ready, usual
+from acsard.calibration.wheel_angles import angles_of, blocks
+from tests.unit.calibration.cut import BASE, ideal, log_of, ready, table, usual
 from tests.unit.calibration.robots import GUIDED, Drive, wander
 
 
 def headings_of(drive: Drive):  # type: ignore[no-untyped-def]
-    runs = log_of(drive.csv(places=False)).runs
-    angles = [wheels(run) for run in runs]
+    runs = log_of(table(drive, places=False)).runs
+    angles = [angles_of(run) for run in runs]
     return runs, angles, of_gyro(runs, angles)
 
 
@@ -40,7 +40,7 @@ def test_a_slow_gyro_with_a_spike_in_a_short_rest_has_a_bias() -> None:
     slow.gyro[in_rest] += 0.02
     headings = headings_of(slow)[2]
     assert headings.bias == pytest.approx(0.01, abs=0.01)
-    assert 0.0 < headings.unsure < 0.1
+    assert 0.0 < headings.bias_std < 0.1
 
 
 @pytest.mark.parametrize(("noise", "walk"), [(0.05, 0.0), (0.003, 0.0003)])
@@ -56,25 +56,25 @@ def test_how_sure_the_bias_is_covers_the_truth(noise: float, walk: float) -> Non
         heading = headings.of[0]
         turned = np.interp(heading.t - 0.02, drive.t, drive.yaw)
         off = (heading.angle - turned)[[0, -1]] @ [-1, 1] / np.ptp(heading.t)
-        z.append(off / headings.unsure)
+        z.append(off / headings.bias_std)
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_without_a_rest_the_bias_is_left_to_the_fit() -> None:
     moving = [part for part in GUIDED if part[1] or part[2]]
-    assert headings_of(usual(plan=moving))[2].drifts
+    assert headings_of(usual(plan=moving))[2].bias_unknown
 
 
 @pytest.mark.parametrize("late", [-0.7, 0.0, 0.05, 1.2])
 def test_the_time_offset_is_found(late: float) -> None:
     drive = usual()
     shifted = replace(drive, gyro_t=drive.gyro_t + late)
-    assert headings_of(shifted)[2].late == pytest.approx(late + 0.02, abs=0.005)
+    assert headings_of(shifted)[2].delay == pytest.approx(late + 0.02, abs=0.005)
 
 
 def test_a_reversed_side_does_not_hide_the_time_offset() -> None:
     drive = usual()
-    assert headings_of(replace(drive, left=-drive.left))[2].late == pytest.approx(0.02, abs=0.02)
+    assert headings_of(replace(drive, left=-drive.left))[2].delay == pytest.approx(0.02, abs=0.02)
 
 
 def test_a_gyro_that_says_the_same_always_is_refused() -> None:
@@ -109,14 +109,14 @@ def test_degrees_are_told_from_radians(wrapped: bool) -> None:
              for t, a, b, w in zip(drive.t, drive.left, drive.right, yaw, strict=True)]  # fmt: skip
     runs = log_of("t,left,right,yaw\n" + "\n".join(lines)).runs
     with pytest.raises(LogError, match="degrees"):
-        of_yaw(runs, [wheels(run) for run in runs], 0.05 / 0.3)
+        of_yaw(runs, [angles_of(run) for run in runs], 0.05 / 0.3)
 
 
 AT = np.array([0.9, 1.1, 0.6, 0.05, *[0.0] * (COUNT - 4)])
 
 
 def test_least_squares_find_both_sides_whatever_their_sign() -> None:
-    rows = ready(ideal().csv(places=False)).rows
+    rows = ready(table(ideal(), places=False)).rows
     left, right = heading.first(rows, BASE)
     assert left == pytest.approx(0.998 / 1.6, rel=1e-3)
     assert right == pytest.approx(1.002 / 1.6, rel=1e-3)
@@ -126,7 +126,7 @@ def test_least_squares_find_both_sides_whatever_their_sign() -> None:
 
 
 def test_slopes_are_those_of_what_the_wheels_say() -> None:
-    rows = ready(ideal().csv(places=False)).rows
+    rows = ready(table(ideal(), places=False)).rows
     step = 1e-6
     score = heading.evidence(rows, BASE, AT, len(rows.turned)).score.sum(axis=0)
     for index in range(4):
@@ -140,4 +140,4 @@ def test_slopes_are_those_of_what_the_wheels_say() -> None:
         weight = huber(residual / usual, 1.0)
         # The other parameters also change the rate term, but only to second order.
         assert score[index] == pytest.approx(float(slope @ (weight * residual)), rel=0.15)
-    assert not score[[LATE, AHEAD, ASIDE]].any()
+    assert not score[[DELAY, SENSOR_X, SENSOR_Y]].any()

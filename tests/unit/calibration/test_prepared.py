@@ -7,35 +7,35 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.doubts import RefusedError
-from acsard.calibration.evidence import LEFT, RIGHT, TURN
+from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT
 from acsard.calibration.fit import Multipliers
 from acsard.calibration.heading import Rows
-from acsard.calibration.paths import Block
+from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.prepared import (
     DRIVE,
     drives_enough,
     rolls_enough,
+    separates_track,
     sure_enough,
-    told_apart,
     turns_enough,
 )  # fmt: skip
-from tests.unit.calibration.cut import ready, usual
+from acsard.calibration.wheel_angles import Block
+from tests.unit.calibration.cut import ready, table, usual
 
 
 @pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True), (True, True)])
 def test_it_begins_near_the_truth(gyro: bool, places: bool) -> None:
-    made = ready(usual().csv(gyro=gyro, places=places))
+    made = ready(table(usual(), gyro=gyro, places=places))
     assert len(made.sources) == gyro + places
     assert made.start[[LEFT, RIGHT]] == pytest.approx([1.0, 1.0], abs=0.05)
-    assert 1 / made.start[TURN] == pytest.approx(1.66, abs=0.15)
+    assert 1 / made.start[INVERSE_TRACK] == pytest.approx(1.66, abs=0.15)
 
 
 def test_sensors_of_another_time_are_refused() -> None:
     drive = usual()
     other = replace(drive, place_t=drive.place_t + 1000.0, gyro=np.zeros(0), gyro_t=np.zeros(0))
     with pytest.raises(RefusedError, match="one clock"):
-        ready(other.csv(gyro=False))
+        ready(table(other, gyro=False))
 
 
 def rows(left: list[float], right: list[float]) -> Rows:
@@ -47,7 +47,7 @@ def test_turns_and_straight_drives_are_enough() -> None:
     rolls_enough(rows([9, -9, 9, -9], [9, -9, -9, 9]))
     turns_enough(np.full(10, 1.0))
     drives_enough([Block(0, 0, 4)] * 5)
-    told_apart(np.eye(3))
+    separates_track(np.eye(3))
     sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-5), 0.01)
 
 
@@ -77,4 +77,4 @@ def test_what_comes_out_of_no_use_is_refused() -> None:
     with pytest.raises(RefusedError, match="effective track"):
         sure_enough(Multipliers(np.array([1.6, 1, 1]), np.eye(3) * 1e-6), np.nan)
     with pytest.raises(RefusedError, match="cannot be separated"):
-        told_apart(np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]]))
+        separates_track(np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]]))

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from acsard.calibration.evidence import LATE, LEFT, RIGHT, TURN, Base
-from acsard.calibration.paths import blocks, wheels
-from acsard.calibration.places import spots
-from acsard.calibration.search import Begin, search
-from tests.unit.calibration.cut import BASE, log_of, usual
+from acsard.calibration.evidence import DELAY, INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.positions import segments
+from acsard.calibration.search import StartingPoint, search
+from acsard.calibration.wheel_angles import angles_of, blocks
+from tests.unit.calibration.cut import BASE, log_of, table, usual
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 
-def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> Begin:
-    runs = log_of(seen.csv(gyro=False)).runs
-    angles = [wheels(run) for run in runs]
-    return search(spots(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base, sides)
+def begun(seen: Drive, base: Base = BASE, sides: Floats | None = None) -> StartingPoint:
+    runs = log_of(table(seen, gyro=False)).runs
+    angles = [angles_of(run) for run in runs]
+    return search(segments(runs, angles, blocks(runs, angles, 8.0)), runs, angles, base, sides)
 
 
 @pytest.mark.variations(3)
@@ -28,21 +28,22 @@ def test_it_begins_near_the_truth(separation: float, radius: float) -> None:
     found = begun(usual(), Base(radius, separation, 1.0, 1.0, 1.0))
     assert found.unexplained < 0.05
     assert found.parameters[LEFT] == pytest.approx(0.05 / radius, rel=0.1)
-    assert found.parameters[TURN] == pytest.approx(separation / 0.5, rel=0.15)
+    assert found.parameters[INVERSE_TRACK] == pytest.approx(separation / 0.5, rel=0.15)
 
 
 def test_a_reversed_side_and_a_mirrored_path_show_in_the_signs() -> None:
     seen = usual()
     left, mirrored = replace(seen, left=-seen.left), replace(seen, place=seen.place.conj())
-    one = np.sign(begun(left).parameters[[LEFT, RIGHT]] * begun(left).parameters[TURN])
+    found = begun(left).parameters
+    one = np.sign(found[[LEFT, RIGHT]] * found[INVERSE_TRACK])
     assert one.tolist() == [-1.0, 1.0]
-    assert begun(mirrored).parameters[TURN] < 0
+    assert begun(mirrored).parameters[INVERSE_TRACK] < 0
 
 
 def test_late_positions_are_found() -> None:
     seen = usual()
     late = replace(seen, place_t=seen.place_t + 0.9)
-    assert begun(late).parameters[LATE] == pytest.approx(0.9, abs=0.15)
+    assert begun(late).parameters[DELAY] == pytest.approx(0.9, abs=0.15)
 
 
 def squares(chi: float) -> Plan:
@@ -54,13 +55,16 @@ def squares(chi: float) -> Plan:
     return [(3, 0, 0), *side * 8, *[(seconds, v, -w) for seconds, v, w in side * 8]]
 
 
-@pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
+@pytest.mark.variations(2)
 @pytest.mark.parametrize("chi", [1.3, 1.6, 2.0])
+@pytest.mark.parametrize("lever", [0j, 0.1 + 0.1j])
 def test_a_turn_in_place_is_taken_for_the_likelier_one(chi: float, lever: complex) -> None:
     """Positions alone cannot distinguish turns of 90 deg left, 270 deg right and 450 deg left."""
     robot = Robot(chi=chi, rate=0.0, lever=lever, slip=0.02)
     seen = drive(robot, squares(chi))
-    assert begun(seen).parameters[TURN] == pytest.approx(1 / chi, rel=0.05)
+    assert begun(seen).parameters[INVERSE_TRACK] == pytest.approx(1 / chi, rel=0.05)
     mirrored = replace(seen, place=seen.place.conj())
     sides = np.array([1.0, 1.0]) / chi
-    assert begun(mirrored, sides=-sides).parameters[TURN] == pytest.approx(-1 / chi, rel=0.05)
+    assert begun(mirrored, sides=-sides).parameters[INVERSE_TRACK] == pytest.approx(
+        -1 / chi, rel=0.05
+    )

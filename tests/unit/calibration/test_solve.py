@@ -12,10 +12,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from acsard.calibration.doubts import RefusedError
+from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.solve import Calibration
 from acsard.calibration.tape_distance import Tape
-from tests.unit.calibration.cut import calibrated, usual
+from tests.unit.calibration.cut import calibrated, table, usual
 from tests.unit.calibration.robots import (
     GUIDED,
     RADIUS,
@@ -48,7 +48,7 @@ def robots(way: str, count: int) -> list[tuple[Calibration, Drive]]:
         rng = np.random.default_rng(seed)
         robot = Robot(rng=rng)
         plan = GUIDED if seed % 2 else wander(rng, 80.0)
-        log = drive(robot, plan).csv(gyro=gyro, places=places)
+        log = table(drive(robot, plan), gyro=gyro, places=places)
         made.append((calibrated(log), drive(robot, wander(rng, 300.0))))
     return made
 
@@ -66,7 +66,7 @@ def off(seen: Drive, values: Floats) -> float:
 @so_many
 @each_way
 def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> None:
-    better = [off(d, np.ones(3)) / off(d, c.found.values) for c, d in robots(way, count)]
+    better = [off(d, np.ones(3)) / off(d, c.multipliers.values) for c, d in robots(way, count)]
     print(f"{way}: heading {min(better):.1f} to {max(better):.1f} times better")
     assert min(better) >= 10
 
@@ -75,7 +75,7 @@ def test_heading_is_ten_times_better_than_geometric(way: str, count: int) -> Non
 @each_way
 def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
     """Check the track from slow to fast turns, and both radii; a gyro gives only their ratio."""
-    found = [c.found for c, _ in robots(way, count)]
+    found = [c.multipliers for c, _ in robots(way, count)]
     z = [(f.values[0] - 1.6 * (1 + 0.08 * rate)) / f.std[0] for f in found for rate in (0, 0.5, 1)]
     for index, true in ((1, 0.998), (2, 1.002)):
         z += [(f.values[index] - true) / f.std[index] for f in found]
@@ -89,16 +89,16 @@ def test_standard_deviations_cover_the_truth(way: str, count: int) -> None:
 @each_way
 def test_what_is_said_to_remain_is_what_remains(way: str, count: int) -> None:
     for c, _ in robots(way, count):
-        assert c.gain.turn.now == pytest.approx(240, abs=25)
-        assert c.gain.turn.then is not None
-        assert c.gain.turn.then < 24
+        assert c.improvement.turn.before == pytest.approx(240, abs=25)
+        assert c.improvement.turn.after is not None
+        assert c.improvement.turn.after < 24
 
 
 @so_many
 def test_bias_and_time_offset_are_told(count: int) -> None:
     for c, _ in robots("gyro", count):
-        assert c.bias == pytest.approx(0.01, abs=0.002)
-        assert c.late["yaw_rate"] == pytest.approx(0.02, abs=0.012)
+        assert c.gyro_bias == pytest.approx(0.01, abs=0.002)
+        assert c.delays["yaw_rate"] == pytest.approx(0.02, abs=0.012)
 
 
 def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
@@ -106,7 +106,7 @@ def test_a_bias_that_is_badly_seen_makes_unsure_what_it_bends() -> None:
     z = []
     for seed in range(12):
         robot = Robot(gyro_noise=0.06, slip=0.003, rng=np.random.default_rng(seed))
-        found = calibrated(drive(robot, wander(robot.rng, 100.0)).csv(places=False)).found
+        found = calibrated(table(drive(robot, wander(robot.rng, 100.0)), places=False)).multipliers
         logs = found.covariance / np.outer(found.values, found.values)
         apart = np.array([0.0, -1.0, 1.0])
         off = np.log(found.values) @ apart - np.log(1.002 / 0.998)
@@ -127,7 +127,7 @@ def test_coarse_encoders_at_a_high_rate_bend_no_track() -> None:
     ]
     left, right = (np.diff(counts) * 2 * np.pi / 20 / 0.001 for counts in counted)
     coarse = replace(seen, t=t[1:], left=left, right=right)
-    found = calibrated(coarse.csv(places=False)).found
+    found = calibrated(table(coarse, places=False)).multipliers
     assert found.values[0] == pytest.approx(1.6 * 1.05, rel=0.06)
 
 
@@ -136,7 +136,7 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
     """A scale error of 1 % is normal for a gyro. Only positions reveal it."""
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
-    found = calibrated(replace(seen, gyro=seen.gyro * 1.01).csv(places=places)).found
+    found = calibrated(table(replace(seen, gyro=seen.gyro * 1.01), places=places)).multipliers
     assert abs(found.values[0] - 1.6) < 2.2 * found.std[0]
     assert found.std[0] < 0.016
     if places:
@@ -146,15 +146,15 @@ def test_a_gyro_that_says_too_much_is_allowed_for(places: bool) -> None:
 def test_what_it_is_worth_is_told_by_the_gyro_as_it_was_put_right() -> None:
     robot = Robot(rate=0.0, slip=0.002, place_noise=0.003, rng=np.random.default_rng(1))
     seen = drive(robot, wander(robot.rng, 300.0))
-    worth = calibrated(replace(seen, gyro=seen.gyro * 1.02).csv(places=True)).gain
-    assert (worth.turn.then or math.inf) < 3.0  # deg in 360; 2 % of that are 7 deg
+    worth = calibrated(table(replace(seen, gyro=seen.gyro * 1.02))).improvement
+    assert (worth.turn.after or math.inf) < 3.0  # deg in 360; 2 % of that are 7 deg
 
 
 def test_positions_that_tell_no_side_contradict_no_gyro() -> None:
     """The robot drives one small square. Pieces of four seconds are straights and noise."""
     side: Plan = [(4, 0.3, 0), (0.5, 0, 0), (4, 0, np.pi / 2 * 1.5 / 4), (0.5, 0, 0)]
     robot = Robot(chi=1.5, rate=0.0, outliers=0.0, lever=0j, rng=np.random.default_rng(3))
-    found = calibrated(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]).csv()).found
+    found = calibrated(table(drive(robot, [(3, 0, 0), *side * 4, (3, 0, 0)]))).multipliers
     assert found.values[0] == pytest.approx(1.5, rel=0.05)
 
 
@@ -167,14 +167,14 @@ AHEAD: Plan = [
 def test_a_log_without_a_rest_tells_the_same_of_the_drive_as_one_with_rests() -> None:
     rests: Plan = [(3, 0, 0), *AHEAD, (3, 0, 0)]
     moving, resting = (
-        calibrated(drive(Robot(rng=np.random.default_rng(4)), plan).csv(places=False))
+        calibrated(table(drive(Robot(rng=np.random.default_rng(4)), plan), places=False))
         for plan in (AHEAD, rests)
     )
     assert moving.drives.metres == pytest.approx(resting.drives.metres, rel=0.02)
     assert moving.drives.turns == pytest.approx(resting.drives.turns, rel=0.06)
     assert moving.drives.fastest == pytest.approx(resting.drives.fastest, rel=0.1)
-    assert moving.gain.turn.now == pytest.approx(resting.gain.turn.now, rel=0.1)
-    assert moving.bias == pytest.approx(0.01, abs=0.01)
+    assert moving.improvement.turn.before == pytest.approx(resting.improvement.turn.before, rel=0.1)
+    assert moving.gyro_bias == pytest.approx(0.01, abs=0.01)
 
 
 def test_a_tape_measures_the_wheels() -> None:
@@ -183,9 +183,9 @@ def test_a_tape_measures_the_wheels() -> None:
     text = drive(robot, GUIDED).csv(places=False, run="turns")
     text += straight.csv(places=False, run="straight").partition("\n")[2]
     made = calibrated(text, Tape(abs(straight.where[-1])))
-    z = (made.found.values[1:] - [0.948, 0.952]) / made.found.std[1:]
+    z = (made.multipliers.values[1:] - [0.948, 0.952]) / made.multipliers.std[1:]
     assert np.all(np.abs(z) < 3)
-    assert made.found.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
+    assert made.multipliers.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
     assert made.scale == "distance"
 
 
@@ -195,7 +195,7 @@ def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
     gyro, places = WAYS[way]
     rng = np.random.default_rng(5)
     made = drive(Robot(slip=0.05, rng=rng), wander(rng, 120.0))
-    found = calibrated(made.csv(gyro=gyro, places=places)).found
+    found = calibrated(table(made, gyro=gyro, places=places)).multipliers
     assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
 
 
@@ -203,7 +203,7 @@ def test_much_slip_makes_it_unsure_and_not_refused(way: str) -> None:
 def test_coarse_positions_are_compared_over_a_longer_time() -> None:
     rng = np.random.default_rng(5)
     made = drive(Robot(place_noise=0.7, outliers=0.0, rng=rng), wander(rng, 600.0))
-    found = calibrated(made.csv(gyro=False)).found
+    found = calibrated(table(made, gyro=False)).multipliers
     assert abs(found.values[0] - 1.6 * 1.04) < 2 * found.std[0]
 
 
@@ -212,8 +212,8 @@ def test_order_repetition_standstill_and_epoch_change_nothing() -> None:
     made = drive(Robot(rng=np.random.default_rng(4)), [(200, 0, 0), *GUIDED, (100, 0, 0)], 1.7e9)
     head, *body = made.csv(places=False).splitlines()
     mixed = list(np.random.default_rng(1).permutation(body + body[:500]))
-    plain = calibrated("\n".join([head, *body])).found
-    other = calibrated("\n".join([head, *mixed])).found
+    plain = calibrated("\n".join([head, *body])).multipliers
+    other = calibrated("\n".join([head, *mixed])).multipliers
     assert np.allclose(plain.values, other.values, atol=1e-9)
 
 
@@ -222,10 +222,10 @@ def test_gaps_and_jumps_are_told_and_cost_little() -> None:
     kept = np.sin(made.t / 7) > -0.6
     jumped = made.place + np.where(made.place_t > 40, 30 - 20j, 0)
     torn = replace(made, t=made.t[kept], left=made.left[kept], right=made.right[kept], place=jumped)
-    found = calibrated(torn.csv())
+    found = calibrated(table(torn))
     assert any("gaps" in note for note in found.notes)
     assert any("jump" in note for note in found.notes)
-    assert found.found.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
+    assert found.multipliers.values[0] == pytest.approx(1.6 * 1.04, rel=0.03)
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_gaps_and_jumps_are_told_and_cost_little() -> None:
 def test_a_drive_that_tells_too_little_is_refused(way: str, plan: list[tuple[float, ...]]) -> None:
     gyro, places = WAYS[way]
     with pytest.raises(RefusedError, match="drive 60 s"):
-        calibrated(drive(Robot(), plan).csv(gyro=gyro, places=places))  # type: ignore[arg-type]
+        calibrated(table(drive(Robot(), plan), gyro=gyro, places=places))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -244,4 +244,4 @@ def test_a_million_rows_are_calibrated_with() -> None:
     rng = np.random.default_rng(1)
     text = drive(Robot(rng=rng), wander(rng, 4900.0)).csv()
     assert text.count("\n") > 1_000_000
-    assert calibrated(text).found.values[0] == pytest.approx(1.6 * 1.045, rel=0.02)
+    assert calibrated(text).multipliers.values[0] == pytest.approx(1.6 * 1.045, rel=0.02)

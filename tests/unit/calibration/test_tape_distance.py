@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from acsard.calibration.doubts import RefusedError
 from acsard.calibration.fit import Multipliers
-from acsard.calibration.tape_distance import TAPE_M, Tape, Way, scaled
+from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.tape_distance import TAPE_M, Extent, Tape, scaled
 
 FOUND = Multipliers(np.array([1.6, 1.0, 1.0]), np.diag([0.02, 1e-3, 1e-3]) ** 2)
 NAMES = ("turns", "straight")
 
 
-def follow(values: np.ndarray, number: int) -> Way:
+def follow(values: np.ndarray, number: int) -> Extent:
     """Return a way of 5 m for wheels as configured, or of 9 m that ends near its start."""
     size = float(values[1:].mean())
-    return Way(5.0 * size, 5.0 * size) if number else Way(0.1 * size, 9.0 * size)
+    return Extent(5.0 * size, 5.0 * size) if number else Extent(0.1 * size, 9.0 * size)
 
 
 def test_the_scale_is_the_tape_s_and_nothing_else_changes() -> None:

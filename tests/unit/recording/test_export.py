@@ -25,8 +25,9 @@ from acsard.core.config.settings import Config
 from acsard.core.ros.channels import CHANNELS
 from acsard.host.errors import RecordingError
 from acsard.recording.atomic_output import replacing
-from acsard.recording.export import Kind, Span, export, measured
+from acsard.recording.export import Kind, export, measured
 from acsard.recording.file import Recording
+from acsard.recording.time_span import Span
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 import pytest
 from msgspec.structs import replace
 
-from acsard.calibration.error_budget.budget import Budget, Cause, Heard, Share, budget
+from acsard.calibration.error_budget.budget import Budget, Cause, Received, Share, budget
 from acsard.calibration.error_budget.drive_log import Line
 from acsard.core.config.settings import Config, McuConfig, OdometryConfig
 from acsard.core.motion.uncertainty import GYRO_SCALE
@@ -48,7 +48,7 @@ def as_predicted(case: str, seconds: float, seeds: int) -> float:
     ratios = []
     for seed in range(seeds):
         told = make(seed, seconds)
-        found = budget(Heard(told.lines, []), CONFIG, metres=told.metres * 0.999)
+        found = budget(Received(told.lines, []), CONFIG, metres=told.metres * 0.999)
         millimetres = share(found, cause).mm_per_100_m
         assert millimetres
         ratios.append(1e3 * told.off / millimetres)
@@ -81,7 +81,7 @@ def driven() -> Told:
 def test_a_robot_that_stands_is_told_its_settings_and_no_more() -> None:
     still = [Line(n / 100, (0.0,) * 4, (1.0,) * 4, 0.0, 0.0) for n in range(300)]
     known = replace(CONFIG, odometry=OdometryConfig(wheel_separation_multiplier_std=0.02))
-    found = budget(Heard(still, []), known)
+    found = budget(Received(still, []), known)
     assert found.still
     assert {one.cause: one.basis for one in found.shares} == {
         "slip": "settings",
@@ -93,39 +93,39 @@ def test_a_robot_that_stands_is_told_its_settings_and_no_more() -> None:
 
 
 def test_without_lines_it_is_the_same() -> None:
-    assert budget(Heard([], []), CONFIG).still
+    assert budget(Received([], []), CONFIG).still
 
 
 def test_parameters_that_nobody_measured_are_unknown_and_not_nothing() -> None:
-    found = share(budget(Heard(driven().lines, []), CONFIG), "parameters")
+    found = share(budget(Received(driven().lines, []), CONFIG), "parameters")
     assert (found.basis, found.mm_per_100_m, found.deg_per_turn) == ("unknown", None, None)
 
 
 def test_the_track_that_a_gyro_implies_is_a_measured_error() -> None:
-    found = share(budget(Heard(driven().lines, [], learned=1.1), CONFIG), "parameters")
+    found = share(budget(Received(driven().lines, [], learned=1.1), CONFIG), "parameters")
     assert found.basis == "measured"
     assert found.deg_per_turn == pytest.approx(36.0, rel=0.02)
 
 
 def test_a_learned_track_that_is_in_use_errs_by_its_own_deviation() -> None:
-    heard = Heard(driven().lines, [], learned=1.1, deviation=0.02, used=True)
-    found = share(budget(heard, CONFIG), "parameters")
+    received = Received(driven().lines, [], learned=1.1, deviation=0.02, used=True)
+    found = share(budget(received, CONFIG), "parameters")
     assert found.basis == "measured"
     assert found.deg_per_turn == pytest.approx(7.2, rel=0.02)
 
 
 def test_the_track_that_a_gyro_implies_is_a_multiplier_as_the_configured_one() -> None:
     config = replace(CONFIG, drive=replace(CONFIG.drive, wheel_separation_multiplier=1.5))
-    found = budget(Heard(driven().lines, [], learned=1.1, deviation=0.02), config)
+    found = budget(Received(driven().lines, [], learned=1.1, deviation=0.02), config)
     assert found.multiplier == 1.5
     assert found.learned_std == pytest.approx(0.033)
     assert found.learned == pytest.approx(1.65)
-    assert budget(Heard(driven().lines, []), config).learned is None
+    assert budget(Received(driven().lines, []), config).learned is None
 
 
 def test_with_a_gyro_no_wheel_turns_the_heading() -> None:
     lines = [replace(line, yaw_variance=1e-6 * n) for n, line in enumerate(driven().lines)]
-    found = budget(Heard(lines, [], gyro=True), CONFIG)
+    found = budget(Received(lines, [], gyro=True), CONFIG)
     for cause in ("time", "quantisation", "gaps", "slip"):
         assert share(found, cause).deg_per_turn == 0.0
     turns = found.turned / 360
@@ -144,7 +144,7 @@ def with_a_gyro(lines: list[Line], before: float = 0.0) -> Share:
         heading += math.remainder(line.yaw - last.yaw, math.tau)
         noise += 1e-6 if any(line.speeds) else 0.0
         made.append(replace(line, yaw_variance=noise + (GYRO_SCALE * heading) ** 2))
-    return share(budget(Heard(made, [], gyro=True), CONFIG), "gyro")
+    return share(budget(Received(made, [], gyro=True), CONFIG), "gyro")
 
 
 @pytest.mark.parametrize("before", [-10, 10])
@@ -174,14 +174,14 @@ def test_of_one_long_spin_nobody_knows_what_is_noise_and_what_scale() -> None:
 
 def test_counts_leave_time_and_gaps_without_a_share_and_a_count_for_quantisation() -> None:
     counted = replace(CONFIG, mcu=McuConfig(link_check="require", encoder_counts=400))
-    found = budget(Heard(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
+    found = budget(Received(drives.late(1, 10.0, "batches").lines, [], counted=True), counted)
     assert share(found, "time").mm_per_100_m == share(found, "gaps").mm_per_100_m == 0.0
     assert (share(found, "quantisation").mm_per_100_m or 0.0) > 0.0
     assert found.counts == 400
 
 
 def test_of_lines_that_did_not_all_come_here_nothing_is_told_of_time() -> None:
-    found = budget(Heard(driven().lines, [], whole=False), CONFIG)
+    found = budget(Received(driven().lines, [], whole=False), CONFIG)
     assert {share(found, cause).basis for cause in ("time", "quantisation", "gaps")} == {"unknown"}
 
 
@@ -191,13 +191,13 @@ def test_a_wheel_that_contradicts_its_neighbour_is_measured_slip() -> None:
         replace(line, positions=(0.0, *line.positions[1:]), speeds=(0.0, *line.speeds[1:]))
         for line in driven().lines
     ]
-    found = share(budget(Heard(lines, []), CONFIG), "slip")
+    found = share(budget(Received(lines, []), CONFIG), "slip")
     assert found.basis == "measured"
     assert (found.mm_per_100_m or 0.0) > 10_000
 
 
 def test_the_largest_is_of_the_place_and_else_of_the_heading() -> None:
-    found = budget(Heard(driven().lines, []), CONFIG)
+    found = budget(Received(driven().lines, []), CONFIG)
     quantisation, slip = found.largest("measured"), found.largest("measured", "settings")
     assert quantisation is not None
     assert slip is not None

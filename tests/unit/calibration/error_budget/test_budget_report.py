@@ -36,7 +36,7 @@ KNOWN: tuple[Cause, float, Basis] = ("parameters", 5.0, "settings")
     [
         ("time", "latency_timer"),
         ("quantisation", "link_check"),
-        ("gaps", "3 lines were lost, so 0.25 s"),
+        ("gaps", "3 feedback lines were lost, so 0.25 s"),
         ("slip", "gyro"),
         ("gyro", "stand"),
         ("parameters", "acsard calibrate"),
@@ -46,7 +46,7 @@ def test_one_sentence_says_what_to_do_about_the_largest_that_was_measured(
     cause: Cause, says: str
 ) -> None:
     told = advice(of((cause, 100.0, "measured"), KNOWN))
-    assert told.startswith(f"the largest is {cause}: ")
+    assert told.startswith(f"the largest measured cause is {cause}: ")
     assert says in told
 
 
@@ -56,18 +56,18 @@ def test_coarse_encoders_are_named() -> None:
 
 def test_what_is_only_declared_does_not_hide_what_was_measured() -> None:
     told = advice(of(("slip", 900.0, "settings"), ("time", 50.0, "measured"), KNOWN))
-    assert told.startswith("[odometry] declares slip the largest")
-    assert "of the measured causes the largest is time" in told
+    assert told.startswith("the largest cause is slip, by the settings in [odometry]")
+    assert "the largest measured cause is time" in told
 
 
 def test_who_never_calibrated_is_told_so_first() -> None:
     told = advice(of(("time", 50.0, "measured"), ("parameters", None, "unknown")))
     assert told.startswith("the error of wheel radii and track width is unknown")
-    assert "the largest is time" in told
+    assert "the largest measured cause is time" in told
 
 
 def test_without_an_error_it_says_so() -> None:
-    assert advice(of()) == "nothing here makes odometry wrong"
+    assert advice(of()) == "this drive shows no error of the odometry"
 
 
 def test_the_table_has_every_cause_and_their_sum() -> None:
@@ -89,13 +89,13 @@ def test_the_track_that_a_gyro_implies_stands_beside_the_configured_one(still: b
     found = of(KNOWN, learned=1.7, learned_std=0.05, multiplier=1.5, still=still)
     told = " ".join(text(found).split())
     assert (
-        "multiplier would be 1.700 (standard deviation 0.050); the configured value, which is used"
+        "multiplier would be 1.700 (standard deviation 0.050). Odometry uses the configured value,"
         in told
     )
-    assert "which is used, is 1.500. If both differ" in told
+    assert "value, 1.500. If both differ" in told
     assert "would be" not in text(of(KNOWN, still=still))
     told = " ".join(text(replace(found, learned_used=True)).split())
-    assert "multiplier is 1.700 (standard deviation 0.050). This value is used" in told
+    assert "multiplier is 1.700 (standard deviation 0.050). Odometry uses this value" in told
     assert "the configured value is 1.500." in told
 
 

@@ -62,7 +62,7 @@ def test_a_line_has_the_parts_of_both_messages_of_its_stamp_in_any_order() -> No
     feed = Feed(Config(), state(10))
     for message in (wheels(0.01), odom(0.01), odom(0.02, 1.5), wheels(0.02)):
         feed.add(message)
-    one, other = feed.heard(state(12), diagnostics()).lines
+    one, other = feed.received(state(12), diagnostics()).lines
     assert (one.at, one.speeds, one.positions) == (0.01, (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))
     assert one.yaw == pytest.approx(0.5)
     assert one.yaw_variance == 0.25
@@ -73,15 +73,15 @@ def test_half_a_line_is_none_and_is_not_kept_for_ever() -> None:
     feed = Feed(Config(), state(0))
     for n in range(1000):
         feed.add(wheels(n / 100))
-    assert feed.heard(state(0), diagnostics()).lines == []
+    assert feed.received(state(0), diagnostics()).lines == []
     feed.add(odom(0.0))
-    assert feed.heard(state(0), diagnostics()).lines == []
+    assert feed.received(state(0), diagnostics()).lines == []
 
 
 def test_the_lines_that_left_are_those_of_the_applied_commands() -> None:
     feed = Feed(Config(), state(0))
     feed.add(TwistStamped(wheels(0.25).header, ZERO))
-    assert feed.heard(state(0), diagnostics()).sent == [0.25]
+    assert feed.received(state(0), diagnostics()).sent == [0.25]
 
 
 @pytest.mark.parametrize(
@@ -94,23 +94,23 @@ def test_lines_of_the_daemon_that_did_not_come_are_noticed(
     for n in range(100):
         feed.add(wheels(n / 100))
         feed.add(odom(n / 100))
-    assert feed.heard(state(lines, impossible=impossible), diagnostics()).whole is whole
+    assert feed.received(state(lines, impossible=impossible), diagnostics()).whole is whole
 
 
 def test_who_has_rates_limited_does_not_send_all_lines() -> None:
     slow = replace(Config(), rates=RatesConfig(odom=10.0))
-    assert not Feed(slow, state(0)).heard(state(0), diagnostics()).whole
+    assert not Feed(slow, state(0)).received(state(0), diagnostics()).whole
 
 
 def test_counts_are_in_force_only_where_the_link_says_so() -> None:
     asked = replace(Config(), mcu=McuConfig(link_check="auto", encoder_counts=400))
     for check, counted in (("checked with samples", True), ("plain", False)):
-        assert Feed(asked, state(0)).heard(state(0), diagnostics(check=check)).counted is counted
+        assert Feed(asked, state(0)).received(state(0), diagnostics(check=check)).counted is counted
 
 
 @pytest.mark.parametrize(("does", "used"), [("used", True), ("disagrees", True), ("silent", False)])
 def test_the_heading_is_the_gyros_where_it_is_used(does: str, used: bool) -> None:
-    assert Feed(Config(), state(0)).heard(state(0, does), diagnostics()).gyro is used
+    assert Feed(Config(), state(0)).received(state(0, does), diagnostics()).gyro is used
 
 
 def test_the_track_that_a_gyro_learned_is_a_share_of_the_configured_one() -> None:
@@ -118,7 +118,7 @@ def test_the_track_that_a_gyro_learned_is_a_share_of_the_configured_one() -> Non
     both["learned_multiplier_std"] = "0.033"
     for in_use, used in (("1.500", False), ("1.650", True)):
         learned = diagnostics(**both, multiplier_in_use=in_use)
-        heard = Feed(Config(), state(0)).heard(state(0), learned)
-        assert (heard.learned, heard.deviation) == pytest.approx((1.1, 0.02))
-        assert heard.used is used
-    assert Feed(Config(), state(0)).heard(state(0), diagnostics()).learned is None
+        received = Feed(Config(), state(0)).received(state(0), learned)
+        assert (received.learned, received.deviation) == pytest.approx((1.1, 0.02))
+        assert received.used is used
+    assert Feed(Config(), state(0)).received(state(0), diagnostics()).learned is None

@@ -40,8 +40,8 @@ def test_a_gap_in_which_the_pose_stood_is_all_the_way_that_was_driven_in_it() ->
     moved = [SPEED * PERIOD] * 200
     moved[100] = 0.0
     found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
-    (stood,) = found.stood[found.stood.any(axis=1)]
-    assert stood[0] == pytest.approx(0.5 * 0.51)
+    (unfilled,) = found.unfilled[found.unfilled.any(axis=1)]
+    assert unfilled[0] == pytest.approx(0.5 * 0.51)
     assert found.unseen == pytest.approx(0.51)
 
 
@@ -52,8 +52,8 @@ def test_lines_that_are_missing_are_a_doubt_where_the_pose_went_on() -> None:
     found = motion(ahead(at, moved), NONE, KINEMATICS, whole=True)
     assert found.missing == 3
     assert found.unseen == pytest.approx(0.03)
-    assert np.flatnonzero(found.bridged[:, 0]).tolist() == [99]
-    assert not found.stood.any()
+    assert np.flatnonzero(found.filled[:, 0]).tolist() == [99]
+    assert not found.unfilled.any()
 
 
 def test_lines_that_only_we_have_missed_are_no_gap() -> None:

@@ -11,15 +11,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from acsard.calibration.guided.legs import Leg, Setup, setup
+from acsard.calibration.guided.drive_plan import Leg, Setup, setup
+from acsard.calibration.guided.methods import METHODS
 from acsard.calibration.guided.runner import guide
-from acsard.calibration.guided.ways import WAYS
 from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
-from acsard.prompts.prompt import Ask
-from acsard.prompts.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import Ask
+from acsard.terminal.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30
@@ -149,7 +149,7 @@ def play(way: str, player: Player) -> Calibration:
 
 def leg(way: str, name: str, track: float = 1.6) -> Leg:
     """Return one leg of a way for a track."""
-    (found,) = [one for one in WAYS[way].legs(usual_setup(), track) if one.name == name]
+    (found,) = [one for one in METHODS[way].legs(usual_setup(), track) if one.name == name]
     return found
 
 

@@ -9,8 +9,8 @@ import cmath
 import math
 from collections.abc import Iterator, Sequence
 
-from acsard.calibration.guided.legs import Leg, Setup
-from acsard.calibration.guided.ways import WAYS, side_of_square
+from acsard.calibration.guided.drive_plan import Leg, Setup
+from acsard.calibration.guided.methods import METHODS, side_of_square
 
 SIDE = 3.0
 STEP_S = 0.05
@@ -40,7 +40,7 @@ def drives(way: str, setup: Setup, track: float) -> Iterator[Drive]:
         "square to the right": (complex(aside, SIDE - aside), 0.0),
     }
     drive: list[Leg] = []
-    for leg in reversed(WAYS[way].legs(setup, track)):
+    for leg in reversed(METHODS[way].legs(setup, track)):
         drive.insert(0, leg)
         if any(words in leg.words for words in ("Push", "Place the")):
             edge = setup.reach + (0.0 if way == "wall" else 0.1)

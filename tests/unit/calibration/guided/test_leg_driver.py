@@ -7,8 +7,8 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
+from acsard.calibration.guided.drive_plan import Leg, Move
 from acsard.calibration.guided.leg_driver import HELD_UP, LegDriver, Phase
-from acsard.calibration.guided.legs import Leg, Move
 from acsard.client.commander import OPENED_S
 from acsard.client.follower import QUIET_S
 from acsard.core.config.settings import DriveConfig

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from acsard.core.config.partial import SpoiltError, told, without
+from acsard.core.config.partial import InvalidKeyError, mistakes, view_without
 from acsard.core.config.settings import Config
 
 
 def test_what_is_not_spoilt_reads_as_ever() -> None:
-    seen = without(Config(), {"mcu.wheels.front_left", "limits"})
+    seen = view_without(Config(), {"mcu.wheels.front_left", "limits"})
     assert seen.mcu.baud_rate == 115200
     assert seen.mcu.wheels.front_right == "+a"
     assert seen.drive is seen.drive
@@ -24,12 +24,12 @@ def test_what_is_not_spoilt_reads_as_ever() -> None:
     ],
 )
 def test_what_is_spoilt_or_rests_on_it_cannot_be_read(read: object) -> None:
-    seen = without(Config(), {"mcu.baud_rate", "mcu.link_check", "limits"})
+    seen = view_without(Config(), {"mcu.baud_rate", "mcu.link_check", "limits"})
     assert callable(read)
-    with pytest.raises(SpoiltError):
+    with pytest.raises(InvalidKeyError):
         read(seen)
 
 
 def test_rules_that_can_be_asked_are() -> None:
     rules = (lambda c: [str(c.mcu.line_bytes)], lambda c: [c.robot.id], lambda c: [c.log.level])
-    assert told(rules, without(Config(), {"mcu.link_check"})) == ["acsar", "info"]
+    assert mistakes(rules, view_without(Config(), {"mcu.link_check"})) == ["acsar", "info"]

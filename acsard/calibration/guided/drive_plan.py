@@ -1,0 +1,272 @@
+"""The types of a guided drive: `Method`, `Leg`, `Move` and measurements, and the robot's `Setup`.
+
+A method of calibration consists of questions to ask first and legs to drive in order. `methods.py`
+has the table of the methods, and `runner.py` leads a person through one of them.
+
+The robot stays within its limits and on a floor of 3 m x 3 m. How far it turns for a command is not
+known before the calibration: the plan must work for an effective track of 1 to 2.5 times the wheel
+separation. A drive stays on the floor in spite of that because it takes one of these forms:
+
+- It goes there and back.
+- It follows a line that a person set the robot on.
+- It comes after a turn that a person measured, which shows the effective track.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+from msgspec import Struct
+
+from acsard.core.config.settings import Config, DriveConfig
+from acsard.core.values import AcsardError
+from acsard.terminal.prompt import Ask
+
+
+class GuideError(AcsardError):
+    """The guided drive cannot continue. The text says why and what to do. No file was changed."""
+
+
+class Move(Struct, frozen=True):
+    """A command, and the time for which the tool keeps sending it."""
+
+    seconds: float
+    """Time in s."""
+    linear: float = 0.0
+    """Linear speed, m/s."""
+    angular: float = 0.0
+    """Commanded turn rate, rad/s, positive to the left."""
+
+
+UNITS = {"m": 1.0, "mm": 1e-3, "deg": math.pi / 180}
+"""Factors that convert the units of tape readings to m or rad."""
+
+
+Quantity = Literal["turned", "angle", "distance", "ahead", "aside"]
+"""The quantity that a tape reading gives about the robot's motion since its last known pose.
+
+- `turned`: the turn in rad, positive to the left, including whole turns.
+- `angle`: the turn in rad, positive to the left, of which whole turns are unknown.
+- `distance`: the straight-line distance in m.
+- `ahead`, `aside`: the displacement in m, along the first heading and to the left of it.
+"""
+
+
+class Mean(Struct, frozen=True):
+    """A measurement that is the mean of several answers, plus a known constant."""
+
+    quantity: Quantity
+    answers: tuple[str, ...]
+    """Names of the answers."""
+    deviation: float
+    """Standard deviation of the measurement, m or rad."""
+    plus: float = 0.0
+    """Constant to add, m or rad: the whole turns, which the person does not measure."""
+    over: tuple[str, ...] = ()
+    """Names of the legs whose motion the measurement covers. () means only the leg itself."""
+
+
+class Slant(Struct, frozen=True):
+    """A measurement of the robot's turn relative to a line or a wall.
+
+    The person measures the distances from the line to two points of the robot.
+    """
+
+    quantity: Quantity
+    near: str
+    """Name of the answer for the point that a turn to the left moves towards the line."""
+    far: str
+    """Name of the answer for the point that a turn to the left moves away from the line."""
+    apart: str
+    """Name of the answer for the distance between both points, asked before the first leg."""
+    since: str = ""
+    """Name of the leg after which the robot's angle to the line was measured last.
+
+    "" means that a person placed the robot parallel to the line before this leg.
+    """
+    plus: float = 0.0
+    """Whole and half turns to add, rad, because the angle to the line does not show them."""
+    over: tuple[str, ...] = ()
+    """Names of the legs whose motion the measurement covers. () means only the leg itself."""
+
+
+Measure = Mean | Slant
+
+
+class Leg(Struct, frozen=True):
+    """A series of moves. A person starts it with Enter and can stop it at any time with any key."""
+
+    name: str
+    words: str
+    """Instructions to the person, and an announcement of the moves."""
+    moves: tuple[Move, ...]
+    asks: tuple[Ask, ...] = ()
+    """Questions that the person answers after the moves."""
+    measures: tuple[Measure, ...] = ()
+    """The measurements that the answers give."""
+    by_key: bool = False
+    """Whether the person ends the last move with a key. Its duration is then a timeout."""
+
+    @property
+    def seconds(self) -> float:
+        return sum(move.seconds for move in self.moves)
+
+
+ROOM = 3.0
+"""Side of the free floor, m."""
+
+MOST_S = 90.0
+"""Longest driving time of all legs of a method together, s. The tests check each method."""
+
+USUAL_SPEED = 0.3
+"""Speed straight ahead, m/s, if the limits allow it."""
+
+FASTEST_WHEEL = 0.5
+"""Largest rolling speed of the wheels in a turn, m/s."""
+
+REACH = 0.75
+"""Distance from the robot's middle to its outermost point, in wheel separations.
+
+Half a wheel radius is added to it.
+"""
+
+EDGE = 0.1
+"""Margin between the robot and the edge of the floor, m."""
+
+LONGEST, SHORTEST = 2.0, 0.8
+"""Longest and shortest straight drive, m."""
+
+LEAST_SPEED, LEAST_TURN = 0.05, 0.2
+"""Smallest `limits.linear_speed` (m/s) and `limits.angular_speed` (rad/s) for a guided drive."""
+
+STOPS_IN = 0.1
+"""Distance that the robot may roll on when a leg ends, m."""
+
+WIDEST = 2.5
+"""Largest ratio of effective track to wheel separation that the plan allows for.
+
+The smallest ratio is 1, because skidding only makes the track larger.
+"""
+
+
+class Setup(Struct, frozen=True):
+    """The robot, and the speeds and lengths of its guided drive."""
+
+    drive: DriveConfig
+    speed: float
+    """Speed straight ahead, m/s."""
+    length: float
+    """Length of the straight drive, m."""
+    reach: float
+    """Distance from the robot's middle to its outermost point, m."""
+    turning: float
+    """Largest turn rate that the limits allow, rad/s."""
+    wheel: float
+    """Largest rolling speed of the wheels in a turn, m/s."""
+
+    @property
+    def from_edge(self) -> float:
+        """Distance of the robot's middle from the near edge before the straight drive, m."""
+        return self.reach + EDGE
+
+    @property
+    def to_middle(self) -> float:
+        """Distance from the end of the straight drive back to the middle of the floor, m."""
+        return self.from_edge + self.length - ROOM / 2
+
+    def ahead(self, metres: float) -> Move:
+        """Return a straight move; a negative distance goes backwards."""
+        return Move(abs(metres) / self.speed, math.copysign(self.speed, metres))
+
+    def spin(self, rate: float, seconds: float) -> Move:
+        """Return a turn on the spot. `rate` is the turn rate without skidding, rad/s."""
+        return Move(seconds, 0.0, self.command(rate))
+
+    def arc(self, rate: float, metres: float) -> Move:
+        """Return a curve. `rate` is the turn rate without skidding, rad/s.
+
+        If `metres` is negative, the robot drives backwards.
+        """
+        straight = self.ahead(metres)
+        return Move(straight.seconds, straight.linear, self.command(rate))
+
+    def turn(self, angle: float, rate: float, track: float) -> Move:
+        """Return a turn on the spot by `angle` as an observer sees it, with skidding included.
+
+        Args:
+            angle: the angle in rad, positive to the left.
+            rate: the wanted turn rate in rad/s; the limits may reduce it.
+            track: the ratio of effective track to wheel separation.
+        """
+        command = abs(self.command(rate * track))
+        multiplier = self.drive.wheel_separation_multiplier
+        seconds = abs(angle) * track / (command * multiplier)
+        return Move(seconds, 0.0, math.copysign(command, angle))
+
+    def command(self, rate: float) -> float:
+        """Return the angular command for a turn rate without skidding, both in rad/s.
+
+        The command is within the limits. The daemon multiplies it by the configured multiplier of
+        the wheel separation, so it is divided by that multiplier here.
+        """
+        multiplier = self.drive.wheel_separation_multiplier
+        most = min(2 * self.wheel / self.drive.wheel_separation, self.turning * multiplier)
+        return max(-most, min(most, rate)) / multiplier
+
+
+Legs = Callable[[Setup, float], tuple[Leg, ...]]
+"""Function from a setup and the ratio of effective track to wheel separation to the legs.
+
+The first `turned` measurement shows that ratio. The legs up to this measurement are therefore the
+same for any ratio.
+"""
+
+TRACKS = [1.0 + 0.05 * step for step in range(round((WIDEST - 1.0) / 0.05) + 1)]
+"""Ratios of effective track to wheel separation for which the driving time is computed.
+
+Computing it for the largest ratio alone is not enough: with a smaller one, more whole turns fit
+into the time allowed, so that the drive can take longer.
+"""
+
+
+class Method(Struct, frozen=True):
+    """A method of calibration by a guided drive."""
+
+    legs: Legs
+    asks: tuple[Ask, ...] = ()
+    """Questions that the person answers before the first leg."""
+    tool: str = ""
+    """The tool of the person's measurements, in words; "" if a sensor measures instead."""
+
+    def longest_s(self, setup: Setup) -> float:
+        """Return the driving time in s for the effective track with which it is longest."""
+        return max(sum(leg.seconds for leg in self.legs(setup, track)) for track in TRACKS)
+
+
+def setup(config: Config) -> Setup:
+    """Return the speeds and lengths of the guided drive of this robot.
+
+    Raises `GuideError` if the robot is too large or its limits are too low.
+    """
+    drive, limits = config.drive, config.limits
+    slowing = math.sqrt(2 * STOPS_IN * limits.linear_deceleration)
+    speed = min(USUAL_SPEED, limits.linear_speed, slowing)
+    wheel = min(FASTEST_WHEEL, 0.9 * limits.wheel_speed * drive.wheel_radius)
+    speed = min(speed, wheel)
+    if speed < LEAST_SPEED or limits.angular_speed < LEAST_TURN:
+        raise GuideError(
+            f"the robot may not drive at {LEAST_SPEED} m/s and turn at {LEAST_TURN} rad/s: raise "
+            "limits.linear_speed, limits.angular_speed, limits.wheel_speed or "
+            "limits.linear_deceleration, or record a drive and use --log"
+        )
+    reach = REACH * drive.wheel_separation + drive.wheel_radius / 2
+    length = min(LONGEST, ROOM - 2 * (reach + EDGE) - STOPS_IN)
+    if length < SHORTEST:
+        raise GuideError(
+            f"the robot is too large to be calibrated on {ROOM:g} m x {ROOM:g} m "
+            f"(drive.wheel_separation = {drive.wheel_separation:g}): record a drive where there "
+            "is room, and use --log"
+        )
+    return Setup(drive, speed, length, reach, limits.angular_speed, wheel)

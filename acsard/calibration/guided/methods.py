@@ -1,0 +1,399 @@
+"""The table of the methods of calibration by a guided drive, and the legs of each.
+
+UMBmark is by Borenstein & Feng, UMBmark: A Benchmark Test for Measuring Odometry Errors in Mobile
+Robots (1995): the robot drives a square in both directions, and a person measures the distance
+between its start and its end. The paper evaluates this distance with two formulas for small errors.
+Here the same measurements go into the fit of `tape_readings.py` instead, because the track of a
+robot that skids is far from the configured one.
+"""
+
+from __future__ import annotations
+
+import math
+
+from acsard.calibration.guided.drive_plan import (
+    EDGE,
+    ROOM,
+    WIDEST,
+    Leg,
+    Mean,
+    Measure,
+    Method,
+    Move,
+    Setup,
+    Slant,
+)  # fmt: skip
+from acsard.calibration.tape_distance import LEAST_M
+from acsard.terminal.prompt import Ask
+
+TAPE_M = 0.005
+"""Standard deviation of the length of the straight drive by tape, m, both ends included."""
+
+BY_EYE = 0.07
+"""Standard deviation of a heading that a person judges by eye, rad."""
+
+END_M = 0.003
+"""Standard deviation of the distance between the marks and the end of a square, m.
+
+It includes the error with which the person placed the robot beside the marks.
+"""
+
+FIRST_TURN = 1.2
+"""Rate of the first turn as it would be without skidding, rad/s."""
+
+MISSED = 1.1
+"""Timeout of the first turn, as a multiple of the time that the widest track needs.
+
+After the timeout, the person has missed the moment at which the circle was full.
+"""
+
+MOST_SPIN_S = 24.0
+"""Longest time for several turns on the spot, s."""
+
+STOP, SETTLE = Move(0.6), Move(1.0)
+"""Pauses before and after a move: to come to rest, and to let the robot stop shaking."""
+
+ROUND = "once round"
+"""Name of the leg of the first turn, which a person ends with a key."""
+
+FROM_MARK = Ask(
+    "How far is that wheel from its mark now, in a straight line?", "m", LEAST_M, 2 * ROOM,
+    name="metres",
+)  # fmt: skip
+DISTANCE = Mean("distance", ("metres",), TAPE_M)
+
+
+def _at_the_edge(setup: Setup) -> str:
+    return (
+        f"Place the middle of the robot {setup.from_edge:.2f} m from the near edge of a free floor "
+        f"of {ROOM:g} m x {ROOM:g} m, {ROOM / 2:g} m from both sides, facing the far edge."
+    )
+
+
+def once_round(setup: Setup, until: str, asks: tuple[Ask, ...] = (), *measures: Measure) -> Leg:
+    """Return the leg in which the robot turns to the left until the person presses a key.
+
+    `until` ends the sentence that begins with "Press SPACE".
+    """
+    longest = MISSED * 2 * math.pi * WIDEST
+    rate = abs(setup.command(FIRST_TURN)) * setup.drive.wheel_separation_multiplier
+    words = f"The robot turns to the left on the spot. Press SPACE {until}"
+    turn = setup.spin(FIRST_TURN, longest / rate)
+    return Leg(ROUND, words, (turn,), asks, measures, by_key=True)
+
+
+def turns(setup: Setup, rate: float, track: float, most: int) -> int:
+    """Return the number of whole turns on the spot that fit into `MOST_SPIN_S`, from 1 to `most`.
+
+    `rate` is the true turn rate, rad/s. `track` is the ratio of effective track to wheel
+    separation.
+    """
+    one = setup.turn(2 * math.pi, rate, track).seconds
+    return max(1, min(most, int(MOST_SPIN_S / one)))
+
+
+# The method "tape": a tape measure, and a straight line on the floor.
+
+TO_LINE = (
+    Ask(
+        "How far is the front left wheel from the line, at a right angle?",
+        "mm",
+        0,
+        1500,
+        name="front",
+    ),
+    Ask("How far is the rear left wheel from the line?", "mm", 0, 1500, name="rear"),
+)
+LINE = "front", "rear", "wheelbase"
+"""Names of the answers `near`, `far` and `apart` of a `Slant`, for a line on the robot's left."""
+
+
+def _tape(setup: Setup, track: float) -> tuple[Leg, ...]:
+    def spun(how: str, side: int, rate: float, since: str) -> Leg:
+        # `rate` is a true rate, rad/s. Two rates show how the track depends on the rate.
+        count = turns(setup, rate, track, 3)
+        around = setup.turn(side * 2 * math.pi * count, rate, track)
+        to = "left" if side > 0 else "right"
+        words = f"The robot turns {count} full circles to the {to}, {how}."
+        measure = Slant("angle", *LINE, since=since)
+        return Leg(how, words, (SETTLE, around, SETTLE), TO_LINE, (measure,))
+
+    around = once_round(
+        setup,
+        "when it has turned one full circle and faces along the line as before; 20 deg too far or "
+        "too short do not matter.",
+        TO_LINE,
+        Slant("turned", *LINE, since="ahead", plus=2 * math.pi, over=("back", ROUND)),
+    )
+    return (
+        Leg(
+            "ahead",
+            f"On a free floor of {ROOM:g} m x {ROOM:g} m, find or draw a straight line across its "
+            "middle (a joint of tiles, a board, chalk). Place the robot to the right of the line, "
+            f"about 300 mm away, its middle {setup.from_edge:.2f} m from the near edge, facing "
+            "along the line, so that its front left and rear left wheel have the same distance "
+            "from the line, to the millimetre. Mark where one wheel stands. Do not move the robot "
+            "by hand until the calibration is done. The robot drives "
+            f"{setup.length:.2f} m straight ahead.",
+            (SETTLE, setup.ahead(setup.length), SETTLE),
+            (FROM_MARK, *TO_LINE),
+            (DISTANCE, Slant("angle", *LINE)),
+        ),
+        Leg(
+            "back", "The robot drives back to the middle.", (setup.ahead(-setup.to_middle), SETTLE)
+        ),
+        around,
+        spun("slowly", -1, 0.6, ROUND),
+        spun("fast", 1, 1.2, "slowly"),
+    )
+
+
+# The method "wall": a tape measure, and a wall that a person sets the robot's back against.
+
+GAP_M = 0.2
+"""Distance from the wall to which the robot returns, m."""
+
+OUT_M = 0.9
+"""Distance that the robot drives before the turns on the spot, m."""
+
+HALF_RATE, ROUND_RATE = 0.8, 1.2
+"""True turn rates for half turns and for whole turns, rad/s."""
+
+SQUARE = (
+    "Push the robot's back flat against the wall by hand, so that both its rear corners touch it"
+)
+
+
+def _corners(end: str) -> tuple[Ask, Ask]:
+    return (
+        Ask(f"How far is the robot's {end} left corner from the wall?", "mm", 0, 2500, name="left"),
+        Ask(f"How far is its {end} right corner from the wall?", "mm", 0, 2500, name="right"),
+    )
+
+
+# A turn to the left moves the rear left corner towards a wall behind the robot, and the front right
+# corner towards a wall in front of it.
+REAR, FRONT = ("left", "right", "rear width"), ("right", "left", "front width")
+
+
+def _wall(setup: Setup, track: float) -> tuple[Leg, ...]:
+    out, count = setup.ahead(setup.length), turns(setup, ROUND_RATE, track, 2)
+    around = setup.turn(-2 * math.pi * count, ROUND_RATE, track)
+
+    def there_and_back(to: str, side: int) -> Leg:
+        half = setup.turn(side * math.pi, HALF_RATE, track)
+        home = setup.ahead(setup.length - 2 * GAP_M)
+        return Leg(
+            f"half round to the {to}",
+            f"{SQUARE}. The robot drives away from the wall, turns half a circle to the {to}, and "
+            "drives back.",
+            (STOP, out, STOP, half, STOP, home, STOP),
+            _corners("front"),
+            (Slant("angle", *FRONT, plus=side * math.pi),),
+        )
+
+    return (
+        Leg(
+            "out",
+            f"Along a straight wall, {ROOM:g} m x {ROOM:g} m must be free. {SQUARE}, in the middle "
+            f"of that floor. The robot drives {setup.length:.2f} m away from the wall.",
+            (STOP, out, STOP),
+            (
+                Ask(
+                    "How far is the robot's back from the wall now?", "m", LEAST_M, 2 * ROOM,
+                    name="metres",
+                ),
+            ),
+            (DISTANCE,),
+        ),
+        once_round(
+            setup,
+            "when it has turned one full circle and faces straight away from the wall as before; "
+            "10 deg too far or too short do not matter.",
+        ),
+        Leg(
+            "home",
+            "The robot drives back towards the wall.",
+            (setup.ahead(GAP_M - setup.length), STOP),
+            _corners("rear"),
+            (Slant("turned", *REAR, plus=2 * math.pi, over=("out", ROUND, "home")),),
+        ),
+        there_and_back("left", 1),
+        there_and_back("right", -1),
+        Leg(
+            "round at the wall",
+            f"{SQUARE}. The robot drives away from the wall, turns {count} full circles to the "
+            "right, and drives back.",
+            (STOP, setup.ahead(OUT_M), STOP, around, STOP, setup.ahead(GAP_M - OUT_M), STOP),
+            _corners("rear"),
+            (Slant("angle", *REAR),),
+        ),
+    )  # fmt: skip
+
+
+# The method "umbmark": squares in both directions, and marks on the floor.
+
+CORNER_RATE = 0.9
+"""True turn rate at the corners, rad/s."""
+
+
+def side_of_square(setup: Setup) -> float:
+    """Return the length of the square's side, m: 1.2 m, or less if the robot is large."""
+    return min(1.2, ROOM - 2 * (setup.from_edge + 2 * EDGE))
+
+
+def _umbmark(setup: Setup, track: float) -> tuple[Leg, ...]:
+    edge = side_of_square(setup)
+    marks = "How far ahead of its mark is the middle of its {} side (negative if behind it)?"
+    ends = (
+        Ask(marks.format("left"), "mm", -1500, 1500, name="left"),
+        Ask(marks.format("right"), "mm", -1500, 1500, name="right"),
+        Ask(
+            "How far to the left of its marks is the robot (negative if to the right)?",
+            "mm", -1500, 1500, name="aside",
+        ),
+    )  # fmt: skip
+
+    def square(to: str, other: str, side: int) -> Leg:
+        corner = setup.turn(side * math.pi / 2, CORNER_RATE, track)
+        return Leg(
+            f"square to the {to}",
+            f"Place the robot's middle {(ROOM - edge) / 2:.2f} m from the near edge and as far "
+            f"from the {other} edge, facing the far edge. Make a mark on the floor exactly beside "
+            "the middle of its left side and of its right side. The robot drives a square of "
+            f"{edge:.2f} m with turns to the {to}, and ends about where it started.",
+            (STOP, *(setup.ahead(edge), STOP, corner, STOP) * 4),
+            ends,
+            (
+                Mean("ahead", ("left", "right"), END_M),
+                Mean("aside", ("aside",), END_M),
+                Slant("angle", "left", "right", "width"),
+            ),
+        )
+
+    return (
+        Leg(
+            "ahead",
+            f"{_at_the_edge(setup)} Mark where one wheel stands. The robot drives "
+            f"{setup.length:.2f} m straight ahead.",
+            (STOP, setup.ahead(setup.length), STOP),
+            (FROM_MARK,),
+            (DISTANCE,),
+        ),
+        once_round(
+            setup,
+            "exactly when it has turned one full circle and faces as before; the tool asks how far "
+            "it turns on after that.",
+            (
+                Ask(
+                    "How many degrees past a full circle did it turn (negative if less)?",
+                    "deg", -90, 90, name="past",
+                ),
+            ),
+            Mean("turned", ("past",), BY_EYE, plus=2 * math.pi),
+        ),
+        square("left", "right", 1),
+        square("right", "left", -1),
+    )  # fmt: skip
+
+
+# The methods "gyro" and "positions". Each drive goes there and back, so the robot stays on the
+# floor although its effective track is unknown.
+
+FAST, SLOW, CURVE = 1.5, 0.75, 0.8
+"""Rates of fast turns, slow turns and curves as they would be without skidding, rad/s."""
+
+SPIN_S, CURVE_M, TURN_RAD = 7.5, 1.2, 5.0
+"""Duration of a turn for a gyro, length of a curve, and angle of a turn for positions."""
+
+PETALS = ((FAST, CURVE), (-FAST, -CURVE), (SLOW, 0.0), (-SLOW, CURVE), (FAST, -CURVE))
+"""Rates of each turn on the spot and of the curve after it, rad/s, as without skidding."""
+
+STANDING, PAUSE, SHORT = Move(2.5), Move(1.4), Move(0.7)
+"""Pauses: before the first drive, between drives, and where the robot only has to stop.
+
+`STANDING` and `PAUSE` are long enough to measure the gyro bias in them.
+"""
+
+STRAIGHT = "straight"
+"""Name of the leg whose length the person measures by tape."""
+
+
+def _straight(setup: Setup, asks: tuple[Ask, ...] = ()) -> Leg:
+    return Leg(
+        STRAIGHT,
+        f"{_at_the_edge(setup)} Mark on the floor where one of its wheels stands. Do not move the "
+        "robot by hand until the calibration is done. The robot stands for "
+        f"{STANDING.seconds:g} s, then drives {setup.length:.2f} m straight ahead.",
+        (STANDING, setup.ahead(setup.length), PAUSE),
+        asks,
+    )
+
+
+def _gyro(setup: Setup, track: float) -> tuple[Leg, ...]:
+    moves = [PAUSE, setup.ahead(-setup.to_middle), PAUSE]
+    for rate in (FAST, -FAST, SLOW, -SLOW):
+        moves += [setup.spin(rate, SPIN_S), PAUSE]
+    for rate in (CURVE, -CURVE, 0.0):
+        moves += _there_and_back(setup, rate)
+    far = Ask(
+        "How far is that wheel from its mark now, in a straight line? Enter alone: not measured",
+        "m", 0.0, 2 * setup.length, 0.0, "metres",
+    )  # fmt: skip
+    return (
+        _straight(setup, (far,)),
+        Leg(
+            "turns",
+            "The robot drives back to the middle, turns on the spot to both sides, fast and "
+            "slowly, and drives three curves there and back.",
+            (*moves, PAUSE),
+        ),
+    )
+
+
+def _positions(setup: Setup, track: float) -> tuple[Leg, ...]:
+    # Positions show a turn on the spot only through the direction of the curve that follows it.
+    moves = [SHORT, setup.ahead(-setup.to_middle), SHORT]
+    for turn_rate, curve_rate in PETALS:
+        moves += [setup.spin(turn_rate, TURN_RAD / abs(turn_rate)), SHORT]
+        moves += _there_and_back(setup, curve_rate)
+    return (
+        _straight(setup),
+        Leg(
+            "turns",
+            "The robot drives back to the middle. Then it repeatedly turns a part of a circle on "
+            "the spot and drives a curve there and back.",
+            tuple(moves),
+        ),
+    )
+
+
+def _there_and_back(setup: Setup, rate: float) -> tuple[Move, ...]:
+    """Return a curve from the middle of the floor and the same curve backwards.
+
+    The curve stays on the floor whatever the robot's heading is.
+    """
+    metres = min(CURVE_M, ROOM / 2 - setup.from_edge)
+    return setup.arc(rate, metres), SHORT, setup.arc(-rate, -metres), SHORT
+
+
+WHEELBASE = Ask(
+    "How far apart are the front left and the rear left wheel, axle to axle?", "mm", 50, 2000,
+    name="wheelbase",
+)  # fmt: skip
+REAR_WIDTH = Ask(
+    "How far apart are the robot's rear corners, where they touch the wall?", "mm", 50, 2000,
+    name="rear width",
+)  # fmt: skip
+FRONT_WIDTH = Ask(
+    "How far apart are the robot's front corners?", "mm", 50, 2000, name="front width"
+)
+WIDTH = Ask("How wide is the robot, from side to side?", "mm", 50, 2000, name="width")
+
+METHODS: dict[str, Method] = {
+    "gyro": Method(_gyro),
+    "positions": Method(_positions),
+    "tape": Method(_tape, (WHEELBASE,), "a tape"),
+    "wall": Method(_wall, (REAR_WIDTH, FRONT_WIDTH), "a wall"),
+    "umbmark": Method(_umbmark, (WIDTH,), "UMBmark"),
+}

@@ -1,0 +1,316 @@
+"""Computes wheel radii and effective track from tape readings.
+
+A reading is one measurement of the robot's motion since a person last placed it: a distance, a
+turn, or a displacement. The fit is a Gauss-Newton fit to all readings. `calibration/positions.py`
+sums the path of the wheels that each reading is compared with.
+
+A reading differs from the path of the wheels because of the error of tape and eye, and because of
+skidding on the way. If there are enough readings, their scatter shows how much the robot skidded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration.evidence import (
+    COUNT,
+    INVERSE_TRACK,
+    LEFT,
+    RIGHT,
+    TRACK_GROWTH,
+    Base,
+    condition,
+)
+from acsard.calibration.fit import USUAL
+from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Mean, Measure, Quantity
+from acsard.calibration.log_table import Floats
+from acsard.calibration.plausibility import RefusedError, in_range
+from acsard.calibration.positions import WheelSteps, path, wheel_steps
+from acsard.calibration.runs import Run
+from acsard.calibration.wheel_angles import angles_of
+from acsard.core.config.settings import DriveConfig
+
+SKIDDING = 0.015
+"""Standard deviation of the heading by skidding after 1 m of rolling, rad.
+
+It grows with the square root of the distance.
+"""
+
+SKIDDING_LENGTH = 0.002
+"""Standard deviation of a distance by skidding, as a fraction of the distance."""
+
+UNKNOWN = 1.0
+"""Prior standard deviation of the mean radius, as a fraction."""
+
+PRIOR_FREE = 4.0
+"""Weight of the assumed skidding (`SKIDDING`, `SKIDDING_LENGTH`), as a number of readings."""
+
+LEAST_FREE = 3.0
+"""Smallest degrees of freedom for Student's t, whose standard deviation is infinite at 2."""
+
+MOST_STEPS = 50
+SMALL = 1e-9
+"""Largest step, as a fraction, at which the fit has converged."""
+
+WORST_CONDITION = 1e8
+"""Largest condition number at which the readings determine the parameters."""
+
+ACTIVE = [LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]
+"""Parameters that are fitted."""
+
+PRECISE = 0.2
+"""Largest standard deviation of a turn that the fit may start from, as a fraction of the turn."""
+
+
+class Reading(Struct, frozen=True):
+    """A measurement of the motion over one or more rides, in rad or m."""
+
+    rides: tuple[Run, ...]
+    """The recorded legs that the measurement covers, in order."""
+    quantity: Quantity
+    value: float
+    deviation: float
+    """Standard deviation of the measurement by tape or eye."""
+
+
+class Predicted(Struct, frozen=True):
+    """The value that a reading has if the robot follows its wheels, in rad or m."""
+
+    value: float
+    derivatives: Floats
+    """Derivatives of the value with respect to the parameters, shape (COUNT,)."""
+    variance: float
+    """Variance by skidding."""
+
+
+class TapeFit(Struct, frozen=True):
+    """The parameters that fit the readings best."""
+
+    parameters: Floats
+    covariance: Floats
+    residuals: Floats
+    """Measured minus predicted value of each reading."""
+    held_out: Floats
+    """The same residuals, each from a fit without its own reading; NaN if that fit fails."""
+
+
+def joined(rides: Sequence[Run]) -> WheelSteps:
+    """Return the wheel steps of several rides as if they were one ride."""
+    parts = [wheel_steps(ride, angles_of(ride)) for ride in rides]
+    ends = np.cumsum([0.0] + [float(part.t[-1]) for part in parts])
+    later = [part.t[1:] + end for part, end in zip(parts, ends, strict=False)]
+    t = np.concatenate([parts[0].t[:1], *later])
+    columns = zip(*((part.left, part.right, part.fast) for part in parts), strict=True)
+    return WheelSteps(t, *(np.concatenate(column) for column in columns))
+
+
+def predicted(steps: WheelSteps, quantity: Quantity, base: Base, parameters: Floats) -> Predicted:
+    """Return the value of a reading that the wheels and these parameters predict."""
+    driven = path(steps, base, parameters)
+    rolled = base.radius * float(np.abs(steps.left).sum() + np.abs(steps.right).sum()) / 2
+    derivatives = np.zeros(COUNT)
+    place, heading_variance = complex(driven.place[-1]), SKIDDING**2 * rolled
+    if quantity in ("turned", "angle"):
+        for index, values in driven.heading_derivatives.items():
+            derivatives[index] = values[-1]
+        return Predicted(float(driven.heading[-1]), derivatives, heading_variance)
+    # The direction of the measurement: towards the end point, ahead, or to the left.
+    along = {"ahead": 1.0 + 0j, "aside": 1j}.get(quantity, place / (abs(place) or 1.0))
+    for index, by_parameter in driven.derivatives.items():
+        derivatives[index] = (np.conj(along) * by_parameter[-1]).real
+    variance = (SKIDDING_LENGTH * abs(place)) ** 2
+    if quantity != "distance":
+        # A heading error on the way displaces the end by the error times the distance that is still
+        # to go. The mean square of this distance is a third of the span squared.
+        span = float(np.ptp(driven.place.real) + np.ptp(driven.place.imag))
+        variance += heading_variance * span**2 / 3
+    return Predicted(float((np.conj(along) * place).real), derivatives, variance)
+
+
+def fit_readings(readings: Sequence[Reading], base: Base) -> TapeFit:
+    """Fit the parameters to the readings. Raises `RefusedError` if they contradict each other."""
+    steps = [joined(reading.rides) for reading in readings]
+    start = _starting_parameters(readings, steps, base)
+    parameters, normal = _solved(readings, steps, base, start)
+    in_range(np.array([1 / parameters[INVERSE_TRACK], parameters[LEFT], parameters[RIGHT]]))
+    residuals, weights = _residuals(readings, steps, base, parameters)
+    # Combine the scatter of these readings with the assumed noise. If there are few readings, the
+    # scatter is uncertain itself, so widen the deviation to that of Student's t.
+    free = PRIOR_FREE + max(0.0, len(readings) - len(ACTIVE) + 1.0)
+    scale = (PRIOR_FREE + float(weights @ residuals**2)) / free
+    free = max(LEAST_FREE, free)
+    covariance = np.zeros((COUNT, COUNT))
+    inner = np.linalg.inv(normal[np.ix_(ACTIVE, ACTIVE)])
+    covariance[np.ix_(ACTIVE, ACTIVE)] = inner * max(1.0, scale) * free / (free - 2)
+    held_out = np.array(
+        [_held_out_residual(n, readings, steps, base, parameters) for n in range(len(readings))]
+    )
+    return TapeFit(parameters, covariance, residuals, held_out)
+
+
+def _starting_parameters(
+    readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base
+) -> Floats:
+    """Return starting parameters that agree with the first `turned` reading.
+
+    They are near enough to the truth to find the number of whole turns of each `angle` reading.
+    """
+    start = base.start()
+    for reading, steps_ in zip(readings, steps, strict=True):
+        if reading.quantity == "turned" and reading.deviation < PRECISE * abs(reading.value):
+            by_wheels = predicted(steps_, "turned", base, start).value
+            if not 0.1 < by_wheels / reading.value < 10.0:
+                raise RefusedError(
+                    f"by the wheels the robot turned by {math.degrees(by_wheels):.0f} deg, by your "
+                    f"measurement {math.degrees(reading.value):.0f}: start again, and let it turn "
+                    "one full circle to the left"
+                )
+            start[INVERSE_TRACK] *= reading.value / by_wheels
+            break
+    return start
+
+
+def _solved(
+    readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base, start: Floats
+) -> tuple[Floats, Floats]:
+    """Return the parameters and the normal equations.
+
+    Raises `RefusedError` if the readings do not determine the parameters.
+    """
+    parameters, configured = start.copy(), base.start()
+    for _ in range(MOST_STEPS):
+        normal, score = np.zeros((COUNT, COUNT)), np.zeros(COUNT)
+        for reading, steps_ in zip(readings, steps, strict=True):
+            prediction = predicted(steps_, reading.quantity, base, parameters)
+            weight = 1 / (reading.deviation**2 + prediction.variance)
+            normal += weight * np.outer(prediction.derivatives, prediction.derivatives)
+            score += weight * prediction.derivatives * _residual(reading, prediction.value)
+        normal[TRACK_GROWTH, TRACK_GROWTH] += USUAL[TRACK_GROWTH] ** -2
+        score[TRACK_GROWTH] -= parameters[TRACK_GROWTH] * USUAL[TRACK_GROWTH] ** -2
+        both = np.zeros(COUNT)
+        both[[LEFT, RIGHT]] = 0.5
+        normal += np.outer(both, both) / UNKNOWN**2
+        score += both * float(both @ (configured - parameters)) / UNKNOWN**2
+        inner = normal[np.ix_(ACTIVE, ACTIVE)]
+        if condition(inner) > WORST_CONDITION:
+            raise RefusedError(
+                "the measurements cannot separate the wheels from the track: the robot hardly "
+                "moved or hardly turned. Give it room, and start again"
+            )
+        step = np.linalg.solve(inner, score[ACTIVE])
+        parameters[ACTIVE] += step * min(1.0, 0.3 / (float(np.abs(step).max()) or 1.0))
+        if float(np.abs(step).max()) < SMALL:
+            return parameters, normal
+    raise RefusedError(
+        "the measurements contradict each other: is each number in its unit, and of the end that "
+        "the question names? Start again"
+    )
+
+
+def _residual(reading: Reading, prediction: float) -> float:
+    off = reading.value - prediction
+    return math.remainder(off, 2 * math.pi) if reading.quantity == "angle" else off
+
+
+def _residuals(
+    readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base, parameters: Floats
+) -> tuple[Floats, Floats]:
+    """Return the residual and the weight of each reading."""
+    residuals, weights = [], []
+    for reading, steps_ in zip(readings, steps, strict=True):
+        prediction = predicted(steps_, reading.quantity, base, parameters)
+        residuals.append(_residual(reading, prediction.value))
+        weights.append(1 / (reading.deviation**2 + prediction.variance))
+    return np.array(residuals), np.array(weights)
+
+
+def _held_out_residual(
+    number: int, readings: Sequence[Reading], steps: Sequence[WheelSteps], base: Base, start: Floats
+) -> float:
+    """Return the residual of one reading in the fit to all others, or NaN if that fit fails."""
+    kept = [n for n in range(len(readings)) if n != number]
+    try:
+        parameters, _ = _solved([readings[n] for n in kept], [steps[n] for n in kept], base, start)
+    except RefusedError:
+        return math.nan
+    prediction = predicted(steps[number], readings[number].quantity, base, parameters)
+    return _residual(readings[number], prediction.value)
+
+
+READ_M = 0.002
+"""Standard deviation of a measured distance of a few decimetres, m.
+
+The standard deviation with which a person places the robot on a line is the same.
+"""
+
+CREDIBLE = 0.85, 3.0
+"""Credible ratios of effective track to wheel separation. Outside them, a reading must be wrong."""
+
+Answers = dict[tuple[str, str], float]
+"""The person's answers in m and rad, by the names of the leg and of the question.
+
+The name of the leg is "" for questions that were asked before the first leg.
+"""
+
+
+def reading(measure: Measure, leg: str, rides: Mapping[str, Run], answers: Answers) -> Reading:
+    """Return the reading that the answers after a leg give.
+
+    Raises `RefusedError` if the answers are impossible.
+    """
+    driven = tuple(rides[name] for name in measure.over or (leg,))
+    if isinstance(measure, Mean):
+        numbers = [answers[leg, name] for name in measure.answers]
+        value = measure.plus + sum(numbers) / len(numbers)
+        return Reading(driven, measure.quantity, value, measure.deviation)
+    apart = answers["", measure.apart]
+
+    def angle(leg: str) -> float:
+        return slant(answers[leg, measure.near], answers[leg, measure.far], apart)
+
+    turned = angle(leg) - (angle(measure.since) if measure.since else 0.0)
+    # The turn is the difference of two angles, each from two distances: four errors of `READ_M`
+    # combine to twice `READ_M`.
+    return Reading(driven, measure.quantity, measure.plus + turned, 2 * READ_M / apart)
+
+
+def track_ratio(reading: Reading, drive: DriveConfig) -> float:
+    """Return the ratio of effective track to wheel separation that a `turned` reading shows.
+
+    It is an approximation for the next legs. Raises `GuideError` if it is not credible.
+    """
+    # Use the measured radius and separation without the configured multipliers.
+    base = Base(drive.wheel_radius, drive.wheel_separation, 1.0, 1.0, 1.0)
+    by_wheels = predicted(joined(reading.rides), "turned", base, base.start()).value
+    track = by_wheels / reading.value
+    least, most = CREDIBLE
+    if not least < track < most:
+        raise GuideError(
+            f"for one full circle the wheels report {math.degrees(by_wheels):.0f} deg: was it one "
+            "full circle, and do drive.wheel_radius and drive.wheel_separation agree with a tape? "
+            "Start again"
+        )
+    return min(WIDEST, max(1.0, track))
+
+
+def slant(near: float, far: float, apart: float) -> float:
+    """Return the angle in rad between the robot and a line, positive after a turn to the left.
+
+    Args:
+        near: the distance from the line to the point that a turn to the left moves towards it, m.
+        far: the distance from the line to the point that a turn to the left moves away from it, m.
+        apart: the distance between both points, m.
+
+    Raises `RefusedError` if the distances are impossible.
+    """
+    sine = (far - near) / apart
+    if abs(sine) > 0.98:
+        raise RefusedError(
+            f"points {apart * 1000:.0f} mm apart cannot be {near * 1000:.0f} and "
+            f"{far * 1000:.0f} mm from the line: measure again from the start"
+        )
+    return math.asin(sine)

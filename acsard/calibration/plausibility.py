@@ -1,0 +1,275 @@
+"""Checks whether a log and its calibration are plausible: signs, sides, units and times.
+
+A log with an error that would spoil the calibration is refused, and the message names the probable
+cause. Unusual facts that the calibration corrects or tolerates are reported as remarks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT, Base
+from acsard.calibration.log_table import Floats
+from acsard.calibration.search import StartingPoint
+from acsard.core.values import AcsardError
+
+UNLIKE = 0.5
+"""Largest part of a sensor's motion that the wheels may leave unexplained, as squares."""
+
+UNITS = 8.0
+"""Factor by which a result may be too large or too small. Beyond it, a unit must be wrong."""
+
+LEAST_TURN = 0.2
+"""Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
+
+A robot that skids turns further than this. If it turns less, its wheel speeds are probably in rpm.
+"""
+
+FAR_SIZE = 2e-3
+"""Ratio of the measured radius to the configured one below which the positions have a wrong unit.
+
+Between it and 1 / `UNITS`, the wheel speeds have a wrong unit.
+"""
+
+FASTEST_TURN = 12.0
+"""Fastest credible turn rate, rad/s.
+
+A higher rate is in degrees, since no robot turns twice a second.
+"""
+
+LEAST_CHI = 0.4
+"""Smallest ratio of effective track to wheel separation.
+
+WheelAngles that skid make the effective track larger, and nothing makes it this much smaller.
+"""
+
+LEAST_FACTOR, MOST_FACTOR = 0.1, 10.0
+"""Range of multipliers that the configuration accepts."""
+
+NOTABLE_S, FAR_S = 0.005, 0.5
+"""Delay of a sensor, s, from which it is reported, and above which the advice is to set clocks."""
+
+LARGE_BIAS = 0.05
+"""Gyro bias, rad/s, above which it is reported."""
+
+ONE_SIDED = 0.1
+"""Ratio of the turns to one side to those to the other below which this is reported."""
+
+ODD_SIZE = 1.25
+"""Ratio of the measured radius to the configured one from which it is reported."""
+
+LEAST_TRACK, MOST_TRACK = 0.85, 3.0
+"""Ratios of effective track to wheel separation that are usual. Others are reported."""
+
+
+class RefusedError(AcsardError):
+    """The log cannot be used for a calibration. The text says why and what to do."""
+
+
+class UnlikeError(RefusedError):
+    """The positions do not follow the wheels in blocks of the length that was tried."""
+
+
+def heading_follows(source: str, turned: Floats, by_wheels: Floats) -> None:
+    """Raise `RefusedError` if the sensor's turns differ much from those of the wheels.
+
+    Args:
+        source: the name of the heading sensor.
+        turned: the turn of each row by the sensor, rad.
+        by_wheels: the turn of each row by the wheels, rad, scaled to fit the sensor best.
+    """
+    spread = float(turned @ turned)
+    if not spread or float(np.sum((turned - by_wheels) ** 2)) > UNLIKE * spread:
+        raise RefusedError(
+            f"{source} does not follow the wheels: does it measure the upright axis (yaw, not "
+            "roll or pitch), is it from the same drive, on the same clock within 2 s, and did the "
+            "wheels touch the ground? Are the wheels' columns speeds, not angles?"
+        )
+
+
+def positions_follow(begun: StartingPoint) -> None:
+    """Raise `UnlikeError` if the positions do not follow the path of the wheels."""
+    if begun.unexplained > UNLIKE:
+        raise UnlikeError(
+            "the positions do not follow the wheels: are they x ahead and y to the left in m (not "
+            "latitude and longitude), from the same drive, on the same clock within 1 s?"
+        )
+
+
+def turns_the_right_way(source: str, sides: Floats | None, begun: StartingPoint | None) -> None:
+    """Raise `RefusedError`, naming the wrong sign, if wheels and sensors turn to different sides.
+
+    Args:
+        source: the name of the heading sensor.
+        sides: the result of `heading.first`, or None without a heading sensor.
+        begun: the best starting point that the positions give, or None without positions.
+    """
+    left = right = 1.0
+    if begun is not None:
+        left, right = np.sign(begun.parameters[[LEFT, RIGHT]] * begun.parameters[INVERSE_TRACK])
+    by_places = {(1.0, 1.0): "", (-1.0, -1.0): "turn", (-1.0, 1.0): "left"}.get(
+        (left, right), "right"
+    )
+    by_heading = by_places
+    if sides is not None:
+        by_heading = {(True, True): "", (False, False): "turn", (False, True): "left"}.get(
+            (bool(sides[0] > 0), bool(sides[1] > 0)), "right"
+        )
+    for side in ("left", "right"):
+        if side in (by_heading, by_places):
+            raise RefusedError(
+                f"the {side} wheels turn backwards when the robot goes ahead: their speeds have "
+                "the wrong sign; rad/s must be positive ahead on both sides"
+            )
+    if sides is not None and begun is not None and by_heading != by_places:
+        other = "x and y are swapped, or y is positive to the right"
+        sign = f"{source} has the wrong sign (it must be positive to the left)"
+        raise RefusedError(
+            f"wheels and positions agree on the direction of turns, but {source} does not: {sign}"
+            if by_heading
+            else f"wheels and {source} agree on the direction of turns, but the positions do not: "
+            f"{other}"
+        )
+    if by_heading:
+        sensor = source or "the positions"
+        # If both sensors agree, the wheels are wrong. Otherwise the only sensor may be wrong.
+        or_sensor = (
+            ""
+            if begun is not None and sides is not None
+            else ", or x and y are swapped, or y is positive to the right"
+            if sides is None
+            else ", or the sensor is positive to the right (it must be positive to the left)"
+        )
+        raise RefusedError(
+            f"by {sensor} the robot turns in the opposite direction than by the wheels: the "
+            "columns of left and right are swapped, or ahead is negative on both sides"
+            f"{or_sensor}"
+        )
+
+
+def turn_rates(source: str, turned: Floats, seconds: Floats) -> None:
+    """Raise `RefusedError` if the turns are in degrees, because no robot turns this fast.
+
+    The wheels are not compared here: if their speeds are in degrees too, both errors hide each
+    other.
+
+    Args:
+        source: the name of the heading sensor.
+        turned: the turn of each row by the sensor, rad.
+        seconds: the length of each row, s.
+    """
+    rate = float(np.percentile(np.abs(turned) / seconds, 90))
+    if rate > FASTEST_TURN:
+        raise RefusedError(
+            f"{source} is in degrees (multiply by pi / 180): it shows turns of {rate:.0f} rad/s; "
+            "also check that the wheel speeds are in rad/s, not deg/s, rpm or mm/s"
+        )
+
+
+def turn_units(source: str, turn: float, bare: float, base: Base) -> None:
+    """Raise `RefusedError` if the turns are so far from the wheels' that a unit must be wrong.
+
+    Args:
+        source: the name of the sensor of turns.
+        turn: the ratio of the measured turn to the turn by the configured multipliers.
+        bare: the ratio of the measured turn to the turn by wheel radius and separation alone.
+        base: the configured geometry.
+    """
+    if LEAST_TURN < turn < UNITS and bare < 1 / LEAST_CHI:
+        return
+    may = (
+        f"{source} is in degrees (multiply by pi / 180), or the wheel speeds are in m/s (divide "
+        "by the wheel radius) or turns/s (multiply by 2 pi)"
+        if turn > 1
+        else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
+    )
+    raise RefusedError(
+        f"the robot turns {turn:.3g} times as far as its wheels report: {may}, or "
+        f"drive.wheel_radius = {base.radius:g} and drive.wheel_separation = {base.separation:g} "
+        "belong to another robot (--config)"
+    )
+
+
+def distance_units(size: float, base: Base) -> None:
+    """Raise `RefusedError` if distances are so far from the wheels' that a unit must be wrong.
+
+    `size` is the ratio of the measured radius to the configured one.
+    """
+    if 1 / UNITS < size < UNITS:
+        return
+    may = (
+        "the wheel speeds are in m/s (divide by the wheel radius), or the positions in mm or cm"
+        if size > 1
+        else "the positions are latitude and longitude, or in km (they must be x ahead and y to "
+        "the left, in m)"
+        if size < FAR_SIZE
+        else "the wheel speeds are in deg/s, rpm or counts, or are angles (they must be in rad/s)"
+    )
+    raise RefusedError(
+        f"the robot drives {size:.3g} times as far as its wheels report: {may}, or "
+        f"drive.wheel_radius = {base.radius:g} belongs to another robot (--config)"
+    )
+
+
+def in_range(values: Floats) -> None:
+    """Raise `RefusedError` if the configuration does not accept these multipliers."""
+    if np.all((values >= LEAST_FACTOR) & (values <= MOST_FACTOR)):
+        return
+    shown = ", ".join(f"{value:.3g}" for value in values)
+    raise RefusedError(
+        f"the multipliers are {shown} (wheel separation, left, right), but must be from "
+        f"{LEAST_FACTOR:g} to {MOST_FACTOR:g}: write the measured drive.wheel_radius and "
+        "drive.wheel_separation into the configuration first"
+    )
+
+
+def remarks(
+    delays: dict[str, float],
+    bias: float,
+    turned: Floats,
+    values: Floats,
+    base: Base,
+    *,
+    sized: bool,
+) -> Iterator[str]:
+    """Yield a sentence for each unusual fact that the calibration corrects or tolerates.
+
+    Args:
+        delays: the delay of each sensor behind the wheels, s.
+        bias: the gyro bias, rad/s.
+        turned: the turn of each row, rad, positive to the left.
+        values: the multipliers of the track, the left and the right radius.
+        base: the configured geometry.
+        sized: whether the size of the wheels was measured.
+    """
+    for source, seconds in delays.items():
+        if abs(seconds) >= NOTABLE_S:
+            word = "later" if seconds > 0 else "earlier"
+            far = "; set the clocks" if abs(seconds) > FAR_S else ""
+            yield (
+                f"the times of {source} are {abs(seconds) * 1000:.0f} ms {word} than those of the "
+                f"wheels; the calibration has corrected this{far}"
+            )
+    if abs(bias) > LARGE_BIAS:
+        yield (
+            f"the gyro turns by {bias:.3f} rad/s while the robot stands: the calibration has "
+            "corrected this large value"
+        )
+    left, right = float(turned[turned > 0].sum()), float(-turned[turned < 0].sum())
+    if min(left, right) < ONE_SIDED * max(left, right):
+        yield "nearly all turns are to one side, so differences between the sides are not measured"
+    size = float(values[1:].mean())
+    if sized and not 1 / ODD_SIZE < size < ODD_SIZE:
+        yield (
+            f"the wheels are {size:.3g} times as large as drive.wheel_radius = {base.radius:g}: "
+            "measure it, and check that wheel speeds are in rad/s and x, y in m"
+        )
+    track = float(values[0])
+    if not LEAST_TRACK < track < MOST_TRACK:
+        yield (
+            f"an effective track of {track:.3g} times drive.wheel_separation = "
+            f"{base.separation:g} is unusual (1 to 2.5 is usual): measure it, and check all "
+            "units"
+        )

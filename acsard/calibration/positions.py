@@ -1,0 +1,266 @@
+"""Evidence from positions, of any source: the path of the wheels is compared with the positions.
+
+The path of each block is first shifted and rotated so that it fits the positions best. The
+residuals of this alignment are the evidence, so no start pose, frame or yaw is needed. Places are
+complex numbers x + iy in m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from msgspec import Struct
+
+from acsard.calibration.evidence import (
+    COUNT,
+    DELAY,
+    INVERSE_TRACK,
+    LEFT,
+    RIGHT,
+    SENSOR_X,
+    SENSOR_Y,
+    TRACK_GROWTH,
+    Base,
+    Evidence,
+    huber,
+)  # fmt: skip
+from acsard.calibration.log_table import Floats
+from acsard.calibration.runs import Complexes, Run
+from acsard.calibration.wheel_angles import Block, WheelAngles, cumulative
+
+LEAST_POINTS = 5
+"""Smallest number of positions in a block, which has three unknowns: shift (two) and rotation."""
+
+FINE_S = 0.02
+"""Time step in which the path is summed, s. Finer steps cost time and add no accuracy."""
+
+JUMP, JUMP_M = 6.0, 0.05
+"""Difference between a step of the positions and the wheels' motion that counts as a jump.
+
+It is `JUMP` standard deviations plus `JUMP_M` m. After a jump, the position is an outlier, or the
+source has relocalized.
+"""
+
+SPEED_S = 0.05
+"""Half of the interval from which the speed along the path is computed, s."""
+
+
+class Segment(Struct, frozen=True):
+    """The positions of a block between two jumps of their source."""
+
+    block: int
+    """Number of the block."""
+    run: int
+    """Number of the run."""
+    t: Floats
+    """Times of the positions, s."""
+    place: Complexes
+    """Positions x + iy, m."""
+
+
+class WheelSteps(Struct, frozen=True):
+    """The motion of the wheels of a run, in the steps in which its path is summed."""
+
+    t: Floats
+    """Ends of the steps, s, with the begin of the first one in front."""
+    left: Floats
+    """Angle that the left wheels roll in each step, rad."""
+    right: Floats
+    fast: Floats
+    """|right - left| (right - left) in each step, rad2/s."""
+
+
+class Path(Struct, frozen=True):
+    """The path of a run according to the wheels. It is linear between the times."""
+
+    t: Floats
+    place: Complexes
+    """Place x + iy of the robot at these times, m."""
+    heading: Floats
+    """Heading at these times, rad."""
+    derivatives: dict[int, Complexes]
+    """Derivatives of `place` with respect to parameters, by the index of the parameter."""
+    heading_derivatives: dict[int, Floats]
+    """Derivatives of `heading` with respect to the same parameters."""
+
+    def at(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
+        """Return the sensor's place when it measured positions, with the derivatives of the place.
+
+        `t` has the recorded times of the positions, which are delayed by the parameter DELAY. The
+        derivatives have the shape (times, COUNT).
+        """
+        t = t - parameters[DELAY]
+        derivatives = np.zeros((len(t), COUNT), dtype=np.complex128)
+        here, ahead = self._sensor(t, parameters)
+        lever = 1j * complex(parameters[SENSOR_X], parameters[SENSOR_Y]) * ahead
+        for index, values in self.derivatives.items():
+            turned = np.interp(t, self.t, self.heading_derivatives[index])
+            derivatives[:, index] = np.interp(t, self.t, values) + lever * turned
+        derivatives[:, SENSOR_X], derivatives[:, SENSOR_Y] = ahead, 1j * ahead
+        before, after = (self._sensor(t + s, parameters)[0] for s in (-SPEED_S, SPEED_S))
+        derivatives[:, DELAY] = (before - after) / (2 * SPEED_S)
+        return here, derivatives
+
+    def _sensor(self, t: Floats, parameters: Floats) -> tuple[Complexes, Complexes]:
+        """Return the sensor's place, and the robot's heading as a complex number of length 1."""
+        ahead = np.exp(1j * np.interp(t, self.t, self.heading))
+        lever = complex(parameters[SENSOR_X], parameters[SENSOR_Y])
+        return np.interp(t, self.t, self.place) + lever * ahead, ahead
+
+
+def segments(
+    driven: Sequence[Run], angles: Sequence[WheelAngles], parts: Sequence[Block]
+) -> list[Segment]:
+    """Return the positions of each block, split at jumps."""
+    edges = [jumps(run, wheels) for run, wheels in zip(driven, angles, strict=True)]
+    found = []
+    for number, part in enumerate(parts):
+        run = driven[part.run]
+        a, b = np.searchsorted(run.place_t, (part.begin, part.end))
+        cuts = edges[part.run]
+        for piece in np.split(np.arange(a, b), cuts[(cuts > a) & (cuts < b)] - a):
+            if len(piece) >= LEAST_POINTS:
+                found.append(Segment(number, part.run, run.place_t[piece], run.place[piece]))
+    return found
+
+
+def jumps(run: Run, wheels: WheelAngles) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """Return the indices of the positions before which the source jumped."""
+    steps = np.abs(np.diff(run.place))
+    if len(steps) < LEAST_POINTS:
+        return np.zeros(0, dtype=np.int64)
+    left, right = wheels.angles(run.place_t)
+    rolled = np.maximum(np.abs(np.diff(left)), np.abs(np.diff(right)))
+    moving = rolled > 0.25 * float(np.max(rolled))
+    per_rad = float(np.median(steps[moving] / rolled[moving])) if moving.any() else 0.0
+    beyond = steps - per_rad * rolled
+    usual = 1.4826 * float(np.median(np.abs(beyond - np.median(beyond))))
+    return np.flatnonzero(beyond > JUMP * usual + JUMP_M) + 1
+
+
+def wheel_steps(run: Run, wheels: WheelAngles, fine_s: float = FINE_S) -> WheelSteps:
+    """Return the wheel steps of a run, each of about `fine_s` s or one sample."""
+    usual = float(np.median(np.diff(run.t)))
+    every = max(1, int(fine_s / usual))
+    kept = np.unique(np.append(np.arange(0, len(run.t), every), len(run.t) - 1))
+    t, left, right = run.t[kept], wheels.left[kept], wheels.right[kept]
+    apart, steps = wheels.speed_difference((t[1:] + t[:-1]) / 2), np.diff(t)
+    return WheelSteps(t, np.diff(left), np.diff(right), np.abs(apart) * apart * steps)
+
+
+def path(steps: WheelSteps, base: Base, parameters: Floats) -> Path:
+    """Return the path of the robot, which starts at the origin with heading 0.
+
+    Each step is an exact arc.
+    """
+    left, right, turn, rate = parameters[[LEFT, RIGHT, INVERSE_TRACK, TRACK_GROWTH]]
+    gain = base.gain * turn
+    mean = gain * (left + right) / 2
+    turn_derivatives = {
+        LEFT: -gain * steps.left,
+        RIGHT: gain * steps.right,
+        INVERSE_TRACK: base.gain * (right * steps.right - left * steps.left),
+        TRACK_GROWTH: -mean * abs(mean) * steps.fast,
+    }
+    turns = turn * turn_derivatives[INVERSE_TRACK] + rate * turn_derivatives[TRACK_GROWTH]
+    rolls = {LEFT: base.radius * steps.left / 2, RIGHT: base.radius * steps.right / 2}
+    distance = left * rolls[LEFT] + right * rolls[RIGHT]
+    heading, ahead = _directions(turns)
+    derivatives, heading_derivatives = {}, {}
+    for index, of_step in turn_derivatives.items():
+        heading_derivatives[index] = cumulative(of_step)
+        middle = heading_derivatives[index][:-1] + of_step / 2
+        derivatives[index] = _sums(ahead * (rolls.get(index, 0.0) + 1j * distance * middle))
+    return Path(steps.t, _sums(ahead * distance), heading, derivatives, heading_derivatives)
+
+
+def place(steps: WheelSteps, base: Base, parameters: Floats) -> Complexes:
+    """Return the place of the robot at the times of the steps, like `Path.place` but faster.
+
+    The track does not change with the turn rate here.
+    """
+    left, right = parameters[LEFT] * steps.left, parameters[RIGHT] * steps.right
+    _, ahead = _directions(base.gain * parameters[INVERSE_TRACK] * (right - left))
+    return _sums(ahead * base.radius * (left + right) / 2)
+
+
+def _directions(turns: Floats) -> tuple[Floats, Complexes]:
+    """Return the headings at the ends of the steps, and the chord of each step's arc.
+
+    A chord is for an arc of length 1, as a complex number.
+    """
+    heading = cumulative(turns)
+    return heading, np.exp(1j * (heading[:-1] + turns / 2)) * np.sinc(turns / (2 * np.pi))
+
+
+def _sums(steps: Complexes) -> Complexes:
+    return np.concatenate((np.zeros(1, dtype=np.complex128), np.cumsum(steps)))
+
+
+Paths = Sequence[Path] | Mapping[int, Path]
+"""Paths by the number of the run."""
+
+
+class Aligned(Struct, frozen=True):
+    """The positions of a segment, compared with the path that was aligned with them."""
+
+    block: int
+    """Number of the block."""
+    residual: Complexes
+    """Position minus path, m, times the root of the weight."""
+    derivatives: Complexes
+    """Derivatives of the aligned path with respect to the parameters, times the root of the weight.
+
+    The shift and the rotation of the alignment follow each change of a parameter.
+    """
+
+
+def aligned(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> Iterator[Aligned]:
+    """Align the path of each segment with its positions, and yield the result.
+
+    Outliers have a smaller weight.
+    """
+    for segment in segments:
+        place, derivatives = paths[segment.run].at(segment.t, parameters)
+        weight = np.ones(len(place))
+        for _ in range(3):
+            share = weight / weight.sum()
+            centred, centred_path = segment.place - share @ segment.place, place - share @ place
+            match = np.vdot(centred_path, weight * centred)
+            turn = match / abs(match) if match else 1.0
+            residual = centred - turn * centred_path
+            weight = huber(residual, 1e-6)
+        columns = turn * (derivatives - share @ derivatives)
+        across = 1j * turn * centred_path
+        size = float(np.sum(weight * np.abs(centred_path) ** 2))
+        if size:
+            along = np.real(np.conj(across) @ (weight[:, None] * columns)) / size
+            columns = columns - across[:, None] * along
+        root = np.sqrt(weight)
+        yield Aligned(segment.block, root * residual, root[:, None] * columns)
+
+
+def evidence(
+    segments: Sequence[Segment], paths: Paths, parameters: Floats, blocks: int
+) -> Evidence:
+    """Return the evidence at these parameters."""
+    normal, score = np.zeros((blocks, COUNT, COUNT)), np.zeros((blocks, COUNT))
+    squares, counts = np.zeros(blocks), np.zeros(blocks)
+    for part in aligned(segments, paths, parameters):
+        conj = np.conj(part.derivatives.T)
+        normal[part.block] += np.real(conj @ part.derivatives)
+        score[part.block] += np.real(conj @ part.residual)
+        squares[part.block] += float(np.sum(np.abs(part.residual) ** 2))
+        # Each position gives two numbers. The alignment uses up three: a shift and a rotation.
+        counts[part.block] += 2 * len(part.residual) - 3
+    return Evidence(normal, score, squares, counts)
+
+
+def spread(segments: Sequence[Segment], paths: Paths, parameters: Floats) -> float:
+    """Return the RMS distance of the positions from the aligned paths, m."""
+    squares, count = 0.0, 0
+    for part in aligned(segments, paths, parameters):
+        squares += float(np.sum(np.abs(part.residual) ** 2))
+        count += len(part.residual)
+    return float(np.sqrt(squares / max(1, count)))

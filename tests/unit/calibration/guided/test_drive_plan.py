@@ -1,0 +1,101 @@
+"""Tests of the steps, speeds and distances of a guided calibration."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.calibration.guided.drive_plan import (
+    FASTEST_WHEEL,
+    USUAL_SPEED,
+    GuideError,
+    Leg,
+    Move,
+    setup,
+)
+from acsard.calibration.guided.methods import METHODS
+from acsard.core.config.settings import Config, DriveConfig, LimitsConfig
+from tests.unit.calibration.guided.room import beyond
+
+SPIN = st.floats(-5.0, 5.0).filter(lambda rate: abs(rate) > 0.1)
+
+
+def robot(
+    separation: float = 0.3, multiplier: float = 1.0, limits: LimitsConfig | None = None
+) -> Config:
+    drive = DriveConfig(wheel_separation=separation, wheel_separation_multiplier=multiplier)
+    return Config(drive=drive, limits=limits or LimitsConfig())
+
+
+@given(
+    rate=SPIN,
+    separation=st.floats(0.1, 0.8),
+    multiplier=st.floats(0.5, 2.5),
+    linear=st.floats(0.06, 2.0),
+    angular=st.floats(0.3, 10.0),
+    wheel=st.floats(3.0, 60.0),
+)
+def test_no_command_is_beyond_the_limits_or_faster_than_slow(
+    rate: float, separation: float, multiplier: float, linear: float, angular: float, wheel: float
+) -> None:
+    limits = LimitsConfig(linear_speed=linear, angular_speed=angular, wheel_speed=wheel)
+    made = setup(robot(separation, multiplier, limits))
+    ahead, spin = made.ahead(1.0), made.spin(rate, 1.0)
+    assert ahead.linear <= min(USUAL_SPEED, linear) + 1e-12
+    assert abs(spin.angular) <= angular * (1 + 1e-12)
+    rolls = abs(spin.angular) * multiplier * separation / 2
+    assert rolls <= min(FASTEST_WHEEL, wheel * 0.05) * (1 + 1e-12)
+    assert ahead.linear <= wheel * 0.05
+    assert math.copysign(1, spin.angular) == math.copysign(1, rate)
+
+
+@given(angle=SPIN, track=st.floats(1.0, 2.5), multiplier=st.floats(0.5, 2.5))
+def test_a_turn_by_the_true_track_is_the_angle_whatever_is_configured(
+    angle: float, track: float, multiplier: float
+) -> None:
+    move = setup(robot(multiplier=multiplier)).turn(angle, 0.9, track)
+    assert move.angular * multiplier / track * move.seconds == pytest.approx(angle)
+
+
+@pytest.mark.parametrize("way", METHODS)
+@pytest.mark.parametrize("separation", [0.15, 0.3, 0.6])
+@pytest.mark.parametrize("multiplier", [1.0, 1.6])
+def test_every_point_of_the_robot_stays_in_the_room(
+    way: str, separation: float, multiplier: float
+) -> None:
+    """This holds for every track, and if the first turn measured the track with an error of 3 %."""
+    made = setup(robot(separation, multiplier))
+    for track in (1.0, 1.4, 1.9, 2.5):
+        for off, bend in ((0.97, 0.01), (1.03, -0.01)):
+            assert beyond(way, made, track, min(2.5, track * off), bend) <= 1e-6, (track, off)
+
+
+def test_a_robot_that_would_leave_the_room_is_found() -> None:
+    made = msgspec.structs.replace(setup(Config()), length=2.6)
+    assert beyond("gyro", made, 1.0, 1.0, 0.0) > 0.05
+
+
+def test_a_robot_too_large_for_the_room_is_told_what_to_do() -> None:
+    with pytest.raises(GuideError, match="--log"):
+        setup(robot(1.4))
+
+
+@pytest.mark.parametrize(
+    "limits", [LimitsConfig(linear_speed=0.01), LimitsConfig(angular_speed=0.1)]
+)
+def test_limits_that_are_too_low_are_named(limits: LimitsConfig) -> None:
+    with pytest.raises(GuideError, match="limits"):
+        setup(robot(limits=limits))
+
+
+def test_the_straight_drive_ends_short_however_weak_the_brakes() -> None:
+    made = setup(robot(limits=LimitsConfig(linear_deceleration=0.05)))
+    assert made.speed**2 / (2 * 0.05) <= 0.1 + 1e-9
+
+
+def test_a_leg_lasts_as_long_as_its_moves() -> None:
+    assert Leg("", "", (Move(1.5), Move(2.0, 0.3))).seconds == 3.5

@@ -1,0 +1,88 @@
+"""Tests that turn the messages of the bus into a run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acsard.calibration.guided.leg_recorder import Recorder, Sample, times
+from acsard.calibration.log_table import LogError
+from acsard.core.config.settings import JointsConfig
+from acsard.core.messages.schema import (
+    Header,
+    Imu,
+    JointState,
+    Odometry,
+    Pose,
+    PoseStamped,
+    PoseWithCovariance,
+    Quaternion,
+    Time,
+    Twist,
+    TwistWithCovariance,
+    Vector3,
+)  # fmt: skip
+
+JOINTS = JointsConfig().as_tuple()
+
+
+def stamped(seconds: float) -> Header:
+    return Header(Time.from_ns(round(seconds * 1e9)))
+
+
+def wheels(seconds: float, right: float, left: float) -> JointState:
+    return JointState(stamped(seconds), list(JOINTS), [0.0] * 4, [right, left, left, right])
+
+
+def recorded() -> Recorder:
+    """Record wheel messages and a gyro.
+
+    The wheel messages have another clock's stamps and arrive at least 0.1 s late. The gyro has no
+    stamps.
+    """
+    recorder = Recorder(JOINTS)
+    for k in range(100):
+        at = 10.0 + 0.02 * k
+        recorder.wheels(wheels(at + 5000.0, 3.0, 1.0), at + 0.1 + 0.05 * (k % 3))
+        imu = Imu(
+            Header(), Quaternion(), [0.0] * 9, Vector3(z=0.5), [0.0] * 9, Vector3(), [0.0] * 9
+        )
+        recorder.gyro(imu, at)
+    return recorder
+
+
+def test_samples_are_as_far_apart_as_their_stamps_say_and_the_soonest_came_at_once() -> None:
+    run = recorded().run()
+    assert np.diff(run.t) == pytest.approx(0.02)
+    # The gyro began at 10.0 s on this computer's clock, the wheels 0.1 s later.
+    assert run.gyro_t[0] == pytest.approx(-0.1)
+    assert set(run.left) == {1.0}
+    assert set(run.right) == {3.0}
+    assert set(run.gyro) == {0.5}
+
+
+def test_stamps_that_jump_are_not_believed() -> None:
+    samples = [Sample(float(k), k + (100.0 if k > 5 else 0.0), ()) for k in range(10)]
+    assert list(times(samples)) == [float(k) for k in range(10)]
+
+
+def test_positions_are_taken_from_a_pose_and_from_odometry_alike() -> None:
+    pose = Pose(Vector3(1.0, 2.0), Quaternion())
+    unknown = [0.0] * 36
+    twist = TwistWithCovariance(Twist(Vector3(), Vector3()), unknown)
+    for message in (
+        PoseStamped(stamped(1.0), pose),
+        Odometry(stamped(1.0), "base", PoseWithCovariance(pose, unknown), twist),
+    ):
+        recorder = Recorder(JOINTS)
+        recorder.place(message, 5.0)
+        assert recorder.samples["places"] == [Sample(5.0, 1.0, (1.0, 2.0))]
+
+
+def test_the_fastest_wheel_is_told_whichever_way_it_turns() -> None:
+    assert Recorder(JOINTS).wheels(wheels(1.0, 1.0, -4.0), 1.0) == 4.0
+
+
+def test_without_wheels_there_is_no_run() -> None:
+    with pytest.raises(LogError):
+        Recorder(JOINTS).run()

@@ -1,0 +1,170 @@
+"""Tests that turn tape readings and spins into parameters and their standard deviations."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acsard.calibration.evidence import INVERSE_TRACK, LEFT, RIGHT
+from acsard.calibration.guided.drive_plan import WIDEST, GuideError, Quantity
+from acsard.calibration.guided.methods import MOST_SPIN_S, once_round, turns
+from acsard.calibration.guided.tape_readings import (
+    Reading,
+    fit_readings,
+    joined,
+    predicted,
+    slant,
+    track_ratio,
+)  # fmt: skip
+from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.runs import Run
+from acsard.core.config.settings import DriveConfig
+from tests.unit.calibration.cut import BASE, IDEAL, log_of, table
+from tests.unit.calibration.guided.played import Player, usual_setup
+from tests.unit.calibration.robots import Plan, Robot, drive
+
+SPIN: Plan = [(0.5, 0, 0), (15, 0, 1.2), (1, 0, 0)]
+STRAIGHT: Plan = [(0.5, 0, 0), (6, 0.3, 0), (1, 0, 0)]
+CURVE: Plan = [(0.5, 0, 0), (6, 0.3, 0.4), (1, 0, 0)]
+
+TRUE = {"chi": 1.5, "left": 0.98, "right": 1.01}
+
+
+def driven(plan: Plan) -> tuple[Run, complex, float]:
+    """Return the wheel log of a robot without noise, its true end position and its true heading."""
+    made = drive(replace(Robot(), **(IDEAL | TRUE)), plan)  # type: ignore[arg-type]
+    run = log_of(table(made, gyro=False)).runs[0]
+    return run, complex(made.where[-1]), float(made.yaw[-1])
+
+
+def readings() -> list[Reading]:
+    """Return one exact reading of every kind."""
+    spin, _, turned = driven(SPIN)
+    straight, end, bent = driven(STRAIGHT)
+    curve, there, _ = driven(CURVE)
+    return [
+        Reading((spin,), "turned", turned, 0.01),
+        Reading((straight,), "distance", abs(end), 0.002),
+        Reading((straight,), "angle", bent, 0.01),
+        Reading((curve,), "ahead", there.real, 0.002),
+        Reading((curve,), "aside", there.imag, 0.002),
+    ]
+
+
+def test_exact_readings_give_the_robot() -> None:
+    told = fit_readings(readings(), BASE)
+    assert 1 / told.parameters[INVERSE_TRACK] == pytest.approx(1.5, rel=2e-3)
+    assert told.parameters[LEFT] == pytest.approx(0.98, rel=1e-3)
+    assert told.parameters[RIGHT] == pytest.approx(1.01, rel=1e-3)
+    assert np.all(np.abs(told.residuals) < 3e-3)
+
+
+def test_whole_turns_that_were_not_counted_do_not_matter() -> None:
+    given = readings()
+    spin, _, turned = driven(SPIN)
+    given.append(Reading((spin,), "angle", math.remainder(turned, 2 * math.pi), 0.01))
+    assert fit_readings(given, BASE).parameters == pytest.approx(
+        fit_readings(readings(), BASE).parameters, abs=3e-3
+    )
+
+
+@pytest.mark.parametrize("what", ["turned", "distance", "ahead", "aside"])
+def test_derivatives_are_those_of_small_steps(what: Quantity) -> None:
+    """The computed derivatives ignore a small second-order effect of the rate parameter."""
+    steps = joined([driven(CURVE)[0]])
+    start = np.array([0.99, 1.01, 0.7, 0.03, 0.0, 0.0, 0.0])
+    told = predicted(steps, what, BASE, start)
+    for index in range(4):
+        more = start.copy()
+        more[index] += 1e-6
+        derivative = (predicted(steps, what, BASE, more).value - told.value) / 1e-6
+        assert told.derivatives[index] == pytest.approx(derivative, rel=0.02)
+
+
+def test_rides_that_follow_each_other_are_one() -> None:
+    spin, _, turned = driven(SPIN)
+    straight, end, bent = driven(STRAIGHT)
+    parameters = np.array([0.98, 1.01, 1 / 1.5, 0.0, 0.0, 0.0, 0.0])
+    steps = joined([spin, straight])
+    assert np.all(np.diff(steps.t) > 0)
+    assert predicted(steps, "turned", BASE, parameters).value == pytest.approx(
+        turned + bent, abs=2e-3
+    )
+    there = end * cmath.exp(1j * turned)
+    assert predicted(steps, "ahead", BASE, parameters).value == pytest.approx(there.real, abs=5e-3)
+
+
+def test_readings_that_contradict_each_other_are_less_sure() -> None:
+    exact, worse = readings(), readings()
+    spin, _, turned = driven(SPIN)
+    for measured, wrong in ((exact, 0.0), (worse, 0.6)):
+        measured += [Reading((spin,), "turned", turned + side * wrong, 0.01) for side in (1, -1)]
+    sure, unsure = (
+        fit_readings(one, BASE).covariance[INVERSE_TRACK, INVERSE_TRACK] for one in (exact, worse)
+    )
+    assert unsure > 4 * sure
+
+
+def test_a_robot_that_never_turned_tells_nothing_of_the_track() -> None:
+    with pytest.raises(RefusedError, match="hardly turned"):
+        fit_readings([one for one in readings() if one.quantity == "distance"], BASE)
+
+
+def test_a_turn_that_the_wheels_deny_is_refused() -> None:
+    given = readings()
+    given[0] = Reading(given[0].rides, "turned", -given[0].value, 0.01)
+    with pytest.raises(RefusedError, match="to the left"):
+        fit_readings(given, BASE)
+
+
+@given(angle=st.floats(-1.3, 1.3), apart=st.floats(0.1, 1.0))
+def test_two_distances_from_a_line_are_an_angle(angle: float, apart: float) -> None:
+    """A turn to the left brings the front closer to a line on the robot's left."""
+    half = apart / 2 * math.sin(angle)
+    assert slant(1.0 - half, 1.0 + half, apart) == pytest.approx(angle, abs=1e-9)
+
+
+def test_distances_that_no_robot_can_have_are_refused() -> None:
+    with pytest.raises(RefusedError, match="measure again"):
+        slant(0.1, 0.5, 0.25)
+
+
+@pytest.mark.parametrize("track", [1.0, 1.7, WIDEST])
+def test_a_first_turn_has_the_time_that_the_widest_track_takes(track: float) -> None:
+    move = once_round(usual_setup(), "").moves[-1]
+    assert move.angular * move.seconds / track > 2 * math.pi
+
+
+@pytest.mark.parametrize("track", [1.0, 1.7, WIDEST])
+@pytest.mark.parametrize("rate", [0.6, 1.2])
+def test_there_is_time_for_the_turns(track: float, rate: float) -> None:
+    setup = usual_setup()
+    count = turns(setup, rate, track, 3)
+    assert 1 <= count <= 3
+    assert setup.turn(2 * math.pi * count, rate, track).seconds <= MOST_SPIN_S
+
+
+def once(chi: float) -> Reading:
+    """Return the reading of a first turn with this track, ended after about one revolution."""
+    player = Player(replace(Robot(chi=chi), **IDEAL))  # type: ignore[arg-type]
+    run = player.ride(once_round(usual_setup(), ""))
+    return Reading((run,), "turned", player.yaw, 0.01)
+
+
+@pytest.mark.parametrize("chi", [1.0, 1.6, 2.4])
+@pytest.mark.parametrize("multiplier", [1.0, 1.6])
+def test_one_turn_tells_the_track_whatever_is_configured(chi: float, multiplier: float) -> None:
+    drive = DriveConfig(wheel_separation_multiplier=multiplier)
+    assert track_ratio(once(chi), drive) == pytest.approx(chi, rel=1e-3)
+
+
+def test_a_turn_that_was_no_whole_one_is_told() -> None:
+    half = once(2.4)
+    with pytest.raises(GuideError, match="one full circle"):
+        track_ratio(Reading(half.rides, "turned", math.pi, 0.01), DriveConfig())

@@ -1,0 +1,130 @@
+"""Calibration names the error in a log: every wrong sign, side and unit, on whole logs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acsard.calibration.plausibility import RefusedError, in_range, remarks, turn_units
+from tests.unit.calibration.cut import BASE, calibrated, table, usual
+from tests.unit.calibration.robots import Drive
+
+DRIVE = usual()
+WRONG = {
+    "gyro": replace(DRIVE, gyro=-DRIVE.gyro),
+    "sides": replace(DRIVE, left=DRIVE.right, right=DRIVE.left),
+    "left": replace(DRIVE, left=-DRIVE.left),
+    "right": replace(DRIVE, right=-DRIVE.right),
+    "ahead": replace(DRIVE, left=-DRIVE.left, right=-DRIVE.right),
+    "mirror": replace(DRIVE, place=DRIVE.place.conj()),
+    "degrees": replace(DRIVE, gyro=np.degrees(DRIVE.gyro)),
+    "m/s": replace(DRIVE, left=DRIVE.left * 0.05, right=DRIVE.right * 0.05),
+    "rpm": replace(DRIVE, left=DRIVE.left * 9.55, right=DRIVE.right * 9.55),
+    "mm": replace(DRIVE, place=DRIVE.place * 1000),
+    "both degrees": replace(
+        DRIVE,
+        gyro=np.degrees(DRIVE.gyro),
+        left=np.degrees(DRIVE.left),
+        right=np.degrees(DRIVE.right),
+    ),
+    "degrees, rpm": replace(
+        DRIVE, gyro=np.degrees(DRIVE.gyro), left=DRIVE.left * 9.55, right=DRIVE.right * 9.55
+    ),
+    "degrees, mm/s": replace(
+        DRIVE, gyro=np.degrees(DRIVE.gyro), left=DRIVE.left * 50, right=DRIVE.right * 50
+    ),
+    "m/s, large": replace(DRIVE, left=DRIVE.left * 0.165, right=DRIVE.right * 0.165),
+    "latitude": replace(DRIVE, place=DRIVE.place * 9e-6),
+    "another clock": replace(DRIVE, gyro_t=DRIVE.gyro_t + 1.7e9),
+    "later": replace(DRIVE, gyro_t=DRIVE.gyro_t + 5.0),
+}
+
+
+@pytest.mark.variations(3)
+@pytest.mark.parametrize(
+    ("what", "gyro", "places", "words"),
+    [
+        ("gyro", True, False, "positive to the left"),
+        ("gyro", True, True, "yaw_rate has the wrong sign"),
+        ("sides", True, False, "left and right are swapped"),
+        ("sides", False, True, "left and right are swapped"),
+        ("sides", True, True, "left and right are swapped"),
+        ("ahead", True, True, "ahead is negative on both sides"),
+        ("left", True, False, "the left wheels turn backwards"),
+        ("left", False, True, "the left wheels turn backwards"),
+        ("right", True, False, "the right wheels turn backwards"),
+        ("right", False, True, "the right wheels turn backwards"),
+        ("mirror", True, True, "y is positive to the right"),
+        ("mirror", False, True, "y is positive to the right"),
+        ("degrees", True, False, "yaw_rate is in degrees"),
+        ("m/s", True, False, "wheel speeds are in m/s"),
+        ("m/s", False, True, "wheel speeds are in m/s"),
+        ("rpm", True, False, "rpm"),
+        ("rpm", False, True, "rpm"),
+        ("mm", False, True, "mm or cm"),
+        ("both degrees", True, False, "yaw_rate is in degrees"),
+        ("degrees, rpm", True, False, "yaw_rate is in degrees"),
+        ("degrees, mm/s", True, False, "yaw_rate is in degrees"),
+        ("m/s, large", True, False, "wheel speeds are in m/s"),
+        ("latitude", False, True, "latitude and longitude"),
+        ("another clock", True, False, "times of one clock"),
+        ("another clock", True, True, "times of one clock"),
+        ("later", True, False, "does not follow the wheels"),
+    ],
+)
+def test_it_is_refused_by_its_name(what: str, gyro: bool, places: bool, words: str) -> None:
+    with pytest.raises(RefusedError) as refused:
+        calibrated(table(WRONG[what], gyro=gyro, places=places))
+    assert words in str(refused.value)
+
+
+def test_rpm_are_refused_also_with_the_configuration_of_another_robot() -> None:
+    """Its radius may be a larger share of its separation than in the default configuration."""
+    with pytest.raises(RefusedError, match="rpm"):
+        turn_units("yaw_rate", 1.9 * 2 * np.pi / 60, 1.9 * 2 * np.pi / 60, BASE)
+    turn_units("yaw_rate", 1 / 3.5, 1 / 3.5, BASE)
+
+
+def odometry(robot: Drive) -> Drive:
+    """Return the log with the driver's own wheel odometry as its positions and turn rate."""
+    turn = (robot.right - robot.left) * 0.05 / 0.45
+    yaw = np.cumsum(turn) * 0.01
+    ahead = np.exp(1j * (yaw - turn * 0.005))
+    way = np.asarray(np.cumsum((robot.left + robot.right) / 2 * 0.05 * ahead), np.complex128)
+    return replace(
+        robot, gyro_t=robot.t, gyro=turn, place_t=robot.t[::10], place=way[::10] * 0.01
+    )  # fmt: skip
+
+
+@pytest.mark.variations(2)
+@pytest.mark.parametrize(("gyro", "places"), [(True, False), (False, True)])
+def test_what_was_made_of_the_same_wheels_is_told(gyro: bool, places: bool) -> None:
+    log = table(odometry(DRIVE), gyro=gyro, places=places)
+    assert any("computed from the same wheels" in note for note in calibrated(log).notes)
+    usual_log = table(DRIVE, gyro=gyro, places=places)
+    assert not any("same wheels" in note for note in calibrated(usual_log).notes)
+
+
+def test_positions_of_another_drive_are_refused() -> None:
+    x, y = np.random.default_rng(1).normal(size=(2, len(DRIVE.place)))
+    still = replace(DRIVE, place=x + 1j * y)
+    with pytest.raises(RefusedError, match="positions"):
+        calibrated(table(still, gyro=False))
+
+
+def test_multipliers_that_cannot_be_written_are_refused() -> None:
+    in_range(np.array([2.51, 1.0, 1.0]))
+    with pytest.raises(RefusedError, match=r"from 0\.1 to 10"):
+        in_range(np.array([12.0, 1.0, 1.0]))
+
+
+def test_what_is_unusual_is_told() -> None:
+    told = list(
+        remarks({"yaw_rate": 0.6}, 0.2, np.ones(5), np.array([5.0, 2, 2]), BASE, sized=True)
+    )
+    assert len(told) == 5
+    assert not list(
+        remarks({"x": 0.001}, 0.0, np.array([1.0, -1]), np.array([1.6, 1, 1]), BASE, sized=True)
+    )
