@@ -33,8 +33,8 @@ from acsard.core.messages.topics import (
 from acsard.core.values import Plain, Pose
 from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.daemon.bus.identity import Identity, identity
-from acsard.daemon.bus.quiet import why as why_quiet
-from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.robot_discovery import presence
+from acsard.daemon.bus.silent_key import explain_silence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
 from acsard.daemon.bus.zenoh_sessions import client_session
@@ -363,13 +363,15 @@ class Client:
             if why := us.lacks(key):
                 return NotPermittedError(why)
         where = self.where
-        seen = around(self.session, where.robot_id, where.endpoint)
+        seen = presence(self.session, where.robot_id, where.endpoint)
         if seen is None or seen.here or not where.endpoint:
             return NoAnswerError(
                 f"{no_answer}; is the daemon of robot.id {where.robot_id!r} stuck, does it have "
                 "this key (`acsard topics`), and may you query it?"
             )
-        return NoAnswerError(f"{no_answer}: {why_quiet(key, where.robot_id, where.endpoint, seen)}")
+        return NoAnswerError(
+            f"{no_answer}: {explain_silence(key, where.robot_id, where.endpoint, seen)}"
+        )
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Convert the error to its documented type, and add the role of the certificate in it."""
