@@ -25,7 +25,7 @@ from acsard.core.incoming.bus_interface import (
 from acsard.core.incoming.commands import Receiver, caller_name, parts, sender
 from acsard.core.incoming.imu import GyroFollower
 from acsard.core.incoming.queries import Queries, Query, refused
-from acsard.core.link.line_gate import Port
+from acsard.core.link.serial_output import Port
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.report import Report
 from acsard.core.messages.schema import Info, Message

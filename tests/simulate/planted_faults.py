@@ -410,7 +410,7 @@ FAULTS = (
     fault(
         "gate late",
         "a line that was made before a stall leaves after it",
-        "core/link/line_gate.py",
+        "core/link/serial_output.py",
         "if now_ns - made_ns > self._period_ns and",
         "if False and",
     ),
