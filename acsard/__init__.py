@@ -18,14 +18,14 @@ this order as contracts, and `lint-imports` checks them.
 
     cli/             one file per verb: its options, one call into another package, its output
     bench/           `acsard bench`: measures a daemon from outside
-    doctor/          `acsard doctor`: what is wrong with this installation
     foxglove/        `acsard foxglove`: a live server for Foxglove
-    certificates/    certificates for other machines
     report/          `acsard recording report`: what a recording shows, as a page
     top/             `acsard top`, `acsard drive` and `acsard fleet`: the robot in a terminal
     web/             `acsard web`: the robot's page, in a process of its own
     calibration/     `acsard calibrate`, by a log or a drive of its own, and `acsard accuracy`: how
                      much each cause contributes to the odometry's error
+    machine/         what an administrator does with the computer: `acsard doctor`, certificates for
+                     other machines, the serial ports, the system service
     client/          follow and drive a robot from Python, synchronous or with asyncio; the
                      follower and the commander hold the rules and time limits of all tools
     daemon/          the process: control loop, latch file, ways down
@@ -33,11 +33,11 @@ this order as contracts, and `lint-imports` checks them.
     daemon/bus/      the Zenoh sessions: subscriptions, publications, replies, access rules
     daemon/serial/   the serial port
     recording/       the black box: steps to MCAP and back, a ring of files, replay
-    prompts/         how a verb asks the person beside the robot: at a terminal or by a program
-    host/            the machine: clock, timers, threads and the mailboxes between them, child
-                     processes, files, rate limits, systemd, logs, errors
+    terminal/        tables and output of all tools, by the library rich; how a verb asks the person
+                     beside the robot: at a terminal, or through a program in JSON
+    host/            what every process uses: clock, timers, threads and the mailboxes between
+                     them, child processes, files, rate limits, systemd, logs, errors
     checkup/         `acsard mcu check`: one module for each question to the board
-    terminal/        tables and output of all tools, by the library rich
     core/            the robot as a pure function: no clock, no I/O, no thread
 
 Inside `core/`, in the same order:

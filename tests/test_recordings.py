@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from acsard.recording.file import Recording
-from acsard.recording.replayed import differs, live
+from acsard.recording.file_replay import replay_file
+from acsard.recording.replay_text import describe_difference
 from tests.each import each
 
 RECORDINGS = sorted((Path(__file__).parent / "recordings").glob("*.mcap"))
@@ -28,10 +29,10 @@ def test_there_are_some_and_each_is_small() -> None:
 @each("path", RECORDINGS)
 def test_it_comes_out_as_it_did(path: Path) -> None:
     recording = Recording(path)
-    tally, trouble, _ = live(recording)
+    comparison, trouble, _ = replay_file(recording)
     assert trouble == ""
-    if tally.first is not None:
-        pytest.fail("\n".join(differs(tally.first, recording.about.mono_ns)))
-    assert tally.lines == tally.lines_same > 100
-    assert tally.modes_same == tally.steps
-    assert tally.exact, "an estimate is another in its last bits"
+    if comparison.first is not None:
+        pytest.fail("\n".join(describe_difference(comparison.first, recording.about.mono_ns)))
+    assert comparison.lines == comparison.lines_same > 100
+    assert comparison.modes_same == comparison.steps
+    assert comparison.exact, "an estimate is another in its last bits"

@@ -13,7 +13,7 @@ from rich.console import RenderableType
 
 from acsard import __version__
 from acsard.bench.matching import Summary
-from acsard.terminal.tables import table
+from acsard.terminal.output import table
 
 POINTS = {
     "command_to_wire": "put() here -> first byte of the line at the port's far end",

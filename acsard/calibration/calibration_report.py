@@ -12,7 +12,7 @@ from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import DriveConfig
 from acsard.core.config.writing import excerpt
 from acsard.core.formatting import many
-from acsard.terminal.tables import table
+from acsard.terminal.output import table
 
 NAMES = (
     "wheel_separation_multiplier", "left_wheel_radius_multiplier", "right_wheel_radius_multiplier",

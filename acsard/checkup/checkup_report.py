@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import reduce
 from operator import attrgetter, getitem
-from typing import Any
+from typing import Any, get_args
 
 from msgspec import Struct, ValidationError
-from rich.table import Table
-from rich.text import Text
 
 from acsard.checkup import lateness
-from acsard.checkup.findings import REST, Finding
+from acsard.checkup.findings import REST, Finding, Verdict
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import effective, from_builtins
 from acsard.core.config.settings import Config
 from acsard.core.config.writing import excerpt
-from acsard.terminal.tables import table
 
 Changes = dict[str, object]
 """New values by dotted key, in the order of the file."""
@@ -84,9 +81,6 @@ def applied(given: Changes, config: Config) -> Config | None:
         return None
 
 
-COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
-
-
 class Report(Struct, frozen=True):
     """A check that has ended.
 
@@ -139,18 +133,10 @@ def failed(findings: Sequence[Finding]) -> bool:
     return any(finding.verdict == "FAIL" for finding in findings)
 
 
-def row(finding: Finding) -> Table:
-    """Return the verdict with name and figure, then the meaning and the remedy."""
-    verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
-    below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
-    head = f"{finding.name:<22} {finding.figure}"
-    return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
-
-
 def summary(found: Report, where: str) -> str:
     """Return the number of each verdict and of unjudged findings, and the lines for `where`."""
     verdicts = [finding.verdict for finding in found.findings]
-    counts = ", ".join(f"{verdicts.count(v)} {v}" for v in COLOURS if v in verdicts)
+    counts = ", ".join(f"{verdicts.count(v)} {v}" for v in get_args(Verdict) if v in verdicts)
     if late := lateness.unjudged(found.findings):
         again = "so the check has not passed: try again when this computer is idle"
         counts += f"\n{len(late)} not judged, {again}"

@@ -1,7 +1,8 @@
-"""The command line: one module per verb, each with `add` (its options) and `main` (its work).
+"""The command line: one module per verb. Its docstring is the text of its `--help`.
 
-The parser imports only the module of the verb that is called. Each `main` imports heavy libraries
-itself, so that `--help` stays fast.
+Each module has `add`, which declares the options, and `main`, which calls one room and prints. Only
+the module of the verb that is called is imported, so the modules import at their top all that the
+verb needs. Libraries that may be missing are the exception.
 """
 
 from __future__ import annotations
@@ -12,48 +13,48 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Collection
 from decimal import Decimal
 from importlib import import_module
 from typing import NoReturn
 
 from acsard import __version__
-from acsard.cli.exits import code_of
 from acsard.core.config.nearest import nearest
 from acsard.core.formatting import lines
 from acsard.core.values import AcsardError
 from acsard.host.errors import Exit, MendableError
 
-VERBS = (
-    "run",
-    "sim",
-    "check",
-    "topics",
-    "echo",
-    "get",
-    "hz",
-    "top",
-    "fleet",
-    "foxglove",
-    "drive",
-    "web",
-    "call",
-    "whoami",
-    "set",
-    "bench",
-    "doctor",
-    "ports",
-    "mcu",
-    "accuracy",
-    "calibrate",
-    "recording",
-    "tls",
-    "gateway",
-    "router",
-    "service",
-    "completion",
-)
-"""The verbs in the order of the help text. Each one is the name of a module of this package."""
+VERBS = {
+    "run": "run the daemon (the default verb)",
+    "sim": "simulate a microcontroller on a pty, for a separate `acsard run --port …`",
+    "check": "check the configuration and print the effective one",
+    "topics": "list the keys on the bus: direction, type, rate, meaning",
+    "echo": "print the messages on a key as JSON lines",
+    "get": "query a key once and print the answer as JSON",
+    "hz": "measure the message rate of a key",
+    "top": "show the robot's status on one screen, live",
+    "fleet": "show one live line per robot",
+    "foxglove": "show the robot live in Foxglove or Lichtblick",
+    "drive": "drive the robot with the keyboard",
+    "web": "serve the robot's page: see, stop and drive the robot in a browser",
+    "call": "call a service, such as stop or clear",
+    "whoami": "show your role on this robot, your certificate and your sender id",
+    "set": "change a setting of the running robot, or list the changeable settings",
+    "bench": "measure how fast the daemon is on this machine",
+    "doctor": "find the problems on this machine and their fixes",
+    "ports": "list the serial ports, the processes that use them, and the likely MCU",
+    "mcu": "test the microcontroller on your own robot with its wheels lifted",
+    "accuracy": "show the causes of odometry error now, and their fixes",
+    "calibrate": "measure wheel radii and effective track width, by a guided or a recorded drive",
+    "recording": "list, show, replay, export and draw recordings",
+    "tls": "make the certificates with which other machines connect",
+    "gateway": "run the TLS gateway, which admits clients from other machines",
+    "router": "run a fleet's Zenoh router and restart it when a client blocks it",
+    "service": "install acsard as a system service, remove it, or show its status",
+    "completion": "print the script for completion with Tab in a shell",
+    "man": "print the text of every --help as a man page",
+}
+"""The verbs in the order of `acsard --help`, with their lines in it. Each one is a module here."""
 
 _EPILOG = """\
 exit codes: 0 done, 1 failure, 2 wrong usage, 66 no such port, 69 daemon unreachable, 75 port,
@@ -79,8 +80,8 @@ class _Parser(argparse.ArgumentParser):
             raise
 
 
-def parser(names: Sequence[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of the `acsard` command with these verbs."""
+def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
+    """Return the parser of the `acsard` command; it has the options of these verbs only."""
     whole = _Parser(
         prog="acsard",
         description="The hardware interface of a four-wheel differential-drive robot. It connects "
@@ -91,8 +92,12 @@ def parser(names: Sequence[str] = VERBS) -> argparse.ArgumentParser:
     )
     whole.add_argument("--version", action="version", version=f"acsard {__version__}")
     verbs = whole.add_subparsers(title="verbs", metavar="VERB", dest="verb")
-    for name in names:
-        import_module(f"acsard.cli.{name}").add(verbs)
+    for name, text in VERBS.items():
+        verb = verbs.add_parser(name, help=text)
+        if name in called:
+            module = import_module(f"acsard.cli.{name}")
+            verb.description = module.__doc__
+            module.add(verb)
     return whole
 
 
@@ -104,11 +109,11 @@ def main(argv: list[str] | None = None) -> int:
         words.insert(0, "run")
     try:
         try:
-            args = parser(_needed(words[0])).parse_args(words)
+            args = parser(words[:1]).parse_args(words)
             return int(args.main(args))
         except AcsardError as error:
             print(f"acsard: {lines(str(error))}", file=sys.stderr)
-            return int(code_of(error) if isinstance(error, MendableError) else Exit.FAILURE)
+            return int(error.code if isinstance(error, MendableError) else Exit.FAILURE)
         finally:
             sys.stdout.flush()
     except OSError as error:
@@ -120,13 +125,6 @@ def main(argv: list[str] | None = None) -> int:
         return int(Exit.OK if isinstance(error, BrokenPipeError) else Exit.FAILURE)
     except KeyboardInterrupt:
         return 130
-
-
-def _needed(word: str) -> Sequence[str]:
-    """Return the verbs to import for this first word: only the verb itself if it is a verb."""
-    if word == "--version":
-        return ()
-    return (word,) if word in VERBS else VERBS
 
 
 _EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][+-]?\d{1,3}")

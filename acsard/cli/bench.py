@@ -1,15 +1,7 @@
-"""`acsard bench`: measure how fast the daemon is on this machine."""
-
-from __future__ import annotations
-
-import argparse
-
-from acsard.cli.common import Overrides, add_config, load
-
-_DESCRIPTION = """\
-Measure how fast the daemon is on this machine. The tool starts a daemon of its own on a simulated
-microcontroller; a daemon that already runs is not disturbed. It commands and follows the new daemon
-from another process and prints the times. It does not judge them. A busy machine gives worse times.
+"""Measure how fast the daemon is on this machine. The tool starts a daemon of its own on a
+simulated microcontroller; a daemon that already runs is not disturbed. It commands and follows the
+new daemon from another process and prints the times. It does not judge them. A busy machine gives
+worse times.
 
 what is measured, and between which points (all by one clock):
   command -> wire       from the call of put() in this process, at random times, until the first
@@ -26,22 +18,27 @@ With --port the tool uses the real microcontroller. It sends only zero speeds, s
 It cannot see the wire then, so it omits the times on the wire. Stop the robot's daemon first.
 """
 
-LONGEST_S = 600.0
-"""Longest measurement, s. Every sample stays in memory to the end: 60 MB at 100 Hz in this time."""
+from __future__ import annotations
+
+import argparse
+import signal
+
+import msgspec
+
+from acsard.bench.measure import bench_config, measure
+from acsard.bench.results_table import parts
+from acsard.cli.common import add_config, load, seconds
+from acsard.daemon.serial.device import require
+from acsard.terminal.output import show
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "bench",
-        help="measure how fast the daemon is on this machine",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add_config(parser)
     parser.add_argument(
         "--seconds",
-        type=duration,
+        type=seconds,
         default=20.0,
         metavar="N",
         help="duration of the measurement in seconds (default: 20)",
@@ -59,33 +56,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.set_defaults(main=main)
 
 
-def duration(text: str) -> float:
-    """Return the number of seconds: an argparse type.
-
-    Raises `ArgumentTypeError` below 1 s, and above the time whose samples fit into memory.
-    """
-    value = float(text)
-    if not 1.0 <= value <= LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text} is not from 1 to {LONGEST_S:g} s")
-    return value
-
-
 def main(args: argparse.Namespace) -> int:
     """Run the measurement and print its figures."""
-    import signal
-
-    import msgspec
-
-    from acsard.bench.measure import bench_config, measure
-    from acsard.bench.results_table import parts
-    from acsard.daemon.serial.device import require
-    from acsard.terminal.output import show
-
     port = "" if args.port in (None, "sim") else args.port
     if port:
         require(port)
-    given: Overrides = {"control": {"rate": args.rate}} if args.rate is not None else {}
-    _, config = load(args.config, given)
+    _, config = load(args.config, {"control.rate": args.rate})
     # However this process is ended, the daemon and the far end of the port must end with it.
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)

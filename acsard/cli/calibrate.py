@@ -1,6 +1,15 @@
-"""`acsard calibrate`: find wheel radii and effective track from a guided or a recorded drive.
-
-The package `calibration` computes them; `calibrate_drive.py` runs the guided drive.
+"""Measure the wheel radii and the effective track width, each with its standard deviation, and say
+how much they improve the odometry. Without --log the tool drives the robot and guides a person at
+this terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m,
+starts each leg with Enter, stops it with any key, and types the tape measurements that the tool
+asks for. The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box
+recording of a robot with a gyro, or a CSV file with a header. The CSV file has the column t (s) and
+the wheel speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro),
+or x and y (m, from any source of positions) with or without yaw (rad), or both. The column run (any
+name) separates several drives. The columns may be in any order, and a cell is empty if its sensor
+has no value then. A good log begins with 3 s of standing still. It contains straight drives, turns
+to both sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the
+values. Otherwise it is 1, and a message says what to do instead.
 """
 
 from __future__ import annotations
@@ -9,49 +18,30 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import msgspec
+
+from acsard.calibration.calibration_report import Refusal, keys, parts, report
+from acsard.calibration.guided.drive_plan import GuideError
+from acsard.calibration.log_table import LogError
+from acsard.calibration.plausibility import RefusedError
+from acsard.calibration.recorded_drive import calibrated
+from acsard.calibration.tape_distance import Tape
 from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
-from acsard.cli.common import JSON_LINES, add_bus, load
+from acsard.cli.common import add_outcome, load, require_asking
+from acsard.cli.connection import add_bus
 from acsard.host.config_file import change, writable
 from acsard.host.errors import Exit, ExitError, UsageError
-
-if TYPE_CHECKING:
-    from acsard.calibration.solve import Calibration
-    from acsard.calibration.tape_distance import Tape
-    from acsard.core.config.settings import DriveConfig
-    from acsard.prompts.json_prompt import JsonPrompt
-
-DESCRIPTION = """\
-Measure the wheel radii and the effective track width, each with its standard deviation, and say how
-much they improve the odometry. Without --log the tool drives the robot and guides a person at this
-terminal through the drive. The person stands near the robot on a free floor of 3 m x 3 m, starts
-each leg with Enter, stops it with any key, and types the tape measurements that the tool asks for.
-The robot drives for at most 90 s. With --log the tool uses a recorded drive: a black-box recording
-of a robot with a gyro, or a CSV file with a header. The CSV file has the column t (s) and the wheel
-speeds in rad/s, "fr,fl,rl,rr" or "left,right". It also has yaw_rate (rad/s, from a gyro), or x and
-y (m, from any source of positions) with or without yaw (rad), or both. The column run (any name)
-separates several drives. The columns may be in any order, and a cell is empty if its sensor has no
-value then. A good log begins with 3 s of standing still. It contains straight drives, turns to both
-sides, slow and fast, and curves, for 60 s or more. The exit code is 0 if the tool found the values.
-Otherwise it is 1, and a message says what to do instead.
-"""
+from acsard.terminal.json_prompt import JsonPrompt
+from acsard.terminal.output import SENTENCES, plain, show
+from acsard.terminal.prompt import NobodyError
 
 DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""
 
-MOST_BYTES = 1 << 30
-"""Largest log in bytes. The whole log is read into memory."""
 
-
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "calibrate",
-        help="measure wheel radii and effective track width, by a guided drive or from a "
-        "recorded one",
-        description=DESCRIPTION,
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_bus(parser)
     add_options(parser)
     parser.add_argument(
@@ -68,16 +58,7 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         "tape measure. It determines how large the wheels are. Without RUN it applies to "
         "the straightest run",
     )
-    how = parser.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print one JSON object")
-    how.add_argument("--json-lines", action="store_true", help=JSON_LINES)
-    parser.add_argument(
-        "--write",
-        action="store_true",
-        help="also write the result into the configuration file and keep its comments (needs "
-        "the library tomlkit; if it is missing, a message gives the command that installs "
-        "it)",
-    )
+    add_outcome(parser, "the result")
     parser.set_defaults(main=main)
 
 
@@ -85,34 +66,19 @@ def main(args: argparse.Namespace) -> int:
     """Run the calibration and print its result."""
     if not args.json_lines or args.log:
         return _calibrate(args, None)
-    if args.yes:
-        raise UsageError(
-            "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
-            "asks them through a program. Leave one out"
-        )
-    from acsard.prompts.json_prompt import JsonPrompt
-
+    require_asking(args)
     with JsonPrompt() as lines:
         return _calibrate(args, lines)
 
 
 def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
-    import msgspec
-
-    from acsard.calibration.calibration_report import Refusal, keys, parts, report
-    from acsard.calibration.guided.drive_plan import GuideError
-    from acsard.calibration.log_table import LogError
-    from acsard.calibration.plausibility import RefusedError
-    from acsard.prompts.prompt import NobodyError
-    from acsard.terminal.output import SENTENCES, plain, show
-
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:
-            found, config = _calibrated(_only_log(args), mine.drive, args.distance), mine
+            found, config = calibrated(_only_log(args), mine.drive, args.distance), mine
         else:
             found, config = guided(_no_log(args), mine, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
@@ -162,58 +128,7 @@ def _no_log(args: argparse.Namespace) -> argparse.Namespace:
     return args
 
 
-def _calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
-    from acsard.calibration.log_table import AS_CSV, LogError, noted, read
-    from acsard.calibration.runs import runs
-    from acsard.calibration.solve import calibrate
-    from acsard.recording.mcap_records import MAGIC
-
-    if log.is_dir():
-        raise LogError(f"it is a directory (perhaps a ROS bag): {AS_CSV}")
-    try:
-        if log.stat().st_size > MOST_BYTES:
-            raise ExitError(
-                Exit.FAILURE, f"{log} is larger than 1 GiB: cut it; ten minutes are enough"
-            )
-        data = log.read_bytes()
-    except OSError as error:
-        raise ExitError(
-            Exit.FAILURE, f"cannot read {log}: {error.strerror}; correct --log"
-        ) from None
-    if data.startswith(MAGIC):
-        data = _measured(log)
-    table = read(data)
-    try:
-        driven = runs(table)
-    except LogError as error:
-        noted(error, table.notes)
-        raise
-    return calibrate(driven, drive, tape)
-
-
-def _measured(log: Path) -> bytes:
-    """Return the measurements of a black-box recording as a CSV table.
-
-    Raises `LogError` if the file is not a recording or if the recording has no gyro.
-    """
-    from acsard.calibration.log_table import AS_CSV, LogError
-    from acsard.host.errors import RecordingError
-    from acsard.recording.export import measured
-    from acsard.recording.file import Recording
-
-    try:
-        recording = Recording(log)
-    except RecordingError as error:
-        raise LogError(f"{error}; {AS_CSV}") from None
-    try:
-        return measured(recording)
-    except RecordingError as error:
-        raise LogError(str(error)) from None
-
-
 def _distance(text: str) -> Tape:
-    from acsard.calibration.tape_distance import Tape
-
     run, _, metres = text.rpartition("=")
     try:
         value = float(metres)

@@ -6,19 +6,26 @@ import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
 
+import msgspec
+import zenoh
+
+from acsard.calibration.guided.drive_plan import GuideError, setup
 from acsard.calibration.guided.equipment import NEEDS
+from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
+from acsard.calibration.guided.runner import guide
+from acsard.calibration.solve import Calibration
+from acsard.cli.connection import require_one
+from acsard.client import Client, connect
+from acsard.core.config.settings import Config
+from acsard.core.messages.topics import full_key
+from acsard.daemon.bus.address import address_of
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UsageError
-
-if TYPE_CHECKING:
-    import zenoh
-
-    from acsard.calibration.solve import Calibration
-    from acsard.client import Client
-    from acsard.core.config.settings import Config
-    from acsard.prompts.json_prompt import JsonPrompt
-    from acsard.prompts.prompt import Prompt
+from acsard.host.terminal_modes import one_by_one
+from acsard.terminal.json_prompt import JsonPrompt
+from acsard.terminal.prompt import Prompt, ended_by_signals
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 DRIVE_OPTIONS = ("method", "positions", "positions_at", "imu", "yes", "json_lines")
 
@@ -66,14 +73,6 @@ def guided(
     A key press and Ctrl-C end the drive with zero commands. Raises `GuideError`, `LogError` and
     `RefusedError`.
     """
-    from acsard.calibration.guided.drive_plan import GuideError, setup
-    from acsard.calibration.guided.robot_on_bus import SOURCE, RobotOnBus
-    from acsard.calibration.guided.runner import guide
-    from acsard.cli.common import require_one
-    from acsard.client import connect
-    from acsard.core.messages.topics import full_key
-    from acsard.daemon.bus.address import address_of
-
     require_one(args)
     endpoint, robot_id, tls = address_of(config, args.connect, args.id, args.tls)
     _usable(args, full_key(robot_id, "odom"))
@@ -139,11 +138,6 @@ def _in_force(client: Client, mine: Config, where: str, *, write: bool) -> Confi
 
     Raises `GuideError` if the result is to be written to a file that differs from it.
     """
-    import msgspec
-
-    from acsard.calibration.guided.drive_plan import GuideError
-    from acsard.core.config.settings import Config
-
     config = msgspec.convert(client.get("config"), Config)
     if write and (trouble := differing(config, mine, where)):
         raise GuideError(trouble)
@@ -182,10 +176,6 @@ def _way(args: argparse.Namespace, config: Config) -> str:
 
 @contextmanager
 def _prompt(args: argparse.Namespace, lines: JsonPrompt | None) -> Iterator[Prompt]:
-    from acsard.host.terminal_modes import one_by_one
-    from acsard.prompts.prompt import ended_by_signals
-    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
-
     if args.yes:
         yield NoPrompt(args.json)
         return
@@ -201,7 +191,6 @@ def _elsewhere(args: argparse.Namespace, tls: str, stack: ExitStack) -> zenoh.Se
     """Return a separate session for positions that the daemon does not publish, or None."""
     if not args.positions_at:
         return None
-    from acsard.daemon.bus.zenoh_sessions import client_session
 
     session = client_session(args.positions_at, tls)
     stack.callback(session.close)

@@ -1,19 +1,24 @@
-"""`acsard call <service>`: call a service of the robot, such as stop, clear or activate."""
+"""Call a service and print its answer. The exit code is 1 if the robot refuses."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from concurrent.futures import ThreadPoolExecutor
 
-from acsard.cli.common import MANY, add_bus, robots_address
+from acsard.cli.connection import MANY, add_bus, connected_to_many
+from acsard.cli.echo import of_robot
+from acsard.client import Client
 from acsard.core.formatting import json_line, lines, printable
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.topics import SERVICES
-from acsard.host.errors import Exit
+from acsard.core.values import AcsardError
+from acsard.daemon.bus import robot_discovery
+from acsard.daemon.bus.robot_discovery import ALL, named, present, seen
+from acsard.host.errors import Exit, UsageError
 
-if TYPE_CHECKING:
-    from acsard.client import Client
 CALLED = tuple(service for service in SERVICES if service != "set")
 """The services of this verb.
 
@@ -21,17 +26,8 @@ CALLED = tuple(service for service in SERVICES if service != "set")
 """
 
 
-MOST_AT_ONCE = 32
-"""Number of robots that are called at the same time."""
-
-
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "call",
-        help="call a service: " + ", ".join(CALLED),
-        description="Call a service and print its answer. The exit code is 1 if the robot refuses.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument(
         "service",
         # Accept `srv/stop` too, as `state` and the key table write it.
@@ -50,21 +46,15 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Call the service and print its answer."""
-    from acsard.client import connect
-    from acsard.core.messages.encodings import encode
-    from acsard.host.errors import UsageError
-
     wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise UsageError(f"write: {form}")
-    (endpoint, robot_id, tls), many = robots_address(args)
-    if many:
-        if args.service != "stop":
-            raise UsageError(for_one(args.service, args.values, many))
-        with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
-            return _stop_all(robot, many, endpoint, as_json=args.json)
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+    if args.service != "stop" and (ids := named(args.id or "")):
+        raise UsageError(for_one(args.service, args.values, ids))
+    with connected_to_many(args) as (robot, many):
+        if many:
+            return _stop_all(robot, many, as_json=args.json)
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
     print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message))
     return 0 if reply.success else 1
@@ -82,23 +72,14 @@ def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:
     )
 
 
-def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bool) -> int:
+def _stop_all(robot: Client, ids: tuple[str, ...], *, as_json: bool) -> int:
     """Stop all these robots at once by their exact keys, and print each robot's answer.
 
     Returns the exit code: `UNREACHABLE` if any robot did not answer.
     """
-    from concurrent.futures import ThreadPoolExecutor
-
-    from acsard.cli.echo import of_robot
-    from acsard.core.messages.encodings import encode
-    from acsard.core.messages.schema import ServiceReply
-    from acsard.core.values import AcsardError
-    from acsard.daemon.bus import robot_discovery
-    from acsard.daemon.bus.robot_discovery import ALL, present, seen
-
     # Send the stop to every named robot first. Finding out which robots are present would delay it.
     robot_discovery.stop(robot.session, ids, robot.caller)
-    wanted = present(robot.session, ids, endpoint) if ALL in ids else list(ids)
+    wanted = present(robot.session, ids, robot.where.endpoint) if ALL in ids else list(ids)
 
     def stop(one: str) -> ServiceReply | AcsardError:
         try:
@@ -106,7 +87,7 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
         except AcsardError as error:  # the robot did not answer, or its answer cannot be decoded
             return error
 
-    with ThreadPoolExecutor(min(len(wanted), MOST_AT_ONCE)) as calls:
+    with ThreadPoolExecutor(min(len(wanted), 32)) as calls:
         replies = dict(zip(wanted, calls.map(stop, wanted), strict=True))
     for one, reply in replies.items():
         if isinstance(reply, AcsardError):
@@ -115,7 +96,7 @@ def _stop_all(robot: Client, ids: tuple[str, ...], endpoint: str, *, as_json: bo
         line = encode(reply, "json").decode()
         print(of_robot(one, line) if as_json else printable(f"{one}: {reply.message}"))
     if ALL in ids:
-        print(f"acsard: {seen(endpoint, len(replies))}", file=sys.stderr)
+        print(f"acsard: {seen(robot.where.endpoint, len(replies))}", file=sys.stderr)
     if any(isinstance(reply, AcsardError) for reply in replies.values()):
         return int(Exit.UNREACHABLE)
     stopped = [isinstance(reply, ServiceReply) and reply.success for reply in replies.values()]

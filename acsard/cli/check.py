@@ -1,21 +1,22 @@
-"""`acsard check`: print the effective configuration, or every problem in it."""
+"""Print the effective configuration with all defaults. If the configuration has problems, print all
+of them, each with its fix, and exit with code 78.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
+import msgspec
+
 from acsard.cli.common import add_config, load
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import effective
+from acsard.core.config.writing import document
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "check",
-        help="check the configuration and print the effective one",
-        description="Print the effective configuration with all defaults. If the configuration has "
-        "problems, print all of them, each with its fix, and exit with code 78.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of TOML")
     parser.set_defaults(main=main)
@@ -23,12 +24,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Check the configuration and print it."""
-    import msgspec
-
-    from acsard.core.config.contradictions import warnings
-    from acsard.core.config.parsing import effective
-    from acsard.core.config.writing import document
-
     where, config = load(args.config)
     plain = effective(config)
     if args.json:

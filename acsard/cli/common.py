@@ -1,23 +1,20 @@
-"""Shared by the verbs: loading the configuration, and the options of tools that use the bus."""
+"""Shared by the verbs: the configuration, and the types of their options."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
+from collections.abc import Callable, Mapping
 
 from msgspec.structs import replace
 
 from acsard.core.config import parsing as configuration
 from acsard.core.config.parsing import ConfigError
 from acsard.core.config.settings import RECORD, Config
-from acsard.core.formatting import many, printable
-from acsard.core.messages.topics import key_hint, row_of, unknown
-from acsard.daemon.bus.address import Address, address_of
+from acsard.core.formatting import many
 from acsard.host.config_file import find
 from acsard.host.errors import Exit, ExitError, UsageError
-
-Overrides = dict[str, dict[str, object]]
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -30,33 +27,32 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-JSON_LINES = (
-    "for a program that asks the operator: this tool writes its messages and questions to "
-    "standard output as JSON, one object per line, and reads the answers from standard "
-    "input in the same form (deploy/web/README.md)"
-)
-
-MANY = "; several ids separated by commas, or '*' for all robots"
-
-
-def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
-    """Add the options of the tools that talk to a running daemon.
-
-    Args:
-        parser: the parser of the verb.
-        more: text that is appended to the help of `--id`.
-    """
-    add_config(parser)
-    parser.add_argument(
-        "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
+def add_outcome(parser: argparse.ArgumentParser, result: str) -> None:
+    """Add the options of a verb that asks a person and has a result for the configuration."""
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print one JSON object")
+    form.add_argument(
+        "--json-lines",
+        action="store_true",
+        help="for a program that asks the operator: this tool writes its messages and questions to "
+        "standard output as JSON, one object per line, and reads the answers from standard "
+        "input in the same form (deploy/web/README.md)",
     )
     parser.add_argument(
-        "--tls",
-        metavar="DIRECTORY",
-        help="directory with your certificate, for a tls/ endpoint (default: $ACSARD_TLS, or "
-        "bus.tls)",
+        "--write",
+        action="store_true",
+        help=f"also write {result} into the configuration file and keep its comments (needs the "
+        "library tomlkit; if it is missing, a message gives the command that installs it)",
     )
-    parser.add_argument("--id", metavar="ID", help="the robot's id (default: robot.id)" + more)
+
+
+def require_asking(args: argparse.Namespace) -> None:
+    """Raise `UsageError` if both `--yes` and `--json-lines` are given."""
+    if args.yes and args.json_lines:
+        raise UsageError(
+            "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines asks "
+            "them through a program. Leave one out"
+        )
 
 
 def count(text: str) -> int:
@@ -67,7 +63,30 @@ def count(text: str) -> int:
     return number
 
 
-def by_environment() -> Overrides:
+def seconds(text: str) -> float:
+    """Return a duration from 1 to 600 s: an argparse type.
+
+    All that is measured stays in memory to the end. At 100 Hz that is 60 MB in 600 s.
+    """
+    value = float(text)
+    if not 1.0 <= value <= 600.0:
+        raise argparse.ArgumentTypeError(f"{text} is not from 1 to 600 s")
+    return value
+
+
+def whole(units: str, most: int, hint: str = "") -> Callable[[str], int]:
+    """Return an argparse type for a whole number from 1 to `most`; `hint` ends its message."""
+
+    def number(text: str) -> int:
+        if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
+            words = f"{text} is not a whole number of {units} from 1 to {most}{hint}"
+            raise argparse.ArgumentTypeError(words)
+        return int(text)
+
+    return number
+
+
+def by_environment() -> dict[str, dict[str, object]]:
     """Return the configuration keys that the environment sets.
 
     `ACSARD_TLS` sets `bus.tls`: for example, systemd puts a service's credentials there.
@@ -75,14 +94,26 @@ def by_environment() -> Overrides:
     return {"bus": {"tls": os.environ["ACSARD_TLS"]}} if "ACSARD_TLS" in os.environ else {}
 
 
-def load(path: str | None, overrides: Overrides | None = None) -> tuple[str, Config]:
+def tables(
+    options: Mapping[str, object], before: Mapping[str, Mapping[str, object]]
+) -> dict[str, dict[str, object]]:
+    """Return the tables of `before` with these values by dotted key; None leaves a key as it is."""
+    given = {table: dict(values) for table, values in before.items()}
+    for key, value in options.items():
+        if value is not None:
+            table, _, name = key.partition(".")
+            given.setdefault(table, {})[name] = value
+    return given
+
+
+def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple[str, Config]:
     """Return the path of the configuration and the configuration itself.
 
-    Prints every problem in it and raises `ExitError` if there are any.
+    `options` are values by dotted key, such as "mcu.port"; None leaves a key as it is. Prints every
+    problem in the configuration and raises `ExitError` if there are any.
     """
     where, text = find(path)
-    given = dict(overrides or {})
-    given["bus"] = {**by_environment().get("bus", {}), **given.get("bus", {})}
+    given = tables(options or {}, by_environment())
     try:
         return where, configuration.parse(text, given)
     except ConfigError as error:
@@ -101,84 +132,3 @@ def recorded(config: Config) -> Config:
     told = config.record.directory or os.environ.get(RECORD, "")
     directory = os.path.abspath(told) if told else ""
     return replace(config, record=replace(config.record, directory=directory))
-
-
-def robot_address(args: argparse.Namespace) -> Address:
-    """Return the address of one robot from the options, or else from the configuration.
-
-    Raises `UsageError` if `--id` names several robots.
-    """
-    require_one(args)
-    _, config = load(args.config)
-    return address_of(config, args.connect, args.id, args.tls)
-
-
-def require_one(args: argparse.Namespace) -> None:
-    """Raise `UsageError` if `--id` names several robots."""
-    from acsard.daemon.bus.robot_discovery import named
-
-    if named(args.id or ""):
-        raise UsageError(
-            f"--id '{args.id}' names several robots, but `acsard {args.verb}` takes one: "
-            "`acsard fleet` lists the robots; only echo, get and call stop take several"
-        )
-
-
-def robots_address(args: argparse.Namespace) -> tuple[Address, tuple[str, ...]]:
-    """Return the address as `robot_address` does, and the ids if `--id` names several robots.
-
-    The ids are `("*",)` for all robots and `()` for a single robot.
-    """
-    from acsard.daemon.bus.robot_discovery import named
-
-    many = named(args.id or "")
-    _, config = load(args.config)
-    return address_of(config, args.connect, None if many else args.id, args.tls), many
-
-
-def require_followed(key: str) -> None:
-    """Raise `UsageError`, with the command to type instead, if a key never has messages."""
-    row = row_of(key)
-    if row is None:
-        return
-    instead = {
-        "query": f"answers a query: acsard get {key}",
-        "service": f"is a service: acsard call {key.removeprefix('srv/')}",
-    }.get(row.direction)
-    if row.key == "alive":
-        instead = "is a token without messages: acsard fleet lists the robots that are present"
-    if instead is not None:
-        raise UsageError(f"nothing is published on {key}: it {instead}")
-
-
-def warn_of_unknown(key: str) -> None:
-    """Warn if a key is not in the table: waiting on a misspelt key looks like a dead robot."""
-    if unknown(key):
-        said = f"{key} is not in the topic table ({key_hint(key)}); waiting for it all the same"
-        print(f"acsard: {printable(said)}", file=sys.stderr)
-
-
-def require_asked(key: str) -> None:
-    """Raise `UsageError` if `acsard get` cannot ask this key.
-
-    These are keys that do not answer, services, which would act, and wildcards: `get` prints one
-    answer.
-    """
-    if set(key.partition("?")[0]) & set("*$"):
-        raise UsageError(
-            f"{key} stands for several keys, but get asks one; `acsard topics` lists them"
-        )
-    row = row_of(key)
-    if row is None:
-        return
-    if row.direction == "service":
-        raise UsageError(f"{key} is a service: acsard call {key.removeprefix('srv/')}")
-    if row.direction == "in":
-        raise UsageError(
-            f"{key} is an input and does not answer queries: acsard echo {key} follows it"
-        )
-    if row.key == "alive":
-        raise UsageError(
-            "alive is a token and does not answer queries: acsard fleet lists the robots that "
-            "are present"
-        )

@@ -1,12 +1,22 @@
-"""`acsard completion` and `acsard man`: shell completion scripts and the man page."""
+"""Print the script with which a shell completes verbs, options, keys, settings, recordings and
+files when you press Tab. Write it to the file that the shell reads. Needs the library shtab; if it
+is missing, a message gives the command that installs it.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import get_args, get_type_hints
 
-from acsard.host.errors import Exit, ExitError
-from acsard.host.extras import install
+from acsard.cli import parser
+from acsard.core.config.live import flat, live
+from acsard.core.config.named_faults import ARGUMENTS, FAULTS
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config, LogConfig
+from acsard.core.messages.json_schema import SCHEMAS
+from acsard.core.messages.topics import PUBLISHED, TOPICS, json_key, source_keys
+from acsard.host.extras import missing
 
 SHELLS = {
     "bash": "~/.local/share/bash-completion/completions/acsard",
@@ -15,46 +25,50 @@ SHELLS = {
 }
 """Where each shell looks for its completion script."""
 
+_NUMBERS = "acsard recording 2>/dev/null | sed -n 's/^0*\\([0-9][0-9]*\\)-.*/\\1/p'"
+"""Shell command that lists the recordings by number. The shell offers local files as well."""
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare both verbs and their options."""
+_RECORDING: dict[str, str | dict[str, str]] = {
+    "bash": "_acsard_recordings",
+    "zsh": "_acsard_recordings",
+    "fish": f"({_NUMBERS}; __fish_complete_path (commandline -ct))",
+    "preamble": {
+        "bash": f"""
+_acsard_recordings() {{
+  compgen -W "$({_NUMBERS})" -- "$1"
+  _shtab_compgen_files "$1"
+}}""",
+        "zsh": f"""
+_acsard_recordings() {{
+  compadd -- ${{(f)"$({_NUMBERS})"}}
+  _files
+}}""",
+    },
+}
+"""Completion of a recording for each shell, in the form that shtab expects."""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     places = "; ".join(f"{shell}: {place}" for shell, place in SHELLS.items())
-    completion = verbs.add_parser(
-        "completion",
-        help="print the script for completion with Tab in a shell",
-        description="Print the script with which a shell completes verbs, options, keys, settings, "
-        "recordings and files when you press Tab. Write it to the file that the shell "
-        f"reads ({places}). Needs the library shtab; if it is missing, a message gives the "
-        "command that installs it.",
-    )
-    completion.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
-    completion.set_defaults(main=main_completion)
-    page = verbs.add_parser(
-        "man",
-        help="print the text of every --help as a man page",
-        description="Print a man page of every verb and option, for example into "
-        "~/.local/share/man/man1/acsard.1. Needs the library argparse-manpage; if it is "
-        "missing, a message gives the command that installs it.",
-    )
-    page.set_defaults(main=main_man)
+    parser.epilog = f"Where the shells look for it: {places}."
+    parser.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
+    parser.set_defaults(main=main)
 
 
-def main_completion(args: argparse.Namespace) -> int:
+def main(args: argparse.Namespace) -> int:
     """Print the completion script of a shell."""
-    from acsard.cli import parser
-    from acsard.cli.values import RECORDING, words
-
     try:
         import shtab
     except ImportError:
-        raise _missing("shtab") from None
+        raise missing("shtab", "shell") from None
     whole = parser()
     kinds = {"FILE": shtab.FILE, "DIR": shtab.DIRECTORY, "DIRECTORY": shtab.DIRECTORY}
-    known = words()
+    known = _words()
     for verb, action in _actions(whole):
         kind = kinds.get(str(action.metavar))
         if verb == "recording" and action.dest == "file":
-            kind = RECORDING
+            kind = _RECORDING
         if kind:
             action.complete = kind  # type: ignore[attr-defined]
         elif (verb, action.dest) in known:
@@ -62,36 +76,36 @@ def main_completion(args: argparse.Namespace) -> int:
             action.choices = known[verb, action.dest]
     script = shtab.complete(whole, args.shell)
     if args.shell == "zsh":
-        script = every_word(script)
+        # shtab writes `(*)`, which completes the first word and excludes all others. `*` completes
+        # every word of a repeated argument.
+        script = script.replace('  "(*)::', '  "*:').replace('  "(*):', '  "*:')
     print(script)
     return 0
 
 
-def every_word(script: str) -> str:
-    """Return the zsh script with completion for every word of a repeated argument.
+def _words() -> Mapping[tuple[str, str], list[str]]:
+    """Return the words for each (verb, argument).
 
-    shtab writes `(*)`, which completes the first word and excludes all others. `*` completes every
-    word.
+    The names of sources are those of the defaults.
     """
-    return script.replace('  "(*)::', '  "*:').replace('  "(*):', '  "*:')
-
-
-def main_man(args: argparse.Namespace) -> int:
-    """Print the man page."""
-    from acsard import __version__
-    from acsard.cli import parser
-
-    try:
-        from argparse_manpage.manpage import Manpage
-    except ImportError:
-        raise _missing("argparse-manpage") from None
-    about = {"project_name": "acsard", "version": __version__, "manual_title": "ACSAR robot"}
-    print(Manpage(parser(), about))
-    return 0
-
-
-def _missing(library: str) -> ExitError:
-    return ExitError(Exit.FAILURE, f"needs the library {library}; run: {install('shell')}")
+    config = Config()
+    sources = [source.name for source in config.commands.sources]
+    published = [topic.key for topic in PUBLISHED]
+    incoming = [*source_keys(sources), "imu"]
+    followed = [*published, *map(json_key, published), *incoming]
+    asked = [t.key for t in TOPICS if t.direction == "query" and "<" not in t.key]
+    settings = [key for key, _ in flat(effective(config)) if live(key)]
+    levels = [str(level) for level in get_args(get_type_hints(LogConfig)["level"])]
+    return {
+        ("get", "key"): [*published, *asked, *(f"schema/{name}" for name in SCHEMAS)],
+        ("echo", "topic"): followed,
+        ("hz", "topic"): followed,
+        ("set", "settings"): [*settings, *levels],
+        ("drive", "source"): sources,
+        ("calibrate", "positions"): published,
+        ("calibrate", "imu"): ["imu"],
+        ("sim", "fault"): [*FAULTS, *(f"{name}=" for name in ARGUMENTS)],
+    }
 
 
 def _actions(

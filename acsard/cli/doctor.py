@@ -1,28 +1,30 @@
-"""`acsard doctor`: find what is wrong on this machine and how to fix it."""
+"""Check the configuration, the serial port and the process that uses it, permissions, the clock,
+real-time limits, certificates, and the daemon if it runs. The daemon is looked for at the address
+in the configuration, or at the address in the options. Each problem is printed with its fix. The
+exit code is 1 if a check fails, else 0.
+"""
 
 from __future__ import annotations
 
 import argparse
 from functools import partial
 
-from acsard.cli.common import add_bus, by_environment, require_one
+import msgspec
+from rich.text import Text
+
+from acsard.cli.common import by_environment
+from acsard.cli.connection import add_bus, require_one
+from acsard.daemon.bus.address import address_of
 from acsard.host.config_file import find
+from acsard.machine.examination import examine
+from acsard.terminal.output import show_whole
 
 MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FAIL", "red")}
 """The word and the colour of each level of a finding."""
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "doctor",
-        help="find the problems on this machine and their fixes",
-        description="Check the configuration, the serial port and the process that uses it, "
-        "permissions, the clock, real-time limits, certificates, and the daemon if it "
-        "runs. The daemon is looked for at the address in the configuration, or at the "
-        "address in the options. Each problem is printed with its fix. The exit code is 1 "
-        "if a check fails, else 0.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(main=main)
@@ -30,13 +32,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Examine the machine and print the findings. Return 1 if any of them is a failure."""
-    import msgspec
-    from rich.text import Text
-
-    from acsard.daemon.bus.address import address_of
-    from acsard.doctor.examination import examine
-    from acsard.terminal.output import show_whole
-
     require_one(args)
     told = partial(address_of, connect=args.connect, robot_id=args.id, tls=args.tls)
     findings = list(examine(*find(args.config), by_environment(), told))

@@ -1,42 +1,40 @@
-"""`acsard echo <topic>`: print the messages of a key as JSON lines, or with --short as text."""
+"""Print each message on a key as one line of JSON, until Ctrl-C. Every key below the robot's id
+works, for example `cmd/teleop`. --csv prints wheel speeds, gyro and position as one file for
+`acsard calibrate --log`: acsard echo wheel_states imu --csv > drive.csv. --short prints pose and
+speeds as text: acsard echo odom -n 1 --short. If --id names several robots, each line names its
+robot.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from acsard.cli.common import (
-    MANY,
-    add_bus,
-    count,
-    require_followed,
-    robots_address,
-    warn_of_unknown,
-)
+import msgspec
+import zenoh
+
+from acsard.calibration.log_table import HEADER, KEYS, row
+from acsard.cli.common import count
+from acsard.cli.connection import MANY, add_bus, connected, connected_to_many, require_followed
+from acsard.cli.waiting import explained, lost_by, nothing, waits_for
+from acsard.client import Client
+from acsard.client.synchronous import decoder
 from acsard.core import formatting
-from acsard.host.errors import Exit, ExitError
+from acsard.core.messages.encodings import DecodeError, Decoder, detect
+from acsard.core.messages.one_line import SHORT, short
+from acsard.core.messages.schema import MESSAGES
+from acsard.core.messages.topics import TOPICS, by_key
+from acsard.daemon.bus.robot_discovery import ALL, follow, named, present, robot_of
+from acsard.daemon.bus.subscription import encoded
+from acsard.host import clock
+from acsard.host.errors import Exit, NoAnswerError, UsageError
 
-if TYPE_CHECKING:
-    import zenoh
 
-    from acsard.client import Client
-    from acsard.core.messages.encodings import Decoder
-
-
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "echo",
-        help="print the messages on a key as JSON lines",
-        description="Print each message on a key as one line of JSON, until Ctrl-C. Every key "
-        "below the robot's id works, for example `cmd/teleop`. --csv prints wheel "
-        "speeds, gyro and position as one file for `acsard calibrate --log`: acsard "
-        "echo wheel_states imu --csv > drive.csv. --short prints pose and speeds as "
-        "text: acsard echo odom -n 1 --short. If --id names several robots, each "
-        "line names its robot.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
     )
@@ -64,38 +62,34 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print messages until Ctrl-C, a count or a timeout ends it."""
-    from acsard.cli.waiting import explained, lost_by, nothing, waits_for
-    from acsard.client import connect
-    from acsard.daemon.bus.robot_discovery import follow
-
-    where, many = robots_address(args)
-    endpoint, robot_id, tls = where
+    topic = args.topic[0]
     if args.csv:
-        if many:
-            raise ExitError(Exit.USAGE, "a log holds one robot: with --csv, --id takes one robot")
+        if named(args.id or ""):
+            raise UsageError("a log holds one robot: with --csv, --id takes one robot")
+        for key in args.topic:
+            if key not in KEYS:
+                raise UsageError(f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
         with (
-            connect(endpoint, robot_id=robot_id, tls=tls) as robot,
-            explained(waits_for(robot, args.topic[0], where), lost_by(robot, where)) as heard,
+            connected(args) as robot,
+            explained(waits_for(robot, topic), lost_by(robot)) as heard,
         ):
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
-        raise ExitError(Exit.USAGE, "several keys need --csv, which puts them into one file")
-    topic = args.topic[0]
+        raise UsageError("several keys need --csv, which puts them into one file")
+    short_form = _shortened(topic) if args.short else None
     require_followed(topic)
-    decoder = _shortened(topic) if args.short else None
-    warn_of_unknown(topic)
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+    with connected_to_many(args) as (robot, many):
         samples = robot.samples(topic, args.timeout)
-        look = waits_for(robot, topic, where)
+        look = waits_for(robot, topic)
         if many:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
-            _say_who(robot, many, endpoint)
+            _say_who(robot, many)
             look = nothing
-        elif tls and (why := robot.whoami().silence):
+        elif robot.where.tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
             look = nothing  # the reason for the silence has just been printed
-        with explained(look, lost_by(robot, where)) as heard:
-            return _print(samples, decoder, args.n, bool(many), heard)
+        with explained(look, lost_by(robot)) as heard:
+            return _print(samples, short_form, args.n, bool(many), heard)
 
 
 def _print(
@@ -114,9 +108,6 @@ def _print(
         of_many: whether each line names its robot.
         heard: called for each message.
     """
-    from acsard.daemon.bus.robot_discovery import robot_of
-    from acsard.daemon.bus.subscription import encoded
-
     try:
         for number, sample in enumerate(samples, 1):
             heard()
@@ -130,27 +121,17 @@ def _print(
 
 
 def _shortened(key: str) -> Decoder[Any]:
-    """Return the decoder of a key that has a short form. Raises `ExitError` for any other key."""
-    from acsard.core.messages.encodings import Decoder
-    from acsard.core.messages.one_line import SHORT
-    from acsard.core.messages.schema import MESSAGES
-    from acsard.core.messages.topics import TOPICS, by_key
-
+    """Return the decoder of a key that has a short form. Raises `UsageError` for any other key."""
     kinds = {kind.__name__: kind for kind in SHORT}
     topic = by_key(key)
     if topic is None or topic.type not in kinds:
         known = ", ".join(one.key for one in TOPICS if one.type in kinds)
-        raise ExitError(
-            Exit.USAGE, f"{key} has no short form, only JSON; these keys have one: {known}"
-        )
+        raise UsageError(f"{key} has no short form, only JSON; these keys have one: {known}")
     return Decoder(MESSAGES[topic.type])
 
 
 def _shown(decoder: Decoder[Any] | None, encoding: str, payload: bytes, whose: str) -> str:
     """Return a message as a printable line. A message that cannot be decoded is printed as JSON."""
-    from acsard.core.messages.encodings import DecodeError
-    from acsard.core.messages.one_line import short
-
     if decoder is not None:
         try:
             told = short(decoder.decode(encoding, payload))
@@ -170,16 +151,6 @@ def _record(
     heard: Callable[[], None],
 ) -> int:
     """Print rows of all keys until Ctrl-C, until `most` rows, or after `timeout` s of silence."""
-    import time
-
-    from acsard.calibration.log_table import HEADER, KEYS, row
-    from acsard.client.synchronous import decoder
-    from acsard.daemon.bus.subscription import encoded
-    from acsard.host import clock
-
-    for key in keys:
-        if key not in KEYS:
-            raise ExitError(Exit.USAGE, f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
     queues = [(robot.subscribe(key), decoder(key)) for key in keys]
     print(HEADER, flush=True)
     count, heard_s = 0, time.monotonic()
@@ -198,13 +169,10 @@ def _record(
     return int(Exit.OK)
 
 
-def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
+def _say_who(robot: Client, ids: tuple[str, ...]) -> None:
     """Print which robots are present now, because a silent robot looks like a missing one."""
-    from acsard.daemon.bus.robot_discovery import ALL, present
-    from acsard.host.errors import NoAnswerError
-
     try:
-        there = present(robot.session, ids, endpoint)
+        there = present(robot.session, ids, robot.where.endpoint)
         missing = [one for one in ids if one not in there and one != ALL]
         words = f"following {', '.join(there) or 'no robot yet'}"
         words += f"; not there: {', '.join(missing)}" if missing else ""
@@ -215,8 +183,6 @@ def _say_who(robot: Client, ids: tuple[str, ...], endpoint: str) -> None:
 
 def of_robot(whose: str, line: str) -> str:
     """Return a JSON line that names the robot and contains its message."""
-    import msgspec
-
     told = {"robot": whose, "message": msgspec.Raw(line.encode())}
     return formatting.json_line(msgspec.json.encode(told).decode())
 
@@ -226,10 +192,6 @@ def json_line(encoding: str, payload: bytes) -> str:
 
     Bytes that cannot be decoded become the text `{"undecodable": ...}`.
     """
-    import msgspec
-
-    from acsard.core.messages.encodings import DecodeError, detect
-
     try:
         form = detect(encoding, payload)
         if form == "cdr":

@@ -1,31 +1,27 @@
-"""`acsard foxglove`: show the robot live in Foxglove and Lichtblick."""
+"""Serve the robot's topics to Foxglove and Lichtblick (2026 and later) on this machine until
+Ctrl-C, with a service that stops the robot. With --drive, also offer the other services and the
+settings, and let a Teleop panel drive the robot by /cmd_vel as source `app`. In Foxglove, open a
+connection of the type `Foxglove WebSocket`.
+"""
 
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import signal
 import sys
 
-from acsard.cli.common import add_bus, robot_address
+from acsard.cli.connection import add_bus, connected
 from acsard.core.formatting import lines
-from acsard.host.errors import Exit, ExitError, UsageError
-from acsard.host.extras import install
+from acsard.host.errors import Exit, UsageError
+from acsard.host.extras import missing
 
 DEFAULT = "127.0.0.1:8765"
 """The address that Foxglove and Lichtblick try by default."""
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "foxglove",
-        help="show the robot live in Foxglove or Lichtblick",
-        description="Serve the robot's topics to Foxglove and Lichtblick (2026 and later) on "
-        "this machine until Ctrl-C, with a service that stops the robot. With "
-        "--drive, also offer the other services and the settings, and let a Teleop "
-        "panel drive the robot by /cmd_vel as source `app`. In Foxglove, open a "
-        "connection of the type `Foxglove WebSocket`.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument(
         "--address",
         default=DEFAULT,
@@ -47,25 +43,17 @@ def main(args: argparse.Namespace) -> int:
     try:
         from acsard.foxglove.bridge import Bridge
     except ImportError:
-        raise ExitError(
-            Exit.FAILURE, f"needs the library foxglove-sdk; run: {install('foxglove')}"
-        ) from None
-    from acsard.client import connect
-
+        raise missing("foxglove-sdk", "foxglove") from None
     address = loopback(args.address)
-    endpoint, robot_id, tls = robot_address(args)
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
-        bridge = Bridge(robot, robot_id, tls, address, _tell, acts=args.drive)
+    with connected(args) as robot:
+        bridge = Bridge(robot, address, _tell, acts=args.drive)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: bridge.end())
         try:
-            may = (
-                ""
-                if args.drive
-                else "; it shows and stops the robot; with --drive it also accepts commands"
-            )
-            where = f"ws://{address[0]}:{address[1]}"
-            print(f"{robot_id} at {where}: connect Foxglove there{may}", flush=True)
+            may = "; it shows and stops the robot; with --drive it also accepts commands"
+            where = f"ws://{address[0]}:{address[1]}: connect Foxglove there"
+            told = f"{robot.where.robot_id} at {where}{'' if args.drive else may}"
+            print(told, flush=True)
             bridge.run()
         finally:
             bridge.close()
@@ -77,8 +65,6 @@ def loopback(text: str) -> tuple[str, int]:
 
     Raises `UsageError` for a malformed address and for one that other machines can reach.
     """
-    import ipaddress
-
     host, _, digits = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address("127.0.0.1" if host == "localhost" else host)

@@ -1,24 +1,25 @@
-"""`acsard gateway`: the TLS gateway, a separate process that admits clients of other machines."""
+"""Listen at the tls/ endpoints of bus.listen and pass on to the daemon only the messages that each
+client's certificate allows. `acsard run` starts this gateway by itself; as a service it is
+acsard-gateway.service. It exits with code 1 when it must be restarted.
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 
 from acsard.cli.common import add_config, load
-from acsard.host.errors import Exit, ExitError
+from acsard.daemon.bus.zenoh_sessions import log_from_environment
+from acsard.daemon.gateway.listener_process import ListenerProcess
+from acsard.daemon.gateway.tls_gateway import Gateway
+from acsard.host.errors import UsageError
+from acsard.host.logs import Log
+from acsard.host.systemd import Systemd
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "gateway",
-        help="run the TLS gateway, which admits clients from other machines",
-        description="Listen at the tls/ endpoints of bus.listen and pass on to the daemon only the "
-        "messages that each client's certificate allows. `acsard run` starts this gateway "
-        "by itself; as a service it is acsard-gateway.service. It exits with code 1 when it "
-        "must be restarted.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_config(parser)
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument("--namespace", metavar="NAME", help="the robot's ROS namespace")
@@ -32,28 +33,17 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the gateway until a signal ends it or until it must be restarted."""
-    import os
-
-    from acsard.daemon.bus.zenoh_sessions import log_from_environment
-    from acsard.daemon.gateway.supervision import Watched
-    from acsard.daemon.gateway.tls_gateway import Gateway
-    from acsard.host.logs import Log
-    from acsard.host.systemd import Systemd
-
-    given: dict[str, dict[str, object]] = {"robot": {"id": args.id}} if args.id else {}
-    if args.namespace is not None:
-        given["ros"] = {"namespace": args.namespace}
+    given = {"robot.id": args.id or None, "ros.namespace": args.namespace}
     where, config = load(args.config, given)
     if not config.bus.outside:
-        raise ExitError(
-            Exit.USAGE,
+        raise UsageError(
             f"{where} has no tls/ endpoint in bus.listen: `acsard tls init --write FILE` adds one",
         )
     log_from_environment()
     log, manager = Log(config.log), Systemd(os.environ, os.getpid())
     try:
         holder = sys.stdin.fileno() if args.supervised else None
-        code = Watched(Gateway(config), log, manager, holder).run()
+        code = ListenerProcess(Gateway(config), log, manager, holder).run()
     finally:
         manager.close()
         log.close()

@@ -1,26 +1,26 @@
-"""`acsard get KEY`: query a key once and print its answer as JSON."""
+"""Query a key and print the answer as JSON, indented on a terminal and as one line into a pipe. The
+key is info, config, interfaces, topics, schema/Twist, or any published key, which answers with its
+last value.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
-from acsard.cli.common import MANY, add_bus, require_asked, robots_address
+import msgspec
+
+from acsard.cli.connection import MANY, add_bus, connected_to_many, require_asked
+from acsard.cli.echo import json_line, of_robot
 from acsard.core import formatting
 from acsard.core.formatting import printable
 from acsard.core.values import AcsardError
+from acsard.daemon.bus.robot_discovery import present
 from acsard.host.errors import Exit
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "get",
-        help="query a key once and print the answer as JSON",
-        description="Query a key and print the answer as JSON, indented on a terminal and as "
-        "one line into a pipe. The key is info, config, interfaces, topics, "
-        "schema/Twist, or any published key, which answers with its last value.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("key", help="for example info, config, schema/Twist, state")
     add_bus(parser, MANY)
     parser.set_defaults(main=main)
@@ -28,19 +28,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Query the key and print its answer, or one answer per robot."""
-
-    from acsard.cli.echo import json_line, of_robot
-    from acsard.client import connect
-    from acsard.daemon.bus.robot_discovery import present
-
     require_asked(args.key)
-    (endpoint, robot_id, tls), many = robots_address(args)
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+    with connected_to_many(args) as (robot, many):
         if not many:
             _show(json_line(*robot.reply(args.key)))
             return 0
         silent = 0
-        for one in present(robot.session, many, endpoint):
+        for one in present(robot.session, many, robot.where.endpoint):
             try:
                 line = json_line(*robot.like(one).reply(args.key))
             except AcsardError as error:
@@ -52,7 +46,5 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _show(line: str) -> None:
-    import msgspec
-
     shown = msgspec.json.format(line, indent=2) if sys.stdout.isatty() else line
     print(formatting.json_line(shown))

@@ -1,26 +1,24 @@
-"""`acsard hz <topic>`: measure the rate of a key and how even its gaps are."""
+"""Measure how often messages come on a key and how regular the gaps between them are. The tool
+prints one line per second over the last 10 s, until Ctrl-C.
+"""
 
 from __future__ import annotations
 
 import argparse
 import time
-from typing import TYPE_CHECKING
+from collections import deque
 
-from acsard.cli.common import add_bus, count, require_followed, robot_address, warn_of_unknown
+import msgspec
+import numpy as np
+import zenoh
 
-if TYPE_CHECKING:
-    import zenoh
+from acsard.cli.common import count
+from acsard.cli.connection import add_bus, connected, require_followed
+from acsard.cli.waiting import explained, lost_by, waits_for
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "hz",
-        help="measure the message rate of a key",
-        description="Measure how often messages come on a key and how regular the gaps between "
-        "them are. The tool prints one line per second over the last 10 s, until "
-        "Ctrl-C.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("topic", help="for example odom")
     parser.add_argument("-n", type=count, metavar="N", help="end after N lines")
     parser.add_argument("--json", action="store_true", help="print JSON lines")
@@ -30,21 +28,12 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print a line every second until Ctrl-C or until `-n` lines."""
-    from collections import deque
-
-    import msgspec
-
-    from acsard.cli.waiting import explained, lost_by, waits_for
-    from acsard.client import connect
-
     require_followed(args.topic)
-    warn_of_unknown(args.topic)
-    where = endpoint, robot_id, tls = robot_address(args)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n
     with (
-        connect(endpoint, robot_id=robot_id, tls=tls) as robot,
-        explained(waits_for(robot, args.topic, where), lost_by(robot, where)) as heard,
+        connected(args) as robot,
+        explained(waits_for(robot, args.topic), lost_by(robot)) as heard,
     ):
 
         def take(_: zenoh.Sample) -> None:
@@ -70,8 +59,6 @@ def main(args: argparse.Namespace) -> int:
 
 def rate(times: list[float]) -> dict[str, float]:
     """Return the rate in Hz and the gaps between arrivals in ms, for arrival times in s."""
-    import numpy as np
-
     if len(times) < 2 or times[-1] <= times[0]:
         return {"count": len(times), "hz": 0.0}
     gaps = np.diff(np.asarray(times)) * 1e3

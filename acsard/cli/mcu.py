@@ -1,7 +1,4 @@
-"""`acsard mcu check`: test the microcontroller on the real robot with its wheels lifted.
-
-`checkup/procedure.py` decides what is tested and in which order, and a prompt asks the operator.
-"""
+"""Work with the microcontroller alone, without the daemon."""
 
 from __future__ import annotations
 
@@ -9,19 +6,24 @@ import argparse
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from acsard.cli.common import JSON_LINES, Overrides, add_config, load
+import msgspec
+
+from acsard.checkup import checkup_report, procedure
+from acsard.checkup.board import Wire
+from acsard.checkup.checkup_report import report, summary, withheld
+from acsard.checkup.findings import Finding
+from acsard.cli.common import add_config, add_outcome, load, require_asking
+from acsard.core.config.settings import Config
+from acsard.core.simulator.fake_mcu import FakeMcu
+from acsard.core.simulator.virtual_wire import VirtualWire
+from acsard.daemon.serial.blocking import BlockingPort
 from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, ExitError, MendableError, UsageError
-
-if TYPE_CHECKING:
-    from acsard.checkup.board import Wire
-    from acsard.checkup.findings import Finding
-    from acsard.core.config.settings import Config
-    from acsard.prompts.json_prompt import JsonPrompt
-    from acsard.prompts.prompt import Prompt
-    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
+from acsard.host.errors import Exit, MendableError, UsageError
+from acsard.host.processes import master_of
+from acsard.terminal.json_prompt import JsonPrompt
+from acsard.terminal.prompt import Prompt, ended_by_signals
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt
 
 SIMULATOR = "sim"
 
@@ -39,13 +41,8 @@ to judge a test; in that case try again when the computer is idle.
 """
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb, its action and their options."""
-    parser = verbs.add_parser(
-        "mcu",
-        help="test the microcontroller on your own robot with its wheels lifted",
-        description="Work with the microcontroller alone, without the daemon.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the action and its options."""
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
@@ -68,27 +65,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
         action="store_true",
         help="with --yes: confirm that no wheel touches anything and that you watch the robot",
     )
-    how = check.add_mutually_exclusive_group()
-    how.add_argument("--json", action="store_true", help="print one JSON object")
-    how.add_argument("--json-lines", action="store_true", help=JSON_LINES)
-    check.add_argument(
-        "--write",
-        action="store_true",
-        help="also write the found lines, and --port, into the configuration file and keep its "
-        "comments (needs the library tomlkit; if it is missing, a message gives the "
-        "command that installs it)",
-    )
+    add_outcome(check, "the found lines, and --port,")
     check.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the check and print its result."""
-    from acsard.checkup.checkup_report import withheld
-
-    given: Overrides = {}
-    for key, value in (("port", args.port), ("baud_rate", args.baud_rate)):
-        if value is not None:
-            given.setdefault("mcu", {})[key] = value
+    given = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
     where, config = load(args.config, given)
     if args.write:
         writable(args.config)
@@ -99,12 +82,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _checked(args: argparse.Namespace, config: Config, where: str, prompt: Prompt) -> int:
-    import msgspec
-
-    from acsard.checkup import checkup_report, procedure
-    from acsard.checkup.checkup_report import report, summary
-    from acsard.prompts.prompt import ended_by_signals
-
     _, configured = load(args.config)
     port, simulated = config.mcu.port, config.mcu.simulated
     findings: list[Finding] = []
@@ -147,42 +124,28 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
 
     Raises `ExitError` unless a person can answer, or nothing real can move.
     """
-    from acsard.prompts.terminal_prompt import NoPrompt, TerminalPrompt
-
     if port == SIMULATOR and args.port != SIMULATOR:
-        raise ExitError(
-            Exit.USAGE,
+        raise UsageError(
             "no port is configured, so there is no board to check (mcu.port is the simulator, "
             '"sim"): `acsard ports` lists the serial devices, then `acsard mcu check --port '
             "DEVICE`; `--port sim` checks the built-in simulator",
         )
     if args.json_lines:
-        from acsard.prompts.json_prompt import JsonPrompt
-
-        if args.yes:
-            raise ExitError(
-                Exit.USAGE,
-                "--yes and --json-lines exclude each other: --yes asks no questions, --json-lines "
-                "asks them through a program. Leave one out",
-            )
+        require_asking(args)
         return JsonPrompt()
     if not args.yes:
         if not sys.stdin.isatty():
-            raise ExitError(
-                Exit.USAGE,
+            raise UsageError(
                 "mcu check turns the wheels and asks a person who sees them: run it in a "
                 "terminal; `--yes` without one is for the simulator (--port sim)",
             )
         return TerminalPrompt(args.json)
     if port == SIMULATOR or args.wheels_are_lifted or not os.path.exists(port):
         return NoPrompt(args.json)
-    from acsard.host.processes import master_of
-
     master = master_of(port)
     if master is None or master.name != "acsard":
         what = f"a pty of {master.name}" if master else "no simulator of acsard's"
-        raise ExitError(
-            Exit.USAGE,
+        raise UsageError(
             f"{port} is {what}: a robot may be behind it, and --yes would turn its wheels without "
             "a question. Leave --yes out; or lift the wheels, stay with the robot, and add "
             "--wheels-are-lifted",
@@ -193,10 +156,5 @@ def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | 
 def _wire(config: Config) -> Wire:
     """Return the port, or the simulator in virtual time, with which no check has to wait."""
     if config.mcu.port == SIMULATOR:
-        from acsard.core.simulator.fake_mcu import FakeMcu
-        from acsard.core.simulator.virtual_wire import VirtualWire
-
         return VirtualWire(FakeMcu(config))
-    from acsard.daemon.serial.blocking import BlockingPort
-
     return BlockingPort(config.mcu.port)

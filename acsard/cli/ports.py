@@ -1,30 +1,26 @@
-"""`acsard ports`: list the serial ports and which of them looks like the microcontroller."""
+"""List the serial ports: device, stable names, driver, USB id, the process that has it open, and
+the common microcontroller board that it resembles. The tool opens no port. The exit code is 1 if
+there is no port.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 
+import msgspec
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "ports",
-        help="list the serial ports, the processes that use them, and the likely MCU",
-        description="List the serial ports: device, stable names, driver, USB id, the process "
-        "that has it open, and the common microcontroller board that it resembles. "
-        "The tool opens no port. The exit code is 1 if there is no port.",
-    )
+from acsard.machine.serial_ports import serial_devices
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
     """List the ports."""
-    import msgspec
-
-    from acsard.host.serial_ports import serial_devices
-
     found = serial_devices()
     if args.json:
         print(msgspec.json.encode(found).decode())

@@ -1,27 +1,28 @@
-"""`acsard router`: a fleet's Zenoh router, restarted when a client blocks it."""
+"""Run Zenoh in router mode with a configuration file of Zenoh, such as deploy/zenoh/router.json5.
+The router is a child process. It is ended and restarted if a client takes all its time or memory.
+It runs no plugins; for storages use zenohd.
+"""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import os
+import signal
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from acsard.host.logs import Log
+from acsard.core.config.settings import LogConfig
+from acsard.daemon.bus.zenoh_sessions import log_from_environment
+from acsard.daemon.gateway.fleet_router import Router
+from acsard.daemon.gateway.listener_process import ListenerProcess
+from acsard.daemon.supervisor import ROUTER, keep_running
+from acsard.host.logs import Log
+from acsard.host.systemd import Systemd
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "router",
-        help="run a fleet's Zenoh router and restart it when a client blocks it",
-        description="Run Zenoh in router mode with a configuration file of Zenoh, such as "
-        "deploy/zenoh/router.json5. The router is a child process. It is ended and "
-        "restarted if a client takes all its time or memory. It runs no plugins; "
-        "for storages use zenohd.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
@@ -33,32 +34,19 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Supervise a router until a signal, or be the supervised router (`--supervised`)."""
-    import os
-
-    from acsard.core.config.settings import LogConfig
-    from acsard.daemon.bus.zenoh_sessions import log_from_environment
-    from acsard.daemon.gateway.fleet_router import Router
-    from acsard.daemon.gateway.supervision import Watched
-    from acsard.host.logs import Log
-    from acsard.host.systemd import Systemd
-
     router, log = Router(args.file), Log(LogConfig())
     try:
         if not args.supervised:
             return asyncio.run(_kept(str(args.file), log))
         log_from_environment()
         manager = Systemd({}, os.getpid())
-        return int(Watched(router, log, manager, sys.stdin.fileno()).run())
+        return int(ListenerProcess(router, log, manager, sys.stdin.fileno()).run())
     finally:
         log.close()
 
 
 async def _kept(file: str, log: Log) -> int:
     """Run one router process after the other, until a signal or an exit code that is final."""
-    import signal
-
-    from acsard.daemon.supervisor import ROUTER, keep_running
-
     keeper = asyncio.ensure_future(keep_running(["router", file], log.event, ROUTER))
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, keeper.cancel)

@@ -1,16 +1,26 @@
-"""`acsard run`: run the daemon."""
+"""Run the daemon in the foreground until SIGTERM or Ctrl-C; the robot ramps to zero before the
+daemon ends. If no port is configured, the daemon runs the built-in simulator.
+"""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import faulthandler
 import os
 import shlex
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from acsard.cli.common import Overrides, add_config, load, recorded
+from acsard import __version__
+from acsard.cli.common import add_config, load, recorded
+from acsard.core.config.contradictions import warnings
 from acsard.core.config.settings import Config
+from acsard.core.values import ROOT, Event
+from acsard.daemon import daemon
+from acsard.daemon.bus.zenoh_sessions import reachable
+from acsard.host.logs import Log, Writer
 
 _BANNER = """\
 acsard {version}, robot {robot}
@@ -26,15 +36,8 @@ acsard {version}, robot {robot}
 _PAGE = "  page    {where}, for a browser; a line below says when it is ready\n"
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "run",
-        help="run the daemon (the default verb)",
-        description="Run the daemon in the foreground until SIGTERM or Ctrl-C; the robot ramps "
-        "to zero before the daemon ends. If no port is configured, the daemon runs "
-        "the built-in simulator.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_config(parser)
     parser.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
     parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 115200")
@@ -67,35 +70,22 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     parser.set_defaults(main=main)
 
 
-def overrides(args: argparse.Namespace) -> Overrides:
-    """Return the configuration keys given on the command line."""
-    given: Overrides = {}
-    for section, key, value in (
-        ("mcu", "port", args.port),
-        ("mcu", "baud_rate", args.baud_rate),
-        ("robot", "id", args.id),
-        ("ros", "namespace", args.namespace),
-        ("record", "directory", args.record),
-        ("bus", "listen", [args.listen] if args.listen else None),
-        ("bus", "connect", [args.connect] if args.connect else None),
-    ):
-        if value is not None:
-            given.setdefault(section, {})[key] = value
-    return given
+def options(args: argparse.Namespace) -> dict[str, object]:
+    """Return the configuration keys of the command line; None for one that is not given."""
+    return {
+        "mcu.port": args.port,
+        "mcu.baud_rate": args.baud_rate,
+        "robot.id": args.id,
+        "ros.namespace": args.namespace,
+        "record.directory": args.record,
+        "bus.listen": [args.listen] if args.listen else None,
+        "bus.connect": [args.connect] if args.connect else None,
+    }
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the daemon until a signal."""
-    import asyncio
-    import faulthandler
-
-    from acsard import __version__
-    from acsard.core.config.contradictions import warnings
-    from acsard.core.values import Event
-    from acsard.daemon import daemon
-    from acsard.host.logs import Log, Writer
-
-    where, config = load(args.config, overrides(args))
+    where, config = load(args.config, options(args))
     config = recorded(config)
     log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)
 
@@ -147,7 +137,6 @@ def page(config: Config, where: str) -> list[str] | None:
     there = find_spec("aiohttp") and find_spec("segno")
     if not (config.web.page and looked_at and there):
         return None
-    from acsard.daemon.bus.zenoh_sessions import reachable
 
     words = ["web", "--id", config.robot.id]
     if Path(where).is_file():
@@ -169,8 +158,6 @@ def _bus(config: Config) -> str:
 
 def reach(args: argparse.Namespace) -> str:
     """Return the options that other tools need to find this daemon, as text for the banner."""
-    from acsard.daemon.bus.zenoh_sessions import reachable
-
     listens = args.listen and reachable(args.listen)
     given = (("--config", args.config), ("--connect", listens), ("--id", args.id))
     return "".join([f" {option} {shlex.quote(value)}" for option, value in given if value])
@@ -195,9 +182,6 @@ def banner(
         reach: the options with which other tools find this daemon.
         served: whether the page is served.
     """
-    from acsard import __version__
-    from acsard.core.values import ROOT
-
     port = f"{device} at {config.mcu.baud_rate} baud"
     if trouble:
         port = f"none yet: {trouble}"

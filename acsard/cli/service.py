@@ -1,4 +1,6 @@
-"""`acsard service install | uninstall | status`: acsard as a system service."""
+"""Install the systemd unit, the stop script, the udev rules and a first configuration, then enable
+and start the service; or remove all of that.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +8,16 @@ import argparse
 import os
 import sys
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 from acsard.host.errors import Exit, ExitError, MendableError
+from acsard.machine import service_installation as service
+from acsard.machine.installation_steps import Step
+from acsard.machine.service_installation import misplaced
+from acsard.terminal.output import show, table
 
-if TYPE_CHECKING:
-    from acsard.host.installation_steps import Step
 
-
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb, its actions and their options."""
-    parser = verbs.add_parser(
-        "service",
-        help="install acsard as a system service, remove it, or show its status",
-        description="Install the systemd unit, the stop script, the udev rules and a first "
-        "configuration, then enable and start the service; or remove all of that.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions and their options."""
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for name, main, text in (
         ("install", main_install, "write the files, enable and start the service"),
@@ -52,9 +48,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main_install(args: argparse.Namespace) -> int:
     """Write the files, reload systemd, and enable and start the service."""
-    from acsard.host import service_installation as service
-    from acsard.host.service_installation import misplaced
-
     _ready(args)
     trouble = misplaced()
     if trouble:
@@ -71,8 +64,6 @@ def main_install(args: argparse.Namespace) -> int:
 
 def main_uninstall(args: argparse.Namespace) -> int:
     """Stop and disable the service and remove its files."""
-    from acsard.host import service_installation as service
-
     _ready(args)
     files = [*service.files(), *map(service.lan_drop_in, service.ALL)]
     steps = service.uninstalling(
@@ -90,10 +81,6 @@ def main_uninstall(args: argparse.Namespace) -> int:
 
 def main_status(args: argparse.Namespace) -> int:
     """Print the state of files and units. Return 0 if the daemon's unit is active."""
-    from acsard.host import service_installation as service
-    from acsard.terminal.output import show
-    from acsard.terminal.tables import table
-
     show(table((file.condition(), str(file.path)) for file in service.files()))
     state = service.state(service.UNIT)
     print(state or "systemd does not answer on this machine")

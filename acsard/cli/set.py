@@ -1,23 +1,4 @@
-"""`acsard set limits.linear_speed 0.8`: change a setting of the running robot."""
-
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from acsard.cli.common import add_bus, robot_address
-from acsard.core.formatting import json_line, lines
-from acsard.host.config_file import writable
-from acsard.host.errors import Exit, ExitError
-from acsard.host.extras import install
-
-if TYPE_CHECKING:
-    from acsard.core.values import Plain
-
-DESCRIPTION = """\
-Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
+"""Change settings of the running robot: limits, timeouts, covariances, publishing rates, the log
 level. Either all given settings change or none. The daemon checks them like the configuration file,
 logs them and publishes them on the key `config`. They last until the daemon's next start; only a
 lowered speed, acceleration or jerk survives it. --write also puts the settings into the
@@ -26,14 +7,30 @@ decelerates to a lowered speed limit. Without a setting, list the settings that 
 exit code is 1 if the robot refuses.
 """
 
+from __future__ import annotations
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "set",
-        help="change a setting of the running robot, or list the changeable settings",
-        description=DESCRIPTION,
-    )
+import argparse
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from acsard.cli.connection import add_bus, connected
+from acsard.core.config.live import flat, live
+from acsard.core.config.lowered import stays
+from acsard.core.config.validation import show
+from acsard.core.formatting import json_line, lines
+from acsard.core.messages.encodings import encode
+from acsard.core.ros.parameters import described
+from acsard.core.values import Plain
+from acsard.host.config_file import change, require_changeable, writable
+from acsard.host.errors import Exit, ExitError, MendableError, UsageError
+from acsard.host.extras import install
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     parser.add_argument(
         "settings",
         nargs="*",
@@ -54,18 +51,11 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Set the settings, or list them if none is given."""
-    from acsard.client import connect
-    from acsard.core.config.lowered import stays
-    from acsard.core.messages.encodings import encode
-    from acsard.host.config_file import change, require_changeable
-    from acsard.host.errors import MendableError
-
     settings = pairs(args.settings)
     file = _file(args.config, settings) if args.write else None
     if file is not None:
         require_changeable(file, settings)
-    endpoint, robot_id, tls = robot_address(args)
-    with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
+    with connected(args) as robot:
         if not settings:
             _tell(robot.get("config"), args.json)
             return int(Exit.OK)
@@ -91,16 +81,12 @@ def pairs(words: Sequence[str]) -> dict[str, Plain]:
 
     A value is read as TOML; a bare word is a string. Raises `UsageError` if a value is missing.
     """
-    from acsard.host.errors import UsageError
-
     if len(words) % 2:
         raise UsageError("give pairs of KEY VALUE, for example acsard set limits.linear_speed 0.8")
     return {key: _value(word) for key, word in zip(words[::2], words[1::2], strict=True)}
 
 
 def _value(word: str) -> Plain:
-    import tomllib
-
     try:
         found = tomllib.loads(f"value = {word}")
     except (tomllib.TOMLDecodeError, ValueError, RecursionError):
@@ -112,8 +98,6 @@ def _value(word: str) -> Plain:
 
 def _file(path: str | None, settings: dict[str, Plain]) -> Path:
     """Return the file that --write is to change. Raises `UsageError` before anything is set."""
-    from acsard.host.errors import UsageError
-
     if not settings:
         raise UsageError("--write needs a setting: acsard set limits.linear_speed 0.8 --write")
     if any(key.startswith("commands.sources.") for key in settings):
@@ -128,12 +112,6 @@ def _file(path: str | None, settings: dict[str, Plain]) -> Path:
 
 def _tell(config: object, as_json: bool) -> None:
     """Print the settings that can be changed, with their present values."""
-    import msgspec
-
-    from acsard.core.config.live import flat, live
-    from acsard.core.config.validation import show
-    from acsard.core.ros.parameters import described
-
     now = {key: value for key, value in flat(config) if live(key)}
     if as_json:
         print(msgspec.json.encode(now).decode())

@@ -1,26 +1,27 @@
-"""`acsard sim`: the simulated microcontroller on its own pty."""
+"""Simulate the microcontroller's side of the serial protocol on a pty, until Ctrl-C. The tool
+prints the device for `acsard run --port`.
+"""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
+import signal
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from acsard.cli.common import add_config, load
 from acsard.core.config.named_faults import FAULTS, RESET, NamedFault, forms, named
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
-from acsard.host.errors import Exit, ExitError
+from acsard.daemon.serial.simulated_board import SimPty
+from acsard.host import clock
+from acsard.host.errors import UsageError
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "sim",
-        help="simulate a microcontroller on a pty, for a separate `acsard run --port …`",
-        description="Simulate the microcontroller's side of the serial protocol on a pty, until "
-        "Ctrl-C. The tool prints the device for `acsard run --port`.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_config(parser)
     parser.add_argument(
         "--fault",
@@ -47,8 +48,6 @@ def fault(text: str) -> NamedFault:
 
 def main(args: argparse.Namespace) -> int:
     """Simulate the microcontroller until a signal."""
-    import asyncio
-
     _, config = load(args.config)
     return asyncio.run(_play(config, args))
 
@@ -60,15 +59,11 @@ def _make_link(link: Path, device: str) -> None:
             link.unlink()
         link.symlink_to(device)
     except OSError as error:
-        raise ExitError(
-            Exit.USAGE, f"cannot make the link {link}: {error.strerror}; give another --link"
-        ) from None
+        words = f"cannot make the link {link}: {error.strerror}; give another --link"
+        raise UsageError(words) from None
 
 
 def _reset_again(mcu: FakeMcu, period_s: float) -> None:
-    import asyncio
-
-    from acsard.host import clock
 
     def reset() -> None:
         mcu.reset(clock.now().mono_ns)
@@ -78,13 +73,6 @@ def _reset_again(mcu: FakeMcu, period_s: float) -> None:
 
 
 async def _play(config: Config, args: argparse.Namespace) -> int:
-    import asyncio
-    import signal
-    from contextlib import ExitStack
-
-    from acsard.daemon.serial.simulated_board import SimPty
-    from acsard.host import clock
-
     ended = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)

@@ -1,4 +1,6 @@
-"""`acsard tls init | add | renew | router`: make certificates for a bus that leaves the machine."""
+"""Make certificates for a bus that other machines can reach. Needs the library cryptography; if it
+is missing, a message gives the command that installs it.
+"""
 
 from __future__ import annotations
 
@@ -8,29 +10,24 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from acsard.certificates import identities
-from acsard.cli.common import add_config, load
+from acsard.cli.common import add_config, load, whole
 from acsard.core.config.settings import Config
 from acsard.core.config.validation import write
 from acsard.core.values import ROLES
+from acsard.daemon.bus.address import require_id
 from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY
+from acsard.daemon.gateway.fleet_router import router_file
+from acsard.host.config_file import change, require_changeable, require_tomlkit
 from acsard.host.errors import UsageError
-from acsard.host.service_installation import TLS
-
-MOST_DAYS = 3650
+from acsard.machine import certificates
+from acsard.machine import service_installation as service
+from acsard.machine.service_installation import TLS, source
 
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb, its actions and their options."""
-    parser = verbs.add_parser(
-        "tls",
-        help="make the certificates with which other machines connect",
-        description="Make certificates for a bus that other machines can reach. Needs the "
-        "library cryptography; if it is missing, a message gives the command that "
-        "installs it.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the actions and their options."""
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(
         "init",
@@ -106,7 +103,11 @@ def _add_common(action: argparse.ArgumentParser) -> None:
         "--directory", type=Path, default=Path(TLS), metavar="DIR", help=f"default {TLS}"
     )
     action.add_argument(
-        "--days", type=_days, default=730, metavar="N", help="validity in days (default: 730)"
+        "--days",
+        type=whole("days", 3650),
+        default=730,
+        metavar="N",
+        help="validity in days (default: 730)",
     )
     action.add_argument(
         "--address",
@@ -120,38 +121,34 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 def main_init(args: argparse.Namespace) -> int:
     """Make the authority, the robot's certificate and one client certificate per role."""
-    from acsard.host.config_file import require_changeable, require_tomlkit
-
     directory = args.directory.resolve()
 
     robots: list[str] = []
 
     def keys(config: Config) -> dict[str, object]:
         robots.append(config.robot.id)
-        return identities.keys(config, directory)
+        return certificates.keys(config, directory)
 
     if args.write:
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
     else:
         robots.append(load(None)[1].robot.id)
-    names = identities.init(args.directory, args.address, args.days, force=args.force)
+    names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
         _configure(args.write, keys)
     _admit_service(directory)
     host, robot = socket.gethostname(), robots[-1]
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
-    lines = "" if args.write else _LINES.format(directory=directory, port=identities.PORT)
+    lines = "" if args.write else _LINES.format(directory=directory, port=certificates.PORT)
     print(_certified(names))
-    where = f"tls/{host}.local:{identities.PORT}"
+    where = f"tls/{host}.local:{certificates.PORT}"
     print(_NEXT.format(directory=directory, robot=robot, where=where, lines=lines, **files))
     return 0
 
 
 def main_add(args: argparse.Namespace) -> int:
     """Make one more client certificate."""
-    from acsard.host.config_file import change, require_changeable, require_tomlkit
-
     listed = f"{args.role}s"
 
     def keys(config: Config) -> dict[str, object]:
@@ -168,7 +165,7 @@ def main_add(args: argparse.Namespace) -> int:
             )
         require_tomlkit()
         require_changeable(args.write, keys, new=True)
-    place = identities.add(args.directory, args.name, args.address, args.days)
+    place = certificates.add(args.directory, args.name, args.address, args.days)
     if not args.role:
         print(f"{place} is for {args.name}")
         return 0
@@ -189,7 +186,7 @@ def main_add(args: argparse.Namespace) -> int:
 
 def main_renew(args: argparse.Namespace) -> int:
     """Replace the robot's own certificate."""
-    names = identities.renew(args.directory, args.address, args.days)
+    names = certificates.renew(args.directory, args.address, args.days)
     print(_certified(names))
     print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
     return 0
@@ -197,10 +194,6 @@ def main_renew(args: argparse.Namespace) -> int:
 
 def main_router(args: argparse.Namespace) -> int:
     """Print the configuration of a fleet's router."""
-    from acsard.daemon.bus.address import require_id
-    from acsard.daemon.gateway.fleet_router import router_file
-    from acsard.host.service_installation import source
-
     for robot in args.robots:
         require_id(robot)
     template = (source() / "zenoh" / "router.json5").read_text()
@@ -215,8 +208,6 @@ def _certified(names: list[str]) -> str:
 
 def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
     """Set the keys of the bus in a configuration file and keep its comments."""
-    from acsard.host.config_file import change
-
     changed = change(file, keys, new=True)
     print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
 
@@ -227,8 +218,6 @@ def _admit_service(directory: Path) -> None:
     It writes a systemd drop-in with the permitted networks and the certificates, and does nothing
     without an installed service.
     """
-    from acsard.host import service_installation as service
-
     step = service.admitting(directory)
     if step is None:
         return
@@ -248,15 +237,9 @@ def _name(text: str) -> str:
 
 
 def _address(text: str) -> str:
-    if not identities.ADDRESS.match(text):
+    if not certificates.ADDRESS.match(text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a host name or an IP address")
     return text
-
-
-def _days(text: str) -> int:
-    if not text.isdecimal() or not 0 < int(text) <= MOST_DAYS:
-        raise argparse.ArgumentTypeError(f"{text} is not a number of days from 1 to {MOST_DAYS}")
-    return int(text)
 
 
 _LINES = """\

@@ -1,24 +1,23 @@
-"""`acsard topics`: print the table of keys."""
+"""List every key of the daemon. No daemon has to run."""
 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from acsard.cli.common import add_config, load
+from acsard.core.config.settings import Config
+from acsard.core.incoming.queries import topic_table
+from acsard.core.messages.encodings import encode
+from acsard.core.messages.schema import TopicInfo, Topics
+from acsard.core.messages.topics import by_key
+from acsard.core.ros.names import full_name
+from acsard.core.ros.parameters import SETTING
+from acsard.core.ros.transports import left_out, ros_names
+from acsard.terminal.output import show, table
 
-if TYPE_CHECKING:
-    from acsard.core.config.settings import Config
-    from acsard.core.messages.schema import Topics
 
-
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "topics",
-        help="list the keys on the bus: direction, type, rate, meaning",
-        description="List every key of the daemon. No daemon has to run.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--ros", action="store_true", help="list the ROS 2 names instead")
@@ -27,11 +26,6 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Print the table."""
-    from acsard.core.incoming.queries import topic_table
-    from acsard.core.messages.encodings import encode
-    from acsard.terminal.output import show
-    from acsard.terminal.tables import table
-
     _, config = load(args.config)
     topics = ros_table(config) if args.ros else topic_table(config)
     if args.json:
@@ -44,12 +38,6 @@ def main(args: argparse.Namespace) -> int:
 
 def ros_table(config: Config) -> Topics:
     """Return the ROS topics and services, each with the native key that it stands for."""
-    from acsard.core.messages.schema import TopicInfo, Topics
-    from acsard.core.messages.topics import by_key
-    from acsard.core.ros.names import full_name
-    from acsard.core.ros.parameters import SETTING
-    from acsard.core.ros.transports import left_out, ros_names
-
     ros = config.ros
     rows = []
     for row in ros_names(ros, left_out(config)) if ros.bridge or ros.rmw else ():

@@ -6,14 +6,17 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
-from typing import TYPE_CHECKING
 
+import zenoh
+
+from acsard.client import Client
 from acsard.client.follower import FIRST_S
+from acsard.core.config.settings import TLS
 from acsard.core.formatting import printable
-
-if TYPE_CHECKING:
-    from acsard.client import Client
-    from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.quiet import Around, why
+from acsard.daemon.bus.robot_discovery import around
+from acsard.daemon.bus.tls import trouble
 
 
 def nothing() -> str:
@@ -59,13 +62,11 @@ def explained(
         come.set()
 
 
-def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
+def waits_for(robot: Client, key: str) -> Callable[[], str]:
     """Return a function that explains why nothing has arrived on a key."""
 
     def look() -> str:
-        from acsard.daemon.bus.quiet import why
-        from acsard.daemon.bus.robot_discovery import around
-
+        where = robot.where
         seen = around(robot.session, where.robot_id, where.endpoint)
         if seen is None:
             return ""
@@ -76,23 +77,19 @@ def waits_for(robot: Client, key: str, where: Address) -> Callable[[], str]:
     return look
 
 
-def lost_by(robot: Client, where: Address) -> Callable[[], str]:
+def lost_by(robot: Client) -> Callable[[], str]:
     """Return a function that explains why messages ceased.
 
     It returns "" while the session is connected.
     """
 
     def look() -> str:
-        import zenoh
-
-        from acsard.daemon.bus.quiet import Around, why
-
         try:
             if robot.session.info.links():
                 return ""
         except zenoh.ZError:
             return ""  # the session is being closed
-        gone = Around(linked=False, here=False)
+        where, gone = robot.where, Around(linked=False, here=False)
         return of_link(where) or why("", where.robot_id, where.endpoint, gone)
 
     return look
@@ -103,8 +100,5 @@ def of_link(where: Address) -> str:
 
     A certificate may have expired while the tool followed the robot.
     """
-    from acsard.core.config.settings import TLS
-    from acsard.daemon.bus.tls import trouble
-
     secured = where.tls and where.endpoint.startswith(TLS)
     return trouble(where.endpoint, where.tls) if secured else ""

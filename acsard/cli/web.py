@@ -1,22 +1,31 @@
-"""`acsard web`: serve the robot's page to browsers and programs, and manage access to it."""
+"""Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in a terminal starts this
+by itself. A browser on the robot's machine has every permission. A browser on another machine needs
+HTTPS with the robot's certificate, and a token.
+"""
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import re
 import sys
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from acsard.cli.common import Overrides, add_bus, load, recorded
+from acsard.cli.common import load, recorded, whole
+from acsard.cli.connection import add_bus
+from acsard.core.config.settings import Config
 from acsard.core.formatting import lasting
 from acsard.core.values import ROLES
+from acsard.daemon.bus.address import address_of
+from acsard.daemon.bus.zenoh_sessions import log_from_environment
 from acsard.host.errors import Exit, ExitError, UsageError
 from acsard.host.extras import install
+from acsard.host.logs import Log
+from acsard.terminal.output import show, table
 
 if TYPE_CHECKING:
-    from acsard.core.config.settings import Config
     from acsard.web.listen import Listen
     from acsard.web.tokens import Vault
 
@@ -27,16 +36,9 @@ USUAL_DAYS = 30
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
-def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the verb and its options."""
-    parser = verbs.add_parser(
-        "web",
-        help="serve the robot's page: see, stop and drive the robot in a browser",
-        description="Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in "
-        "a terminal starts this by itself. A browser on the robot's machine has "
-        "every permission. A browser on another machine needs HTTPS with the "
-        f"robot's certificate, and a token. Needs an extra: {install('web')}.",
-    )
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.epilog = f"Needs an extra: {install('web')}."
     add_bus(parser)
     parser.add_argument(
         "--address",
@@ -67,13 +69,13 @@ def add(verbs: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     lasting = parser.add_mutually_exclusive_group()
     lasting.add_argument(
         "--days",
-        type=_days,
+        type=whole("days", MOST_DAYS, "; for less than a day use --hours"),
         metavar="N",
         help=f"days until the token expires (default: {USUAL_DAYS})",
     )
     lasting.add_argument(
         "--hours",
-        type=_hours,
+        type=whole("hours", MOST_HOURS, "; for more use --days"),
         metavar="N",
         help=f"hours until the token expires, for a visitor: 1 to {MOST_HOURS}",
     )
@@ -90,8 +92,7 @@ def main(args: argparse.Namespace) -> int:
         raise ExitError(
             Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
-    given: Overrides = {"record": {"directory": args.record}} if args.record else {}
-    where, loaded = load(args.config, given)
+    where, loaded = load(args.config, {"record.directory": args.record or None})
     config = recorded(loaded)
     if args.invite:
         return _invite(args, config, where)
@@ -103,11 +104,6 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace, config: Config) -> int:
-    import asyncio
-
-    from acsard.daemon.bus.address import address_of
-    from acsard.daemon.bus.zenoh_sessions import log_from_environment
-    from acsard.host.logs import Log
     from acsard.web import server, tokens
     from acsard.web.listen import opened_by
 
@@ -179,16 +175,12 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:
     """Return the tokens of the robot that the options name."""
-    from acsard.daemon.bus.address import address_of
     from acsard.web.tokens import Vault, place
 
     return Vault(place(), address_of(config, args.connect, args.id, args.tls).robot_id)
 
 
 def _list(vault: Vault) -> int:
-    from acsard.terminal.output import show
-    from acsard.terminal.tables import table
-
     tokens, now_s = vault.all(), time.time()
 
     def until(ends: int) -> str:
@@ -218,18 +210,3 @@ def _name(text: str) -> str:
             f"{text!r} is not a name: use 1 to 32 of A-Z a-z 0-9 _ . -"
         )
     return text
-
-
-def _days(text: str) -> int:
-    return _whole(text, MOST_DAYS, "days", "; for less than a day use --hours")
-
-
-def _hours(text: str) -> int:
-    return _whole(text, MOST_HOURS, "hours", "; for more use --days")
-
-
-def _whole(text: str, most: int, units: str, else_: str) -> int:
-    if not text.isascii() or not text.isdecimal() or not 0 < int(text) <= most:
-        words = f"{text} is not a whole number of {units} from 1 to {most}{else_}"
-        raise argparse.ArgumentTypeError(words)
-    return int(text)

@@ -31,6 +31,7 @@ from acsard.core.messages.topics import (
     unknown,
 )
 from acsard.core.values import Plain, Pose
+from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.identity import Identity, identity
 from acsard.daemon.bus.quiet import why as why_quiet
 from acsard.daemon.bus.robot_discovery import around
@@ -88,8 +89,8 @@ class Client:
         tls: str = "",
         endpoint: str = "",
     ) -> None:
-        self.session, self._tls, self._endpoint = session, tls, endpoint
-        self._id, self.source = robot_id, source
+        self.session, self.source = session, source
+        self.where = Address(endpoint, robot_id, tls)
         self.name = own_name()
         """Name under which the daemon's log shows service calls; you may change it."""
         self._opened = False
@@ -121,7 +122,7 @@ class Client:
 
         `name` is the sender's name; by default it is that of this process.
         """
-        other = Client(self.session, robot_id, self.source, self._tls, self._endpoint)
+        other = Client(self.session, robot_id, self.source, self.where.tls, self.where.endpoint)
         other.name, other._secret, other._puts = self.name, self._secret, self._puts
         if name:
             other._sign_as(name)
@@ -129,7 +130,7 @@ class Client:
 
     def key(self, name: str) -> str:
         """Return the full key of a name in the topic table, such as "odom"."""
-        return full_key(self._id, name)
+        return full_key(self.where.robot_id, name)
 
     def command_key(self, source: str) -> str:
         """Return the key, below the robot's id, on which this client commands as `source`.
@@ -199,7 +200,9 @@ class Client:
 
     def whoami(self) -> Identity:
         """Return this client's identity as the daemon sees it. An unknown role is ""."""
-        return identity(self.ask, self._tls, self.sender, self._id, self._endpoint)
+        return identity(
+            self.ask, self.where.tls, self.sender, self.where.robot_id, self.where.endpoint
+        )
 
     def pose(self) -> Pose:
         """Return the present pose of base_link in odom."""
@@ -314,25 +317,26 @@ class Client:
         key, no_answer = name.partition("?")[0], f"no answer on {self.key(name)}"
         if unknown(key):
             return NoAnswerError(f"{no_answer}: {key} is not in the topic table ({key_hint(key)})")
-        if self._tls:
+        if self.where.tls:
             us = self.whoami()
             if us.silence:
                 return NoAnswerError(f"{no_answer}: {us.silence}")
             if why := us.lacks(key):
                 return NotPermittedError(why)
-        seen = around(self.session, self._id, self._endpoint)
-        if seen is None or seen.here or not self._endpoint:
+        where = self.where
+        seen = around(self.session, where.robot_id, where.endpoint)
+        if seen is None or seen.here or not where.endpoint:
             return NoAnswerError(
-                f"{no_answer}; is the daemon of robot.id {self._id!r} stuck, does it have this "
-                "key (`acsard topics`), and may you query it?"
+                f"{no_answer}; is the daemon of robot.id {where.robot_id!r} stuck, does it have "
+                "this key (`acsard topics`), and may you query it?"
             )
-        return NoAnswerError(f"{no_answer}: {why_quiet(key, self._id, self._endpoint, seen)}")
+        return NoAnswerError(f"{no_answer}: {why_quiet(key, where.robot_id, where.endpoint, seen)}")
 
     def unheard(self, error: UnheardError | NoAnswerError) -> MendableError:
         """Convert the error to its documented type, and add the role of the certificate in it."""
-        if isinstance(error, UnheardError) and not self._tls:
+        if isinstance(error, UnheardError) and not self.where.tls:
             return NotDrivenError(str(error))
-        if not self._tls:
+        if not self.where.tls:
             return error
         us = self.whoami()
         if us.silence:

@@ -176,7 +176,8 @@ class Robot:
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
         link = self.session.link
-        status = (self._life.mode.value, self._reason(), link, self._choice.source)
+        # `value` itself would run Python code of the enum.
+        status = (self._life.mode._value_, self._reason(), link, self._choice.source)
         another, self._status = status != self._status, status
         # Otherwise neither the mode nor the commander has changed.
         if another or news:

@@ -47,7 +47,7 @@ from acsard.core.values import (
     Request,
     Snapshot,
 )
-from acsard.daemon.kept_latches import ANSWER_NS, Handover, LatchKeeper
+from acsard.daemon.latch_rules import ANSWER_NS, Handover, LatchKeeper
 from acsard.daemon.latencies import Stopwatch
 from acsard.daemon.pacing import NO_PERIOD, Pace, Period
 from acsard.recording.recorded_steps import BlackBox

@@ -2,7 +2,7 @@
 
 A thread writes it. The control loop only hands over the newest latches and never waits for the
 disk. From the rename on, a killed process loses nothing. From the sync on, a power cut loses
-nothing. The file is read once, before the robot exists. `kept_latches.py` decides what the robot
+nothing. The file is read once, before the robot exists. `latch_rules.py` decides what the robot
 starts with.
 """
 
@@ -22,7 +22,7 @@ from msgspec.structs import replace as replace_fields
 
 from acsard.core.config.settings import Config
 from acsard.core.values import NS_PER_S, Event, Instant, Latches
-from acsard.daemon.kept_latches import (
+from acsard.daemon.latch_rules import (
     MAX_BYTES,
     LatchFileError,
     at_start,

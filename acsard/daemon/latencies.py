@@ -26,31 +26,24 @@ LAST = PER_DECADE * DECADES
 """Index of the end bucket."""
 
 
-ENDS = [math.pow(10.0, index / PER_DECADE) for index in range(LAST)]
-"""The upper end of each bucket except the last, which is open."""
-
-
 class Histogram:
     """Percentiles of an endless stream in fixed memory, by logarithmic buckets."""
 
     def __init__(self) -> None:
         self._buckets = [0] * (LAST + 1)
-        self._count = 0
         self._max = 0.0
 
     def add(self, value: float) -> None:
         """Count a measurement."""
-        self._buckets[bisect_left(ENDS, value)] += 1
-        self._count += 1
+        # A search in a table of the buckets' ends would fetch a dozen cold cache lines each time.
+        index = math.ceil(PER_DECADE * math.log10(value)) if value > 1.0 else 0
+        self._buckets[index if index < LAST else LAST] += 1
         if value > self._max:
             self._max = value
 
     def merge(self, other: Histogram) -> None:
         """Add all measurements of another histogram."""
-        if other._count == 0:
-            return
         self._buckets[:] = map(add, self._buckets, other._buckets)
-        self._count += other._count
         self._max = max(self._max, other._max)
 
     def spread(self) -> Spread:
@@ -58,14 +51,13 @@ class Histogram:
 
         A percentile is the upper end of its bucket.
         """
-        return Spread(self._count, self._percentile(0.50), self._percentile(0.99), self._max)
+        totals = list(accumulate(self._buckets))
+        p50, p99 = (self._percentile(totals, share) for share in (0.50, 0.99))
+        return Spread(totals[-1], p50, p99, self._max)
 
-    def _percentile(self, share: float) -> float:
-        if self._count == 0:
-            return 0.0
-        rank = max(1.0, share * self._count)
-        index = bisect_left(list(accumulate(self._buckets)), rank)
-        return min(math.pow(10.0, index / PER_DECADE), self._max)
+    def _percentile(self, totals: list[int], share: float) -> float:
+        rank = max(1.0, share * totals[-1])
+        return min(math.pow(10.0, bisect_left(totals, rank) / PER_DECADE), self._max)
 
 
 Name = Literal[
@@ -101,20 +93,25 @@ FRESH_NS = NS_PER_S
 """Longest age of the cached values. Adding up a minute costs more than a control step."""
 
 
-class _Figure:
+class Figure:
+    """One latency since the start and over the last minute."""
+
     def __init__(self) -> None:
         self._past = Histogram()
         """All measurements older than the last minute."""
         self._slots = [Histogram() for _ in range(SLOTS)]
         self._number = -SLOTS
+        self._slot, self._ends_ns = self._slots[0], 0
+        """The newest slot, and the monotonic time at which it ends."""
 
-    def add(self, now_ns: int, value: float) -> None:
-        number = now_ns // SLOT_NS
-        if number != self._number:
-            self._advance(number)
-        self._slots[number % SLOTS].add(value)
+    def add(self, now_ns: int, duration_ns: int) -> None:
+        """Record a duration that was measured at monotonic `now_ns`."""
+        if now_ns >= self._ends_ns:
+            self._advance(now_ns // SLOT_NS)
+        self._slot.add(duration_ns / 1000)
 
     def measured(self, now_ns: int) -> Measured:
+        """Return the percentiles at monotonic `now_ns`."""
         self._advance(now_ns // SLOT_NS)
         minute = Histogram()
         for slot in self._slots:
@@ -127,7 +124,9 @@ class _Figure:
         for new in range(max(self._number, number - SLOTS) + 1, number + 1):
             self._past.merge(self._slots[new % SLOTS])
             self._slots[new % SLOTS] = Histogram()
-        self._number = number
+        # A measurement may be a little older than the one before it.
+        number = self._number = max(number, self._number)
+        self._slot, self._ends_ns = self._slots[number % SLOTS], (number + 1) * SLOT_NS
 
 
 class LastMinute:
@@ -153,13 +152,12 @@ class Figures:
     """All figures of one daemon."""
 
     def __init__(self) -> None:
-        self._figures = {name: _Figure() for name in NAMES}
+        self._figures = {name: Figure() for name in NAMES}
         self._cached: dict[str, Measured] = {}
         self._cached_ns = -FRESH_NS
 
-    def add(self, name: Name, now_ns: int, duration_ns: int) -> None:
-        """Record a duration that was measured at monotonic `now_ns`."""
-        self._figures[name].add(now_ns, duration_ns / 1000)
+    def __getitem__(self, name: Name) -> Figure:
+        return self._figures[name]
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
         """Return all figures by name, at most a second old."""
@@ -173,7 +171,13 @@ class Stopwatch:
     """The measurements of the control loop."""
 
     def __init__(self) -> None:
-        self._figures = Figures()
+        figures = self._figures = Figures()
+        self._period_lateness = figures["period_lateness"]
+        self._step_time = figures["step_time"]
+        self._command_age = figures["command_age"]
+        self._command_to_wire = figures["command_to_wire"]
+        self._feedback_to_bus = figures["feedback_to_bus"]
+        self._round_trip = figures["mcu_round_trip"]
         self._missed = LastMinute()
 
     def measured(self, now_ns: int) -> dict[str, Measured]:
@@ -189,7 +193,7 @@ class Stopwatch:
 
         `missed` periods before it had no step.
         """
-        self._figures.add("period_lateness", now_ns, late_ns)
+        self._period_lateness.add(now_ns, late_ns)
         if missed:
             self._missed.add(now_ns, missed)
 
@@ -198,9 +202,9 @@ class Stopwatch:
         command_ns = outputs.command_ns
         if command_ns is None or outputs.mode != "driving":
             return
-        self._figures.add("command_age", sent_ns, sent_ns - command_ns)
+        self._command_age.add(sent_ns, sent_ns - command_ns)
         if command_ns > before_ns:  # otherwise it waited for its source's turn, not for the wire
-            self._figures.add("command_to_wire", sent_ns, sent_ns - command_ns)
+            self._command_to_wire.add(sent_ns, sent_ns - command_ns)
 
     def feedback(self, estimate: Estimate, told_ns: int | None) -> None:
         """Record a feedback line.
@@ -209,10 +213,10 @@ class Stopwatch:
         """
         at_ns, asked_ns = estimate.heard_ns, estimate.asked_ns
         if asked_ns is not None:
-            self._figures.add("mcu_round_trip", at_ns, at_ns - asked_ns)
+            self._round_trip.add(at_ns, at_ns - asked_ns)
         if told_ns is not None:
-            self._figures.add("feedback_to_bus", told_ns, told_ns - at_ns)
+            self._feedback_to_bus.add(told_ns, told_ns - at_ns)
 
     def step(self, began_ns: int, ended_ns: int) -> None:
         """Record the start and the end of a step."""
-        self._figures.add("step_time", began_ns, ended_ns - began_ns)
+        self._step_time.add(began_ns, ended_ns - began_ns)

@@ -19,7 +19,6 @@ import zenoh
 from acsard.client import Client
 from acsard.client.commander import LONGEST_S
 from acsard.client.watch import Watch
-from acsard.core.messages.topics import full_key
 from acsard.core.ros.names import full_name
 from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.drives import Drives
@@ -48,18 +47,16 @@ class Bridge:
     def __init__(
         self,
         robot: Client,
-        robot_id: str,
-        tls: str,
         address: tuple[str, int],
         tell: Callable[[str], None],
         *,
         acts: bool = False,
     ) -> None:
-        self._robot, self._id, self._tls = robot, robot_id, tls
+        self._robot, self._id = robot, robot.where.robot_id
         robot.name += ", a viewer"
         self._wake, self._ended = Event(), Event()
         self._notices = Notices(tell, self._wake.set)
-        facts = learn(robot, tls)
+        facts = learn(robot)
         ros = facts.config.ros
         self._shown = Shown(self._wake.set)
         self._settings = Settings(robot, self._notices, facts.tables)
@@ -74,12 +71,12 @@ class Bridge:
         logging.getLogger("foxglove").addHandler(Refusals(self._notices))
         listener = Listener(self._shown, self._drives, self._settings)
         offered = services(robot, ros, CALLED if acts else STOPS)
-        self._server = start(f"acsard {robot_id}", address, listener, offered, context, acts=acts)
+        self._server = start(f"acsard {self._id}", address, listener, offered, context, acts=acts)
         self._objections: dict[int, Objections] = {}
         self._watch: Watch | None = None
         """Follows the robot while a viewer drives."""
         self._here = self._was_here = True
-        key = full_key(robot_id, "alive")
+        key = robot.key("alive")
         self._token = robot.session.liveliness().declare_subscriber(key, self._alive, history=True)
 
     def run(self) -> None:
@@ -140,7 +137,7 @@ class Bridge:
         Returns False if the daemon does not answer yet.
         """
         try:
-            facts = learn(self._robot, self._tls)
+            facts = learn(self._robot)
         except AcsardError as error:
             self._notices.say("error", "daemon", str(error), stays=GONE)
             return False

@@ -50,13 +50,13 @@ def key_of(row: Channel, source: str) -> str:
     return row.native.replace(SOURCE, source)
 
 
-def learn(robot: Client, tls: str) -> Facts:
+def learn(robot: Client) -> Facts:
     """Query the robot.
 
     Raises the errors of `Client.get`, and `ReplyError` if its version differs.
     """
     forbidden, role, deaf = "", "maintainer", ""
-    if tls:
+    if robot.where.tls:
         deaf = DEAF
         us = robot.whoami()
         role = us.role

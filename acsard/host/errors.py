@@ -2,9 +2,8 @@
 
 Each error is an `AcsardError` and also the built-in exception that Python uses for such a case, so
 either can be caught. The text says what is wrong and how to fix it. Modules that other programs may
-import raise these errors, and `cli/exits.py` maps them to exit codes. `ExitError` is for verbs,
-which name their exit code themselves. Bugs are not among these errors, and neither are states of
-the robot, such as a lost port or a stale command.
+import raise these errors. `ExitError` is for verbs, which name their exit code themselves. Bugs are
+not among these errors, and neither are states of the robot, such as a lost port or a stale command.
 """
 
 from __future__ import annotations
@@ -12,54 +11,6 @@ from __future__ import annotations
 from enum import IntEnum
 
 from acsard.core.values import AcsardError
-
-
-class MendableError(AcsardError):
-    """Base class of these errors."""
-
-
-class UsageError(MendableError, ValueError):
-    """An argument is not written correctly, or names something that does not exist."""
-
-
-class UnreachableError(MendableError, ConnectionError):
-    """No process listens at this endpoint."""
-
-
-class NoAnswerError(MendableError, TimeoutError):
-    """A process listens at the endpoint, but no daemon answers this query."""
-
-
-class ReplyError(MendableError, RuntimeError):
-    """The reply is a failure, or it cannot be decoded."""
-
-
-class NotDrivenError(MendableError, RuntimeError):
-    """The robot does not follow this client's commands; the text is the daemon's reason."""
-
-
-class InUseError(MendableError, OSError):
-    """Another process uses the serial port, the bus address or the robot's id."""
-
-
-class NoPortError(MendableError, FileNotFoundError):
-    """The serial port does not exist."""
-
-
-class NotPermittedError(MendableError, PermissionError):
-    """This process is not permitted to read or open the file or device."""
-
-
-class RouterFileError(MendableError, ValueError):
-    """The configuration file of a router cannot be used."""
-
-
-class CertificateError(MendableError, ValueError):
-    """The certificates that the configuration names cannot be used."""
-
-
-class RecordingError(MendableError, ValueError):
-    """A file is not a recording of acsard, or it cannot be replayed."""
 
 
 class Exit(IntEnum):
@@ -86,6 +37,73 @@ WORDS: dict[int, str] = {
     Exit.BAD_CONFIG: "bad configuration",
 }
 """Meaning of each exit code, for people."""
+
+
+class MendableError(AcsardError):
+    """Base class of these errors."""
+
+    code: Exit = Exit.FAILURE
+    """Exit code of a verb that ends with this error."""
+
+
+class UsageError(MendableError, ValueError):
+    """An argument is not written correctly, or names something that does not exist."""
+
+    code = Exit.USAGE
+
+
+class UnreachableError(MendableError, ConnectionError):
+    """No process listens at this endpoint."""
+
+    code = Exit.UNREACHABLE
+
+
+class NoAnswerError(MendableError, TimeoutError):
+    """A process listens at the endpoint, but no daemon answers this query."""
+
+    code = Exit.UNREACHABLE
+
+
+class ReplyError(MendableError, RuntimeError):
+    """The reply is a failure, or it cannot be decoded."""
+
+
+class NotDrivenError(MendableError, RuntimeError):
+    """The robot does not follow this client's commands; the text is the daemon's reason."""
+
+
+class InUseError(MendableError, OSError):
+    """Another process uses the serial port, the bus address or the robot's id."""
+
+    code = Exit.IN_USE
+
+
+class NoPortError(MendableError, FileNotFoundError):
+    """The serial port does not exist."""
+
+    code = Exit.NO_PORT
+
+
+class NotPermittedError(MendableError, PermissionError):
+    """This process is not permitted to read or open the file or device."""
+
+    code = Exit.NO_PERMISSION
+
+
+class RouterFileError(MendableError, ValueError):
+    """The configuration file of a router cannot be used."""
+
+    code = Exit.BAD_CONFIG
+
+
+class CertificateError(MendableError, ValueError):
+    """The certificates that the configuration names cannot be used."""
+
+    code = Exit.BAD_CONFIG
+
+
+class RecordingError(MendableError, ValueError):
+    """A file is not a recording of acsard, or it cannot be replayed."""
 
 
 class ExitError(MendableError):

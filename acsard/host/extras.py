@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote, urlsplit
 
+from acsard.host.errors import Exit, ExitError
+
 Extra = Literal["foxglove", "report", "shell", "tls", "web", "write"]
 
 
@@ -23,6 +25,11 @@ def install(extra: Extra) -> str:
     except PackageNotFoundError:
         wanted = [f".[{extra}]"]
     return shlex.join([*_installer(), *wanted])
+
+
+def missing(library: str, extra: Extra) -> ExitError:
+    """Return the error about a missing library, with the command that installs it."""
+    return ExitError(Exit.FAILURE, f"needs the library {library}; run: {install(extra)}")
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:

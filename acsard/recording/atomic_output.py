@@ -1,8 +1,8 @@
 """Writes a file or a directory atomically, and never over a recording.
 
-The content is written beside the target under another name and renamed at the end, so the target is
-complete or absent. With `force` an existing target is replaced, but only if it is a plain file or a
-ROS bag. A recording, or a directory that holds anything else, is never replaced.
+The content is written under another name in the same directory and renamed at the end. Therefore
+the target is complete or absent. With `force` an existing target is replaced, but only if it is a
+regular file or a ROS bag. A recording, or a directory with other files, is never replaced.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from acsard.recording.file import Recording
 
 METADATA = "metadata.yaml"
 
-OF_A_BAG = (".mcap", ".db3")
-"""Suffixes of the data files of a rosbag2 directory."""
+BAG_SUFFIXES = (".mcap", ".db3")
+"""Suffixes of the data files of a ROS bag."""
 
 
 @contextmanager
-def beside(new: Path, force: bool) -> Iterator[Path]:
-    """Yield the path to write to, and rename it to `new` when the block succeeds.
+def replacing(new: Path, force: bool) -> Iterator[Path]:
+    """Yield a temporary path to write to, and rename it to `new` when the block succeeds.
 
-    Raises `FileExistsError` if `new` must not be replaced, and any other `OSError`. After an error
-    `new` is unchanged and no temporary file is left.
+    Without `force`, an existing `new` is an error. Raises `FileExistsError` if `new` must not be
+    replaced, and any other `OSError`. After an error `new` is unchanged and the temporary file is
+    removed.
     """
     _require_free(new, force)
     part = _near(new, "part")
@@ -50,8 +51,8 @@ def synced(stream: BinaryIO) -> None:
 def _put(part: Path, new: Path) -> None:
     """Rename `part` to `new`.
 
-    A directory cannot be replaced in one call, so the old one is deleted after the new one is in
-    place.
+    No call replaces a directory that has files. Therefore an old directory is renamed first, and
+    deleted at the end.
     """
     if not new.is_dir():
         os.replace(part, new)
@@ -85,14 +86,18 @@ def _require_free(new: Path, force: bool) -> None:
 
 def _require_bag(directory: Path) -> None:
     if not (directory / METADATA).is_file():
-        raise FileExistsError(EEXIST, "it is a directory, but not a bag")
-    for one in sorted(directory.iterdir()):
-        ours = one.name == METADATA or one.suffix in OF_A_BAG
-        if one.is_symlink() or not one.is_file() or not ours:
-            raise FileExistsError(EEXIST, f"it is a directory with {one.name}, and not only a bag")
-        if one.suffix == ".mcap" and _is_recording(one):
+        raise FileExistsError(EEXIST, "it is a directory, but not a ROS bag; name another path")
+    for path in sorted(directory.iterdir()):
+        of_bag = path.name == METADATA or path.suffix in BAG_SUFFIXES
+        if path.is_symlink() or not path.is_file() or not of_bag:
             raise FileExistsError(
-                EEXIST, f"it contains a recording, {one.name}; name another directory"
+                EEXIST,
+                f"it is a directory that also contains {path.name}, which is not a part of a ROS "
+                "bag; name another directory",
+            )
+        if path.suffix == ".mcap" and _is_recording(path):
+            raise FileExistsError(
+                EEXIST, f"it contains a recording, {path.name}; name another directory"
             )
 
 
@@ -105,13 +110,13 @@ def _is_recording(path: Path) -> bool:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, or a bag's directory file by file.
+    """Remove a file, or the files of a ROS bag and their directory.
 
     A recursive delete could remove more than a bag.
     """
     if path.is_dir() and not path.is_symlink():
-        for one in path.iterdir():
-            one.unlink()
+        for file in path.iterdir():
+            file.unlink()
         path.rmdir()
     else:
         path.unlink(missing_ok=True)

@@ -5,8 +5,8 @@
     000012-20261121T070027Z.near.mcap   finished, less than a minute from an incident
     000012-20261121T070027Z.kept.mcap   finished, and an incident happened in it
 
-The number gives the order of the files, even if the wall clock was set. `room` decides which files
-are deleted.
+The number gives the order of the files, even if the wall clock was adjusted in between.
+`retention.py` decides which files are deleted.
 """
 
 from __future__ import annotations
@@ -29,40 +29,50 @@ from acsard.host.atomic_file import sync
 from acsard.recording.end_record import CUTS
 from acsard.recording.file import MODE, About, Writing
 from acsard.recording.recovery import recover
-from acsard.recording.retention import AROUND_NS, Bounds, Disk, Ended, Kind, Steady, share, too_much
+from acsard.recording.retention import (
+    AROUND_NS,
+    Bounds,
+    ClockWatch,
+    Disk,
+    Ended,
+    Kind,
+    share,
+    to_delete,
+)
 
 DIRECTORY_MODE = 0o750
 
 OPEN_DIRECTORY_MODE, OPEN_MODE = 0o755, 0o644
-"""Modes of the directory and its files when the daemon records as a systemd service: open to all.
+"""Modes of the directory and its files when the daemon records as a systemd service.
 
-They are safe because only root can enter the directory above, and the unit of the robot's page
-mounts this one read-only. A group cannot give this access: a dynamic group has no name, and later
-versions of systemd (257) keep a state directory as nobody's on the disk.
+Every user may read them. That is safe because only root can enter the parent directory, and the
+unit of the robot's page mounts this directory read-only. A group cannot give the page access: a
+dynamic group has no name, and on the disk systemd 257 gives a state directory to the user nobody.
 """
 
 PRIVATE = Path("/var/lib/private")
-"""Parent of the state directories of services with a dynamic user; only root can enter it."""
+"""Parent of the state directories of services with a dynamic user. Only root can enter it."""
 
 KEPT = ".kept.mcap"
 NEAR = ".near.mcap"
 WHOLE = ".mcap"
 PART = ".mcap.part"
 
-LEFT = ".left"
+MARKER = ".left"
 """Suffix of the marker file that says that a `.part` file was not cut off by a crash."""
 
 ENDINGS: dict[Kind, str] = {"plain": WHOLE, "near": NEAR, "kept": KEPT}
 
 TRIM_ROUNDS = 600
-"""Calls of `tend`, one per second, between two searches for files that are too old. A file may
-grow for an hour, so ten minutes are often enough.
+"""Number of calls of `tend`, one each second, between two searches for files that are too old.
+
+Ten minutes are short enough, because a file may cover an hour.
 """
 
 S_PER_DAY = 86400
 
 STAMP = "%Y%m%dT%H%M%SZ"
-"""Format of the time at which a file began, in UTC, as its name holds it."""
+"""Format of the time in a file's name: the time at which the file began, in UTC."""
 
 
 def listed(directory: Path) -> list[Path]:
@@ -70,7 +80,7 @@ def listed(directory: Path) -> list[Path]:
     found = [
         path
         for path in directory.iterdir()
-        # A link or a pipe with such a name is not a recording, and reading a pipe may never end.
+        # A pipe or a link with such a name is not a recording, and reading a pipe may never end.
         if _number(path) is not None and path.is_file() and not path.is_symlink()
     ]
     return sorted(found, key=lambda path: (_number(path), path.name))
@@ -89,27 +99,23 @@ def _stem(path: Path) -> str:
     return path.name.partition(".")[0]
 
 
-def _stem_of(mark: Path) -> str:
-    """Return the stem of the recording to which a marker file belongs."""
-    return mark.name[1:].partition(PART)[0]
+def mark_cut(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
+    """Mark a `.part` file whose end could not be written, so that it does not pass for a crash.
 
-
-def leave(part: Path, kind: Kind, cut: Literal["late", "disk"]) -> None:
-    """Mark a `.part` file whose end the disk did not take, so that it does not pass for a crash.
-
-    The name of an empty marker file holds the retention class and the cause. A full disk still
-    takes a name, and it is there completely or not at all. Raises `OSError`.
+    The marker is an empty file, and its name holds the retention class `kind` and the cause `cut`.
+    Even a full disk usually accepts a new name. Raises `OSError` if it does not.
     """
-    part.with_name(f".{part.name}.{kind}.{cut}{LEFT}").touch()
+    part.with_name(f".{part.name}.{kind}.{cut}{MARKER}").touch()
 
 
-def _left(part: Path) -> tuple[Kind, str] | None:
-    """Return the retention class and the cause from a file's marker.
+def _marked(part: Path) -> tuple[Kind, str] | None:
+    """Return the retention class and the cause from the marker of a `.part` file.
 
-    Returns None for a file without a marker: a crash may have cut it off.
+    Returns None if the file has no marker, so that a crash may have cut it off.
     """
-    for mark in part.parent.glob(f".{part.name}.*{LEFT}"):
-        first, _, cut = mark.name.removeprefix(f".{part.name}.").removesuffix(LEFT).partition(".")
+    for marker in part.parent.glob(f".{part.name}.*{MARKER}"):
+        words = marker.name.removeprefix(f".{part.name}.").removesuffix(MARKER)
+        first, _, cut = words.partition(".")
         for kind in ENDINGS:
             if kind == first and cut in CUTS:
                 return kind, cut
@@ -117,21 +123,22 @@ def _left(part: Path) -> tuple[Kind, str] | None:
 
 
 class Run(Struct):
-    """State that lasts as long as the daemon, even if `Ring` is opened again after a disk error."""
+    """State that lasts as long as the daemon, even if a disk error makes it reopen the `Ring`."""
 
     numbers: set[int] = field(default_factory=set)
     """Numbers of the files that ended in this run of the daemon."""
     cut: dict[str, Kind] = field(default_factory=dict)
-    """Retention classes, by name, of the files that a disk error cut off in this run. Any other
-    cut file was cut off by a crash before this run.
+    """Maps the name of each file that a disk error cut off in this run to its retention class.
+
+    All other `.part` files without a marker were cut off by a crash before this run.
     """
-    given: int = 0
-    """Bytes deleted since a disk refused to write, as long as it still refuses."""
-    clock: Steady = field(default_factory=Steady)
+    freed: int = 0
+    """Number of bytes deleted because the disk refuses to write; 0 once it accepts data again."""
+    clock: ClockWatch = field(default_factory=ClockWatch)
 
 
 class Ring:
-    """Directory of recordings, in which files begin, end and are deleted.
+    """The directory of recordings: begins and ends files, and deletes old ones.
 
     Every method may raise `OSError`.
     """
@@ -147,17 +154,19 @@ class Ring:
         self._bytes, self._days = int(settings.megabytes * 1e6), settings.days
         self._run = run or Run()
         self._rounds = self.file_bytes = 0
-        self.said: list[str] = []
-        """Messages about files that could not be finished."""
+        self.messages: list[str] = []
+        """Messages for the log about files that could not be finished."""
         self.cut_ns: int | None = None
         """Time at which a crash cut off the newest file, ns since 1970, or None."""
         here = self._directory.resolve()
-        self._open = os.environ.get(RECORD) == settings.directory and here.is_relative_to(PRIVATE)
+        as_service = os.environ.get(RECORD) == settings.directory
+        self._open_to_all = as_service and here.is_relative_to(PRIVATE)
         if not self._directory.is_dir():
             self._directory.mkdir(parents=True)
             # The umask may have removed bits of the mode.
             self._directory.chmod(DIRECTORY_MODE)
-        # No other user may open this file: a process that can open it can hold the lock.
+        # Only this user and the group may open this file: every process that can open the file
+        # can hold the lock.
         self._lock = os.open(self._directory / ".lock", os.O_RDWR | os.O_CREAT, MODE)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -165,45 +174,46 @@ class Ring:
             os.close(self._lock)
             raise OSError(error.errno, "another daemon records there") from None
         try:
-            for left in self._directory.glob(f".*{PART}.new"):
-                # This copy was not completed.
-                left.unlink()
+            for copy in self._directory.glob(f".*{PART}.new"):
+                # A crash interrupted the writing of this copy.
+                copy.unlink()
             # Make room first, because finishing a file needs some.
             self.trim(None, refused)
             self._recover()
-            for mark in self._directory.glob(f".*{PART}.*{LEFT}"):
-                if not mark.with_name(f"{_stem_of(mark)}{PART}").exists():
-                    # The file of this marker is finished.
-                    mark.unlink()
+            for marker in self._directory.glob(f".*{PART}.*{MARKER}"):
+                stem = marker.name[1:].partition(PART)[0]
+                if not marker.with_name(f"{stem}{PART}").exists():
+                    # The recording of this marker is finished.
+                    marker.unlink()
         except OSError:
             self.close()
             raise
-        if self._open:
-            self._let_in()
+        if self._open_to_all:
+            self._open_files()
 
     def _recover(self) -> None:
         for part in [path for path in listed(self._directory) if path.name.endswith(PART)]:
             try:
-                seen, left, disk = part.stat(), _left(part), self._disk()
+                found, marked, disk = part.stat(), _marked(part), self._disk()
             except FileNotFoundError:
                 # Another process has just removed the file.
                 continue
             ours = self._run.cut.get(part.name)
-            kind, cut = (ours, "disk") if ours else left or ("kept", "crash")
+            kind, cut = (ours, "disk") if ours else marked or ("kept", "crash")
             whole = part.with_name(_stem(part) + ENDINGS[kind])
             try:
-                said = recover(part, whole, cut, disk.free - seen.st_size > disk.spare)
+                message = recover(part, whole, cut, disk.free - found.st_size > disk.spare)
             # Recording new steps is more important than finishing an old file.
             except OSError as error:
-                said = f"{part.name} cannot be completed: {error.strerror}"
-            self.said += [said] if said else []
+                message = f"{part.name} cannot be completed: {error.strerror}"
+            self.messages += [message] if message else []
             if ours:
                 self._run.numbers.add(_number(part) or 0)
-            elif whole.exists() and not left:
-                self.cut_ns = seen.st_mtime_ns
-                self._near(part, seen.st_mtime_ns)
+            elif whole.exists() and not marked:
+                self.cut_ns = found.st_mtime_ns
+                self._retain_before(part, found.st_mtime_ns)
 
-    def _near(self, part: Path, cut_ns: int) -> None:
+    def _retain_before(self, part: Path, cut_ns: int) -> None:
         """Retain the files that ended less than a minute before the crash that cut off `part`."""
         for path in listed(self._directory):
             # Another process may have just removed the file.
@@ -211,12 +221,12 @@ class Ring:
                 before_ns = cut_ns - path.stat().st_mtime_ns
                 earlier = (_number(path) or 0) < (_number(part) or 0)
                 if earlier and before_ns < AROUND_NS:
-                    self.keep(path)
+                    self.retain(path)
 
-    def _let_in(self) -> None:
-        """Give the service's modes to the directory and to all files in it.
+    def _open_files(self) -> None:
+        """Let every user read the directory and all files in it.
 
-        An earlier version of acsard may have left files that only its own user can read.
+        An earlier version of acsard may have written files that only its own user can read.
         """
         for path in (self._directory, *listed(self._directory)):
             mode = OPEN_DIRECTORY_MODE if path == self._directory else OPEN_MODE
@@ -230,20 +240,20 @@ class Ring:
         os.close(self._lock)
 
     def begin(self, about: About) -> Writing:
-        """Begin a new file, with a number above every other."""
+        """Begin a new file, with a number above the number of every other file."""
         files = listed(self._directory)
         number = 1 + max([_number(path) or 0 for path in files], default=0)
         stamp = time.strftime(STAMP, time.gmtime(about.wall_ns // 1_000_000_000))
         path = self._directory / f"{number:06}-{stamp}{PART}"
-        writing = Writing(path, about, OPEN_MODE if self._open else MODE)
+        writing = Writing(path, about, OPEN_MODE if self._open_to_all else MODE)
         # The names of the files must be on the disk as well as their content.
         sync(self._directory)
         return writing
 
     def end(self, writing: Writing, kind: Kind, cut: str = "", why: str = "") -> Path:
-        """Finish a file as `Writing.finish` does.
+        """Finish a file with the arguments of `Writing.finish`, and name it after its class.
 
-        Returns its new path, named by its retention class.
+        Returns the new path.
         """
         writing.finish(cut, why)
         path = writing.path.with_name(_stem(writing.path) + ENDINGS[kind])
@@ -253,16 +263,16 @@ class Ring:
         return path
 
     def just_ended(self, now: Instant) -> Iterator[tuple[Path, Kind, int]]:
-        """Yield the files that ended less than a minute ago by the wall clock.
+        """Yield the files that ended less than a minute ago according to the wall clock.
 
-        Each comes with its retention class and its end in ns of the monotonic clock.
+        Yields the path, the retention class, and the end in ns of the monotonic clock.
         """
-        for one in self._ended():
-            ago_ns = now.wall_ns - int(one.at_s * NS_PER_S)
+        for file in self._ended():
+            ago_ns = now.wall_ns - int(file.at_s * NS_PER_S)
             if 0 <= ago_ns < AROUND_NS:
-                yield self._directory / one.name, one.kind, now.mono_ns - ago_ns
+                yield self._directory / file.name, file.kind, now.mono_ns - ago_ns
 
-    def keep(self, path: Path) -> None:
+    def retain(self, path: Path) -> None:
         """Retain a finished plain file, because an incident happened within a minute of it."""
         if path.name.endswith(WHOLE) and _kind(path) == "plain":
             # Another process may have removed the file.
@@ -271,67 +281,69 @@ class Ring:
             sync(self._directory)
 
     def tend(self, now: Instant) -> None:
-        """Delete the oldest files when the disk is low, and in every `TRIM_ROUNDS`-th call.
+        """Delete the files to delete if the disk is nearly full, or ten minutes have passed.
 
-        Call it once a second.
+        Call this method once a second.
         """
-        jumped_ns = self._run.clock.look(now)
+        jumped_ns = self._run.clock.jump_ns(now)
         if jumped_ns:
-            self._set(jumped_ns)
+            self._shift_times(jumped_ns)
         self._rounds += 1
         if self._rounds % TRIM_ROUNDS == 0 or self._disk().low:
             self.trim(now)
 
-    def _set(self, jumped_ns: int) -> None:
-        """Shift the file times of this run by the step of the wall clock, so that the files do
-        not look older or newer than they are.
+    def _shift_times(self, jumped_ns: int) -> None:
+        """Add a jump of the wall clock to the times of the files that ended in this run.
+
+        Otherwise these files would seem older or newer than they are.
         """
         for path in listed(self._directory):
             if _number(path) in self._run.numbers:
                 # Another process may have just removed the file.
                 with suppress(FileNotFoundError):
-                    seen = path.stat()
-                    at_ns = max(0, seen.st_mtime_ns + jumped_ns)
-                    os.utime(path, ns=(seen.st_atime_ns, at_ns))
+                    found = path.stat()
+                    at_ns = max(0, found.st_mtime_ns + jumped_ns)
+                    os.utime(path, ns=(found.st_atime_ns, at_ns))
 
     def trim(self, now: Instant | None, refused: bool = False) -> None:
-        """Delete the files that exceed the bounds in bytes or in age.
+        """Delete the files that exceed the limits in bytes or in age.
 
-        The file that is being written stays. `now` is None before a clock has been read; then no
-        file counts as too old.
+        The file that is being written is never deleted.
+
+        Args:
+            now: the present time, or None if it is not known; then no file counts as too old.
+            refused: the last write failed because the disk was full.
         """
         ended, disk = self._ended(), self._disk()
-        believed = now is not None and self._run.clock.believed(now)
-        oldest_s = (
-            now.wall_ns / NS_PER_S - self._days * S_PER_DAY if now and believed else -math.inf
-        )
-        given = self._run.given if refused else None
-        gone = too_much(ended, Bounds(self._bytes, oldest_s), disk, given)
+        oldest_s = -math.inf
+        if now is not None and self._run.clock.trusted(now):
+            oldest_s = now.wall_ns / NS_PER_S - self._days * S_PER_DAY
+        freed = self._run.freed if refused else None
+        names = to_delete(ended, Bounds(self._bytes, oldest_s), disk, freed)
         if refused:
-            self._run.given += sum(one.size for one in ended if one.name in gone)
-        for name in gone:
+            self._run.freed += sum(file.size for file in ended if file.name in names)
+        for name in names:
             # The file may belong to another user. Recording goes on in any case.
             with suppress(OSError):
                 (self._directory / name).unlink()
-        own = sum(one.size for one in ended)
-        self.file_bytes = share(self._bytes, own, disk)
+        self.file_bytes = share(self._bytes, sum(file.size for file in ended), disk)
 
     def _ended(self) -> list[Ended]:
-        found = []
+        ended = []
         for path in listed(self._directory):
             if path.name.endswith(PART):
                 continue
             # Another process may have just removed the file.
             with suppress(FileNotFoundError):
-                seen, number = path.stat(), _number(path) or 0
-                here = number in self._run.numbers
-                size, at_s = seen.st_size, seen.st_mtime
-                found.append(Ended(path.name, number, _kind(path), size, at_s, here))
-        return found
+                found, number = path.stat(), _number(path) or 0
+                this_run = number in self._run.numbers
+                size, at_s = found.st_size, found.st_mtime
+                ended.append(Ended(path.name, number, _kind(path), size, at_s, this_run))
+        return ended
 
     def _disk(self) -> Disk:
-        told = os.statvfs(self._directory)
-        # The file system does not report its size.
-        if not told.f_blocks:
+        size = os.statvfs(self._directory)
+        # This file system does not report its size.
+        if not size.f_blocks:
             return Disk(0, self._bytes)
-        return Disk(told.f_blocks * told.f_frsize, told.f_bavail * told.f_frsize)
+        return Disk(size.f_blocks * size.f_frsize, size.f_bavail * size.f_frsize)

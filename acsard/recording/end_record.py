@@ -21,12 +21,13 @@ END = "acsard end"
 """Name of the MCAP metadata record that holds the `EndRecord`."""
 
 TAIL_BYTES = 1 << 16
-"""Number of bytes at the end of a file in which its end record is searched for. The recordings
-of the tests have 1141 bytes from the record to the end of the file, and long names take some more.
+"""Number of bytes at the end of a file in which the end record is searched for.
+
+In the recordings of the tests the end record begins 1141 bytes before the end of the file.
 """
 
 _NAMED = struct.pack("<I", len(END)) + END.encode()
-"""Name of the record with its length, as it follows the record's head."""
+"""The name of the end record with its length. These bytes follow the head of the record."""
 
 _FOOTER = HEAD.pack(Opcode.FOOTER, 20)
 """Head of the MCAP footer, which has 20 bytes."""
@@ -44,31 +45,35 @@ CUTS = {
     "late": "cut: the daemon was asked to end, and the disk was too slow for the rest",
     "open": "cut, or still being recorded, when it was recovered",
 }
-"""Causes for a file that does not end with the daemon's ordinary end, each with its words.
+"""Why a recording does not end with an ordinary end of the daemon: each cause with its text.
 
-The daemon itself writes only the end of a `bug`; a file with another cause is finished later.
+Only for the cause `bug` does the failing daemon itself finish the file. A file with another cause
+is finished later.
 """
 
 
 class EndRecord(Struct, frozen=True):
-    """Content of the last metadata record, so that a list need not read the whole file."""
+    """Content of the last metadata record. A list of recordings reads only this record."""
 
     wall_ns: Ns
     """Wall-clock time at which the recording began, ns since 1970."""
     last_ns: Ns
-    """Wall-clock time of the last message, ns since 1970. For steps it is that of the first one."""
+    """Wall-clock time of the last message, ns since 1970.
+
+    A message with several steps has the time of its first step.
+    """
     said: str
-    """Summary of the events in a few words, as from `story.summary`."""
+    """Summary of the events in a few words, from `timeline.summary`."""
     cut: str = ""
-    """Key of `CUTS`, or "" if the daemon ended in the ordinary way."""
+    """Why the recording was cut off: a key of `CUTS`, or "" if it ends with an ordinary end."""
     why: str = ""
     """For the cause `bug`: the step in which the daemon failed, and the exception."""
 
 
 def how_it_ends(cut: str, why: str = "") -> str:
-    """Describe how the recording ends; "" if it ended in the ordinary way.
+    """Describe how a recording was cut off, from the fields `cut` and `why` of its end record.
 
-    A key that only a later version knows is described as "cut".
+    Returns "" if the daemon ended in the ordinary way, and "cut" for a cause of a later version.
     """
     if not cut:
         return ""
@@ -76,31 +81,34 @@ def how_it_ends(cut: str, why: str = "") -> str:
     return f"{words}: {printable(why)}" if why else words
 
 
-def fields(last: EndRecord) -> dict[str, str]:
-    """Return the closing as MCAP metadata, which holds strings only."""
+def as_metadata(last: EndRecord) -> dict[str, str]:
+    """Return the end record as MCAP metadata, which holds strings only."""
     return {key: str(value) for key, value in msgspec.to_builtins(last).items()}
 
 
-def closing(path: Path) -> EndRecord | None:
-    """Read the closing of a file. Return None if it has no closing or cannot be read.
+def read_end(path: Path) -> EndRecord | None:
+    """Read the end record of a file. Return None if it has no end record or cannot be read.
 
-    Only the last `TAIL_BYTES` are read. The index of the file is not followed, and no chunk is
-    unpacked, because a file from a stranger may claim gigabytes.
+    This function reads only the last `TAIL_BYTES`. It does not follow the index and unpacks no
+    chunk, because a file from a stranger may claim gigabytes.
     """
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 return None
             stream.seek(max(len(MAGIC), stream.seek(0, os.SEEK_END) - TAIL_BYTES))
-            found = _last(stream.read(TAIL_BYTES))
-            return msgspec.convert(found, EndRecord, strict=False) if found else None
+            metadata = _last(stream.read(TAIL_BYTES))
+            return msgspec.convert(metadata, EndRecord, strict=False) if metadata else None
     except (OSError, *DAMAGE):
         # A caller that reads the whole file reports the damage.
         return None
 
 
 def _last(tail: bytes) -> dict[str, str] | None:
-    """Return the content of the last end record in the last bytes of a file that is finished."""
+    """Return the last end record in `tail`, the last bytes of a file.
+
+    Returns None if the file is not finished.
+    """
     footer_at = len(tail) - len(MAGIC) - 20 - HEAD.size
     if footer_at < 0 or not (tail.startswith(_FOOTER, footer_at) and tail.endswith(MAGIC)):
         return None

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import BinaryIO, Literal, NamedTuple, Protocol
+from typing import BinaryIO, Literal, Protocol
 
 from mcap.writer import Writer
 from msgspec import Struct
@@ -17,12 +16,18 @@ from acsard.core.ros.names import TYPE_HASHES
 from acsard.core.values import NS_PER_S, Outputs
 from acsard.host.errors import RecordingError
 from acsard.recording import csv_table, ros_bag
-from acsard.recording.atomic_output import beside, synced
+from acsard.recording.atomic_output import replacing, synced
 from acsard.recording.file import About, Recording
+from acsard.recording.file_replay import (
+    PROGRESS_STEPS,
+    Progress,
+    RecordedRun,
+    no_progress,
+)
 from acsard.recording.published import Published, Publisher
 from acsard.recording.recorded_steps import Step
-from acsard.recording.replay import lived
-from acsard.recording.replayed import EVERY, Course, Progress, quietly
+from acsard.recording.replay import replay_step
+from acsard.recording.time_span import WHOLE, Span
 
 Kind = Literal["mcap", "csv", "rosbag2"]
 
@@ -30,64 +35,57 @@ SUFFIX: dict[Kind, str] = {"mcap": ".ros2.mcap", "csv": ".csv", "rosbag2": ".ros
 """Suffix of the exported file if the user gives no name."""
 
 
-class Span(NamedTuple):
-    """Time span to export, s after the beginning by the monotonic clock."""
-
-    begin: float = -math.inf
-    end: float = math.inf
-
-
-WHOLE = Span()
-
-
-class Done(Struct, frozen=True):
+class ExportResult(Struct, frozen=True):
     """Result of an export."""
 
     count: int
-    """Number of messages, or of lines of a table."""
+    """Number of messages, or of rows of a CSV table."""
     trouble: str
     """Why the export ends before the recording does; "" if it is complete."""
 
 
-class _Sink(Protocol):
+class _Writer(Protocol):
+    """A file format: takes replayed steps and writes them to a stream."""
+
     count: int
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        """Write the output of a replayed step."""
+        """Write a step and its replayed outputs."""
 
     def finish(self) -> None:
         """Write the end of the file."""
 
 
-class _Messages:
-    """Writer of ROS messages to an MCAP file."""
+class _MessageWriter:
+    """Writes ROS messages to an MCAP file."""
 
     def __init__(self, stream: BinaryIO, robot: Robot, about: About, name: str) -> None:
         self._publisher = Publisher(robot, about.started_ns or about.wall_ns)
         self._namespace = robot.config.ros.namespace
         self._writer = Writer(stream)
         self._writer.start("ros2", f"acsard {__version__}")
-        made = {"robot": about.robot, "recording": name, "recorded_by": f"acsard {about.version}"}
-        self._writer.add_metadata("acsard export", made)
+        origin = {"robot": about.robot, "recording": name, "recorded_by": f"acsard {about.version}"}
+        self._writer.add_metadata("acsard export", origin)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._topics: dict[int, tuple[str, Channel]] = {}
         self._counts: dict[int, int] = {}
         self.count = 0
         self.times: tuple[int, int] = (0, 0)
-        """Wall-clock times of the first and the last message, ns."""
+        """Earliest and latest wall-clock time of a message, ns since 1970."""
 
     def step(self, step: Step, outputs: Outputs) -> None:
-        for one in self._publisher.step(step, outputs):
-            self._add(one)
+        for message in self._publisher.step(step, outputs):
+            self._add(message)
 
-    def _add(self, one: Published) -> None:
-        number = self._channels.get((one.channel.name, one.source))
+    def _add(self, published: Published) -> None:
+        number = self._channels.get((published.channel.name, published.source))
         if number is None:
-            number = self._open(one.channel, one.source)
-        wall_ns = max(0, one.wall_ns)
+            number = self._open(published.channel, published.source)
+        # MCAP has no times before 1970.
+        wall_ns = max(0, published.wall_ns)
         self._counts[number] += 1
-        data = one.channel.encode(one.message)
+        data = published.channel.encode(published.message)
         self._writer.add_message(number, wall_ns, data, wall_ns, self._counts[number])
         first, last = self.times if self.count else (wall_ns, wall_ns)
         self.times = (min(first, wall_ns), max(last, wall_ns))
@@ -119,8 +117,8 @@ class _Messages:
         ]
 
 
-class _Table:
-    """Writer of the table as CSV."""
+class _TableWriter:
+    """Writes a CSV table."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -141,55 +139,64 @@ def export(
     kind: Kind,
     other: Config | None = None,
     span: Span = WHOLE,
-    progress: Progress = quietly,
+    progress: Progress = no_progress,
     force: bool = False,
-) -> Done:
-    """Export a recording to `new`: a file, or a directory for `rosbag2`.
+) -> ExportResult:
+    """Replay a recording and write its messages to `new`: a file, or a directory for `rosbag2`.
 
-    `other` replaces the recording's own configuration. Raises `RecordingError` if there is nothing
-    to write, `FileExistsError` if `new` must not be replaced (with `force` it may, see `beside`),
-    and any other `OSError`. After an error no partial file is left.
+    Args:
+        other: the configuration to replay with; None for the recorded one.
+        force: overwrite `new`, as far as `atomic_output.replacing` allows it.
+
+    Raises:
+        RecordingError: nothing was recorded in the span of time, or the recording cannot be
+            replayed.
+        FileExistsError: `new` must not be overwritten.
+        OSError: the disk refuses. After any error no partial file is left.
     """
-    course = Course(recording, other)
+    run = RecordedRun(recording, other)
 
-    def written(sink: _Sink, stream: BinaryIO) -> None:
-        with course.living():
-            _all(course, sink, span, progress)
-        if not sink.count:
-            raise RecordingError(f"{recording.path} has nothing in that span of time")
-        sink.finish()
+    def write(writer: _Writer, stream: BinaryIO) -> None:
+        with run.state_errors():
+            _write_steps(run, writer, span, progress)
+        if not writer.count:
+            raise RecordingError(
+                f"{recording.path} has nothing in that span of time; correct --from and --to"
+            )
+        writer.finish()
         synced(stream)
 
-    def messages(stream: BinaryIO) -> _Messages:
-        with course.living():
-            return _Messages(stream, course.robot, recording.about, recording.path.name)
+    def message_writer(stream: BinaryIO) -> _MessageWriter:
+        with run.state_errors():
+            return _MessageWriter(stream, run.robot, recording.about, recording.path.name)
 
-    with beside(new, force) as part:
+    with replacing(new, force) as part:
         if kind == "rosbag2":
             part.mkdir()
             file = part / f"{new.name}_0.mcap"
             with file.open("wb") as stream:
-                written(sink := messages(stream), stream)
+                write(bag := message_writer(stream), stream)
             with (part / "metadata.yaml").open("wb") as stream:
-                stream.write(ros_bag.metadata(file.name, sink.topics, *sink.times).encode())
+                stream.write(ros_bag.metadata(file.name, bag.topics, *bag.times).encode())
                 synced(stream)
-            return Done(sink.count, course.trouble)
+            return ExportResult(bag.count, run.trouble)
         with part.open("wb") as stream:
-            one: _Sink = _Table(stream) if kind == "csv" else messages(stream)
-            written(one, stream)
-        return Done(one.count, course.trouble)
+            writer: _Writer = _TableWriter(stream) if kind == "csv" else message_writer(stream)
+            write(writer, stream)
+        return ExportResult(writer.count, run.trouble)
 
 
-def _all(course: Course, sink: _Sink, span: Span, progress: Progress) -> None:
+def _write_steps(run: RecordedRun, writer: _Writer, span: Span, progress: Progress) -> None:
+    """Replay all steps, because each changes the robot, and write those in the time span."""
     began_ns = None
-    for number, step in enumerate(course.steps()):
+    for number, step in enumerate(run.steps()):
         now = step.inputs.now
         began_ns = now.mono_ns if began_ns is None else began_ns
-        if number % EVERY == 0:
+        if number % PROGRESS_STEPS == 0:
             progress(now.wall_ns)
-        outputs = lived(course.robot, step)
+        outputs = replay_step(run.robot, step)
         if span.begin <= (now.mono_ns - began_ns) / NS_PER_S <= span.end:
-            sink.step(step, outputs)
+            writer.step(step, outputs)
 
 
 def measured(recording: Recording) -> bytes:
@@ -197,16 +204,16 @@ def measured(recording: Recording) -> bytes:
 
     Raises `RecordingError` if the recording has no gyro samples, because calibration cannot use it.
     """
-    course = Course(recording)
-    lines, turned = [csv_table.MEASURED_HEADER], False
-    with course.living():
-        for step in course.steps():
-            lines += csv_table.measured(step, lived(course.robot, step))
-            turned = turned or bool(step.inputs.gyro)
-    if not turned:
+    run = RecordedRun(recording)
+    lines, has_gyro = [csv_table.MEASURED_HEADER], False
+    with run.state_errors():
+        for step in run.steps():
+            lines += csv_table.measured(step, replay_step(run.robot, step))
+            has_gyro = has_gyro or bool(step.inputs.gyro)
+    if not has_gyro:
         raise RecordingError(
             f"{recording.path} has no gyro samples with which to compare the wheels: record a "
-            "drive with [odometry] gyro = true, or export it with --csv and add the columns x "
-            "and y of a sensor that measures positions"
+            "drive with [odometry] gyro = true, or export this one with --csv and add the columns "
+            "x and y of a sensor that measures positions"
         )
     return ("\n".join(lines) + "\n").encode()

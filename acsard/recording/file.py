@@ -3,13 +3,14 @@
 A file has four channels:
 - `steps`: batches of steps, as `rows.py` encodes them.
 - `events`: one event per message, in JSON.
-- `state`: a robot, as `state.py` writes it. It comes first if the file begins after the daemon.
+- `state`: a robot, as `state.py` encodes it. A file that does not begin with the daemon's start has
+  this message before all others.
 - `unfinished`: the inputs of the step in which the daemon failed.
 
-A metadata record says which robot and which version recorded it, and an attachment holds its
-`acsard.toml`. The messages are in chunks of about ten seconds, which grow as `chunks.py` says. A
-file that was cut off has no end. Everything that was synced can still be read, and `rewrite` makes
-a finished file of it.
+A metadata record names the robot and the version of acsard, and an attachment holds the
+`acsard.toml`. The messages are in chunks of about ten seconds, which `chunks.py` writes. A file
+that was cut off has no end record, but all data that was synced to the disk can still be read.
+`rewrite` makes a finished file of such a file.
 """
 
 from __future__ import annotations
@@ -38,35 +39,37 @@ from mcap.records import (
 )
 from msgspec import Struct
 
+from acsard.core.formatting import many
 from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
-from acsard.recording.chunks import GROWING, Growing, Message
-from acsard.recording.end_record import END, EndRecord, Ns, fields
+from acsard.recording.chunks import GROWING_HEAD, GrowingChunk, Message
+from acsard.recording.end_record import END, EndRecord, Ns, as_metadata, how_it_ends
 from acsard.recording.mcap_records import MAGIC, walk
 from acsard.recording.recorded_steps import UnfinishedError, unfinished
 from acsard.recording.rows import FORMAT, first_of
-from acsard.recording.timeline import NEWS, TimelineEntry, summary
+from acsard.recording.timeline import INCIDENTS, TimelineEntry, summary
 
 CHUNK_NS = 10 * NS_PER_S
-"""Longest time that a chunk covers. More saves little space, and damage costs more."""
+"""Longest time that a chunk covers. Longer chunks save little space, and lose more if damaged."""
 
 CHUNK_BYTES = 1 << 20
 """Uncompressed size at which a chunk ends. Ten seconds of driving have 160 000 bytes."""
 
 MODE = 0o640
-"""Mode of a recording: the service's group may read it."""
+"""File mode of a recording: the service's group may read it."""
 
 Topic = Literal["steps", "events", "state", "unfinished"]
 
 CHANNELS: tuple[Topic, ...] = ("steps", "state", "events", "unfinished")
-"""Channels in the order of their numbers, from 1. The records that define the channels may be
-damaged, so the reader relies on this order.
+"""Channels in the order of their numbers, which begin with 1.
+
+The reader relies on this order, because the records that define the channels may be damaged.
 """
 
 NUMBERS = {topic: number for number, topic in enumerate(CHANNELS, 1)}
 
 EVENTS_SCHEMA = 1
-"""Number of the schema of the events. The other channels have none."""
+"""Number of the schema of the events. The other channels have no schema."""
 
 
 class About(Struct, frozen=True):
@@ -77,27 +80,30 @@ class About(Struct, frozen=True):
     """Version of acsard."""
     python: str
     mono_ns: Ns
+    """Monotonic time at which the recording began, ns."""
     wall_ns: Ns
-    """Wall-clock time at which the recording began, ns since 1970; `mono_ns` is the same instant
-    by the monotonic clock.
-    """
+    """Wall-clock time at which the recording began, ns since 1970."""
     config: str = ""
-    """The `acsard.toml` in force, with every key."""
+    """The configuration at the beginning, as an `acsard.toml` with every key."""
     format: str = FORMAT
     started_ns: Ns = 0
-    """Wall-clock time of the daemon's start, ns since 1970, perhaps hours before; 0 if unknown."""
+    """Wall-clock time of the daemon's start, ns since 1970; 0 if it is not known.
+
+    The daemon may have started hours before this recording began.
+    """
 
 
-class Gist:
-    """Summary of a recording, collected from its messages."""
+class EndRecordBuilder:
+    """Collects the end record of a recording from its messages."""
 
     def __init__(self, about: About) -> None:
         self._wall_ns = self._last_ns = about.wall_ns
-        self._news: list[TimelineEntry] = []
+        self._incidents: list[TimelineEntry] = []
         self._starts = False
+        """True once the first step of the daemon was among the messages."""
 
     def message(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Take a message of any channel. The content of an event comes through `event`."""
+        """Take a message of any channel. For an event, call `event` as well."""
         self._last_ns = max(self._last_ns, wall_ns)
         if topic == "steps":
             self._starts = self._starts or first_of(data) == 0
@@ -105,19 +111,19 @@ class Gist:
             with suppress(UnfinishedError):
                 self._starts = self._starts or unfinished(data).number == 0
 
-    def event(self, told: TimelineEntry) -> None:
+    def event(self, event: TimelineEntry) -> None:
         """Take an event for the summary."""
-        if told.name in NEWS:
-            self._news.append(told)
+        if event.name in INCIDENTS:
+            self._incidents.append(event)
 
-    def closing(self, cut: str = "", why: str = "") -> EndRecord:
-        """Return the closing of the file.
+    def end_record(self, cut: str = "", why: str = "") -> EndRecord:
+        """Return the end record.
 
-        `cut` is a key of `CUTS` and `why` its explanation if the daemon did not end in the ordinary
-        way.
+        If the daemon did not end in the ordinary way, `cut` is a key of `CUTS` and `why` may
+        explain it.
         """
-        said = summary(self._news, self._starts)
-        return EndRecord(self._wall_ns, self._last_ns, said, cut, why)
+        text = summary(self._incidents, self._starts)
+        return EndRecord(self._wall_ns, self._last_ns, text, cut, why)
 
 
 class Index:
@@ -152,7 +158,10 @@ class Index:
         self._totals.chunk_count += 1
 
     def record(self, record: McapRecord, at: int, length: int) -> None:
-        """Take a record of any kind, with its offset and its length in the file, bytes."""
+        """Take a record of any kind. `at` is its offset in the file and `length` its size, bytes.
+
+        Only metadata and attachments are indexed.
+        """
         if isinstance(record, Metadata):
             self._totals.metadata_count += 1
             self._places.append(MetadataIndex(at, length, record.name))
@@ -163,7 +172,7 @@ class Index:
             self._places.append(AttachmentIndex(at, length, *times, size, record.name, kind))
 
     def records(self) -> list[McapRecord]:
-        """Return the records of the summary."""
+        """Return the records of the summary section."""
         return [self._totals, *self._places]
 
 
@@ -175,11 +184,11 @@ class Writing:
 
     def __init__(self, path: Path, about: About, mode: int = MODE) -> None:
         self.path, self._mode = path, mode
-        self._gist = Gist(about)
+        self._end_builder = EndRecordBuilder(about)
         self._index = Index()
-        self._chunk: Growing | None = None
+        self._chunk: GrowingChunk | None = None
         self._chunk_at: int | None = None
-        """Offset of the chunk's head in the file; None if nothing of it is written yet."""
+        """Offset of the chunk's head in the file; None if the head is not written yet."""
         self._file = os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb")
         try:
             self._open(about)
@@ -213,30 +222,30 @@ class Writing:
         return self._file.tell()
 
     def add(self, topic: Topic, wall_ns: int, data: bytes) -> None:
-        """Add a message. It reaches the file by `flush`, or when its chunk ends."""
-        self._gist.message(topic, wall_ns, data)
+        """Add a message. `flush` writes it to the file, or the end of its chunk does."""
+        self._end_builder.message(topic, wall_ns, data)
         wall_ns = max(0, wall_ns)
         chunk = self._chunk
         if chunk is not None and (
             chunk.size >= CHUNK_BYTES or abs(wall_ns - chunk.first_ns) >= CHUNK_NS
         ):
             self.end_chunk()
-        self._chunk = self._chunk or Growing()
+        self._chunk = self._chunk or GrowingChunk()
         self._chunk.add(Message(NUMBERS[topic], wall_ns, data))
         self._index.message(NUMBERS[topic], wall_ns)
 
-    def event(self, told: TimelineEntry) -> None:
-        """Add an event, and take it for the summary."""
-        wall_ns = int(told.seconds * NS_PER_S)
-        self.add("events", wall_ns, msgspec.json.encode(told))
-        self._gist.event(told)
+    def event(self, event: TimelineEntry) -> None:
+        """Add an event as a message, and to the summary in the end record."""
+        wall_ns = int(event.seconds * NS_PER_S)
+        self.add("events", wall_ns, msgspec.json.encode(event))
+        self._end_builder.event(event)
 
     def flush(self) -> None:
-        """Write the messages added so far, so that each can be read, and sync them to the disk."""
-        if self._chunk is not None and self._chunk.waits:
+        """Write all added messages in a form that can be read, and sync the file to the disk."""
+        if self._chunk is not None and self._chunk.has_unwritten:
             self._put(self._chunk.take())
         self._sync()
-        # The disk accepts the data, but nobody can find a file without a name.
+        # If the file was deleted, the disk still accepts data, but the data is lost.
         if not os.fstat(self._file.fileno()).st_nlink:
             raise FileNotFoundError(errno.ENOENT, f"{self.path.name} has been removed")
 
@@ -244,7 +253,7 @@ class Writing:
         """Write compressed bytes of the chunk, after its head if they are the first."""
         if self._chunk_at is None:
             self._chunk_at = self._file.tell()
-            self._file.write(GROWING)
+            self._file.write(GROWING_HEAD)
         self._file.write(data)
 
     def _sync(self) -> None:
@@ -252,7 +261,7 @@ class Writing:
         os.fsync(self._file.fileno())
 
     def end_chunk(self) -> None:
-        """End the chunk, if there is one. The next message begins another."""
+        """End the chunk that is being written. The next message begins a new chunk."""
         if self._chunk is None:
             return
         last, head = self._chunk.end()
@@ -266,14 +275,17 @@ class Writing:
         self._index.chunk()
 
     def finish(self, cut: str = "", why: str = "") -> None:
-        """Write the end of the file and close it; `cut` and `why` are as for `Gist.closing`."""
+        """Write the end of the file and close it.
+
+        `cut` and `why` say how the daemon ended, as in `EndRecordBuilder.end_record`.
+        """
         self.end_chunk()
-        self._write(Metadata(END, fields(self._gist.closing(cut, why))))
+        self._write(Metadata(END, as_metadata(self._end_builder.end_record(cut, why))))
         self._write(DataEnd(0))
         summary_at = self._file.tell()
         for record in (*_definitions(), *self._index.records()):
             self._write(record)
-        # A checksum of 0 says that there is none.
+        # In MCAP a checksum of 0 means that the checksum is absent.
         self._write(Footer(summary_at, 0, 0))
         self._file.write(MAGIC)
         self._sync()
@@ -284,21 +296,22 @@ class Writing:
         try:
             self._file.close()
         except OSError:
-            # A disk that refuses to write does not take the rest of a buffer either.
+            # A disk that refuses to write also refuses the rest of the buffer.
             pass
 
 
 def _definitions() -> Iterator[McapRecord]:
-    """Yield the schema and the channels, as they are at the beginning and in the summary."""
+    """Yield the schema and the channels. A file has them at its beginning and in its summary."""
     schema = msgspec.json.encode(msgspec.json.schema(TimelineEntry))
     yield Schema(EVENTS_SCHEMA, schema, "jsonschema", "acsard.TimelineEntry")
     for topic, number in NUMBERS.items():
-        encoding, of = ("json", EVENTS_SCHEMA) if topic == "events" else (f"acsard-{topic}", 0)
-        yield Channel(number, topic, encoding, {}, of)
+        events = topic == "events"
+        encoding, schema_id = ("json", EVENTS_SCHEMA) if events else (f"acsard-{topic}", 0)
+        yield Channel(number, topic, encoding, {}, schema_id)
 
 
 class Recording:
-    """A recording read from a file, as far as the file is whole."""
+    """A recording read from a file. Damaged parts of the file are skipped."""
 
     def __init__(self, path: Path) -> None:
         """Read the file.
@@ -311,9 +324,9 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"cannot read {path}: {error.strerror}") from None
         self.ended = False
-        """True once the file was read to its end, and it has an end record."""
+        """True once `messages` has read the whole file, if the file is finished."""
         self.damaged = 0
-        """Number of damaged places, mostly chunks, between readable ones."""
+        """Number of damaged places, mostly chunks, that have readable data after them."""
         self.cut = ""
         """Key of `CUTS` if the daemon did not end in the ordinary way, else ""."""
         self.why = ""
@@ -324,25 +337,49 @@ class Recording:
 
     @property
     def whole(self) -> bool:
-        """True if the file has an end and nothing before it is damaged."""
+        """True if the file is finished and has no damaged place. Read all messages first."""
         return self.ended and not self.damaged
+
+    @property
+    def ending(self) -> str:
+        """Why it ended other than by a normal end of the daemon, or "". Read it before."""
+        if not self.ended:
+            return "no end: cut off, or still being recorded"
+        return how_it_ends(self.cut, self.why)
+
+    @property
+    def missing(self) -> str:
+        """The damaged places and the ending in words, or "". Read it before."""
+        places = many(self.damaged, "damaged place is", "damaged places are")
+        damaged = f"{places} left out" if self.damaged else ""
+        return "; ".join(filter(None, [damaged, self.ending]))
+
+    def compute_end_record(self) -> EndRecord:
+        """Read the recording, and return the end record that it lacks."""
+        builder = EndRecordBuilder(self.about)
+        for topic, wall_ns, data in self.messages():
+            builder.message(topic, wall_ns, data)
+            if topic == "events":
+                with suppress(RecordingError):  # omit only the event that cannot be decoded
+                    builder.event(event_of(self, data))
+        return builder.end_record()
 
     def messages(self) -> Iterator[tuple[Topic, int, bytes]]:
         """Yield the topic, the wall-clock time in ns and the bytes of each message.
 
-        Reading also sets `ended`, `damaged`, `cut`, `why` and `unfinished`.
+        This also sets `ended`, `damaged`, `cut`, `why` and `unfinished`.
         """
         self.ended, self.damaged, self.cut, self.why = False, 0, "", ""
         self.unfinished = None
         topics = {number: topic for topic, number in NUMBERS.items()}
-        for found in walk(self._data):
-            record = found.record
+        for place in walk(self._data):
+            record = place.record
             if isinstance(record, Footer):
                 self.ended = True
             elif isinstance(record, Metadata) and record.name == END:
                 self.cut, self.why = (record.metadata.get(key, "") for key in ("cut", "why"))
-            self.damaged += found.damaged
-            for channel, wall_ns, data in found.messages:
+            self.damaged += place.damaged
+            for channel, wall_ns, data in place.messages:
                 if channel in topics:
                     topic = topics[channel]
                     if topic == "unfinished":
@@ -350,12 +387,12 @@ class Recording:
                     yield topic, wall_ns, data
 
     def _about(self) -> About:
-        found: dict[str, str] = {}
+        metadata: dict[str, str] = {}
         config = None
         for place in walk(self._data):
             record = place.record
             if isinstance(record, Metadata) and record.name == "acsard":
-                found = record.metadata
+                metadata = record.metadata
             elif isinstance(record, Attachment) and record.name == "acsard.toml":
                 config = record.data.decode(errors="replace")
             elif place.messages:
@@ -365,13 +402,13 @@ class Recording:
                 raise ValueError(
                     "its beginning is missing, or another program wrote this MCAP file"
                 )
-            about = msgspec.convert({**found, "config": config}, About, strict=False)
+            about = msgspec.convert({**metadata, "config": config}, About, strict=False)
         except (ValueError, msgspec.ValidationError) as error:
             raise RecordingError(f"{self.path} is not a recording of acsard: {error}") from None
         if about.format != FORMAT:
             raise RecordingError(
-                f"{self.path} has the format {about.format}, but this acsard reads {FORMAT}: it "
-                f"was written by acsard {about.version}"
+                f"{self.path} has the format {about.format}, but this acsard reads the format "
+                f"{FORMAT}: read the file with acsard {about.version}, which wrote it"
             )
         return about
 
@@ -379,8 +416,9 @@ class Recording:
 def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
     """Write all readable messages to a new, finished file at `path`, and return their number.
 
-    `cut` is the cause to store if the recording lacks its end. Raises `OSError`, or
-    `RecordingError` for an event that cannot be decoded; then no file is left at `path`.
+    If the recording has no end, the new file says that it was cut off for the cause `cut`, a key of
+    `CUTS`. Raises `OSError`, or `RecordingError` if an event cannot be decoded; then no file is
+    left at `path`.
     """
     writing = Writing(path, recording.about)
     try:
@@ -400,7 +438,7 @@ def rewrite(recording: Recording, path: Path, cut: str = "open") -> int:
 
 
 def event_of(recording: Recording, data: bytes) -> TimelineEntry:
-    """Decode an event; raise `RecordingError` if the bytes are not an event."""
+    """Decode a message of the channel `events`; raise `RecordingError` if it is damaged."""
     try:
         return msgspec.json.decode(data, type=TimelineEntry)
     except msgspec.MsgspecError as error:

@@ -1,7 +1,7 @@
 """Yields the records of an MCAP file one after the other, and skips damaged places.
 
-If a chunk is damaged, or a record's length leads nowhere, the reader takes the chunk's first
-messages as far as they are whole, and searches for the next complete chunk.
+If a chunk is damaged, the reader takes the messages before the damage. After a damaged chunk or a
+record whose length is wrong, the reader searches for the next complete chunk.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, DataEnd, Footer, Header, McapRecord, Metadata
 
-from acsard.recording.chunks import MOST_BYTES, Content, Message, content, places
+from acsard.recording.chunks import MAX_CHUNK_BYTES, Message, ReadChunk, chunk_places, read_chunk
 
 DAMAGE = (
     McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error,
@@ -29,10 +29,11 @@ DAMAGE = (
 MAGIC = b"\x89MCAP0\r\n"
 """Magic bytes at the start of every MCAP file."""
 
-MOST_EFFORT = 256
-"""Number of bytes that may be unpacked without a complete chunk, for each byte of the file. The
-chunks of the recordings of the tests take 5 to 13. A damaged chunk is read up to three times, and
-a damaged block in it counts as 128 KiB.
+MAX_EFFORT = 256
+"""Largest effort for damaged chunks, in unpacked bytes for each byte of the file.
+
+The chunks in the recordings of the tests have an effort of 5 to 13. A damaged chunk is read up to
+three times, and a damaged block in it counts as 128 KiB.
 """
 
 HEAD = struct.Struct("<BQ")
@@ -45,22 +46,22 @@ READ: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.METADATA: Metadata.read,
 }
-"""Readers of the records that are used here, besides chunks. All other records are skipped."""
+"""Decoders of the records that a recording uses, besides chunks. All other records are skipped."""
 
 OTHERS = frozenset(Opcode) - READ.keys() - {Opcode.CHUNK}
 
 
 class Found(NamedTuple):
-    """A record that is used, or a damaged place."""
+    """A record, a chunk or a damaged place of a file."""
 
     record: McapRecord | None
     """The record; None for a chunk and for damage."""
-    chunk: Content | None
-    """The chunk, as far as it is whole, or None."""
+    chunk: ReadChunk | None
+    """The readable part of a chunk; None for other records."""
     end: int
-    """Offset of the record's end in the file, bytes. After damage, reading goes on there."""
+    """Offset of the end in the file, bytes. After a damaged place, the reader goes on there."""
     damaged: bool = False
-    """True for damage before other records. The end of a file that was cut is not damage."""
+    """True for a damaged place. The torn end of a file that was cut off is not a damaged place."""
 
     @property
     def messages(self) -> list[Message]:
@@ -69,9 +70,9 @@ class Found(NamedTuple):
 
 
 def walk(data: bytes) -> Iterator[Found]:
-    """Yield the records up to the footer, or to the end of the data.
+    """Yield the records of a file up to the footer, or to the end of the file.
 
-    If the damaged chunks take more time than those of any recording, all after them is damage.
+    If the damaged chunks need more than `MAX_EFFORT`, the rest of the file is one damaged place.
     """
     at, stream, chunks = len(MAGIC), io.BytesIO(data), _Chunks(data)
     if not data.startswith(MAGIC):
@@ -89,9 +90,9 @@ def walk(data: bytes) -> Iterator[Found]:
         if found is None:
             after = chunks.later(at + 1)
             if claimed < (after or len(data)):
-                beside = chunks.read(claimed)
-                # The next chunk is damaged as well, and its beginning can be read.
-                if beside is not None and beside.messages:
+                following = chunks.read(claimed)
+                # The next chunk is damaged as well, but its first messages can be read.
+                if following is not None and following.messages:
                     after = claimed
             cut = after is None and not chunks.spent and (not opcode or claimed > len(data))
             end = len(data) if cut or chunks.spent else after or claimed
@@ -103,7 +104,11 @@ def walk(data: bytes) -> Iterator[Found]:
 
 
 def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> Found | None:
-    """Return the record that begins at `at`; None if it is not one of `READ`, or is cut off."""
+    """Decode the record that begins at the offset `at`.
+
+    `claimed` is the end of the record according to its length, and `size` the size of the file.
+    Returns None if the record is not one of `READ`, is damaged or is cut off.
+    """
     read = READ.get(opcode)
     if read is None:
         return None
@@ -117,42 +122,46 @@ def _read(stream: io.BytesIO, at: int, opcode: int, claimed: int, size: int) -> 
 
 
 class _Chunks:
-    """Reader of chunks, and search for the next complete one. No place is searched twice.
+    """Reads chunks, and searches for the next complete chunk without searching a place twice.
 
-    A hostile file may have thousands of chunks that share their last blocks, so that each takes
-    megabytes to unpack. The chunks that are not complete must not take more than an effort in
-    proportion to the file.
+    A hostile file may have thousands of incomplete chunks that share their last blocks, so that
+    each takes megabytes to unpack. Therefore the effort for incomplete chunks is limited in
+    proportion to the size of the file.
     """
 
     def __init__(self, data: bytes) -> None:
         self._data = data
-        self._effort = MOST_BYTES + MOST_EFFORT * len(data)
-        """Effort that is left for chunks that are not complete."""
+        self._effort = MAX_CHUNK_BYTES + MAX_EFFORT * len(data)
+        """Effort that is left for incomplete chunks."""
         self._searched = 0
-        """Offset up to which no complete chunk begins, apart from those that were passed."""
+        """Offset up to which `later` has searched."""
         self._found: int | None = None
+        """Offset of the chunk that `later` found last."""
 
     @property
     def spent(self) -> bool:
-        """True if no effort is left; then the search finds nothing more."""
+        """True if no effort is left. Then `later` finds no chunk any more."""
         return self._effort < 0
 
-    def read(self, begin: int) -> Content | None:
-        """Read the chunk whose head begins at that offset; return None if there is none."""
-        chunk = content(self._data, begin)
+    def read(self, begin: int) -> ReadChunk | None:
+        """Read the chunk whose head begins at the offset `begin`, or return None.
+
+        A chunk that is incomplete or empty reduces the effort that is left.
+        """
+        chunk = read_chunk(self._data, begin)
         if chunk is not None and not (chunk.complete and chunk.messages):
             self._effort -= chunk.effort
         return chunk
 
     def later(self, begin: int) -> int | None:
-        """Return the offset of the next complete chunk from `begin` on, or None.
+        """Return the offset of the first complete chunk from `begin` on, or None.
 
-        `begin` never decreases.
+        `begin` must not decrease from call to call.
         """
         if self._found is not None and self._found >= begin:
             return self._found
         self._found = None
-        for at in places(self._data, max(begin, self._searched)):
+        for at in chunk_places(self._data, max(begin, self._searched)):
             if self.spent:
                 return None
             self._searched = at + 1

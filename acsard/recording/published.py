@@ -1,8 +1,8 @@
 """Rebuilds the messages that a robot published, while its recording is replayed.
 
-The daemon's `Report` builds the messages, as if a client had subscribed to every topic all the
-time. A recording does not hold the daemon's measurements of itself, so the rows of `diagnostics`
-that contain them are left out.
+`Report`, which the daemon uses too, builds the messages as if a client had subscribed to every
+topic all the time. A recording does not hold the daemon's measurements of itself, so the rows of
+`diagnostics` with such measurements are omitted.
 """
 
 from __future__ import annotations
@@ -22,81 +22,85 @@ from acsard.core.values import Command, Instant, Outputs
 from acsard.recording.recorded_steps import Step
 
 MEASURED = frozenset({"acsard: control loop", "acsard: certificate"})
-"""Rows of `diagnostics` that need more than the inputs of the steps."""
+"""Rows of `diagnostics` whose values a recording does not hold."""
 
 
 class Published(NamedTuple):
-    """Message with the time at which it was published.
-
-    `source` names the commander of a command channel.
-    """
+    """A message that a robot published or received, with its time."""
 
     channel: Channel
     source: str
+    """Source of a received command; "" for a published message."""
     wall_ns: int
+    """Wall-clock time at which the message was published or received, ns since 1970."""
     message: Any
 
 
 class Publisher:
-    """Source of the messages of a replayed robot.
-
-    It takes the steps in order; some may be omitted.
-    """
+    """Rebuilds the messages of a replayed robot, step by step."""
 
     def __init__(self, robot: Robot, started_ns: int) -> None:
-        """Start.
+        """Prepare for the first step.
 
-        `started_ns`, the wall-clock time of the daemon's start, stamps the static messages.
+        Args:
+            robot: the robot that replays the steps.
+            started_ns: wall-clock time of the daemon's start, ns since 1970; the stamp of the
+                messages that never change.
         """
         self._robot, self._config = robot, robot.config
         self._report = Report(robot.config, Instant(0, started_ns))
-        self._wanted = self._listened()
+        self._wanted = self._wanted_keys()
         self._static: TFMessage | None = None
-        self._latches = True
+        self._static_due = True
+        """True before the first step, and after a setting has changed."""
 
-    def _listened(self) -> frozenset[str]:
+    def _wanted_keys(self) -> frozenset[str]:
         names = {channel.native for channel in published_channels(left_out(self._config))}
         return frozenset(names & BY_KEY.keys())
 
     def step(self, step: Step, outputs: Outputs) -> Iterator[Published]:
-        """Yield the messages of a step after its replay: commands first, log lines last."""
-        # A setting was changed.
+        """Yield the messages of a step that was just replayed: commands first, log lines last.
+
+        The steps must come in order. The caller may skip steps.
+        """
+        # The step changed a setting.
         if self._robot.config is not self._config:
             self._config = self._robot.config
             self._report.use(self._config)
-            self._wanted = self._listened()
-            self._latches = True
+            self._wanted = self._wanted_keys()
+            self._static_due = True
         now = step.inputs.now
         for command in step.inputs.commands:
-            yield self._heard(command, now)
+            yield self._received(command, now)
         yield from self._latched(now)
-        for key, message in self._report.due(outputs, self._wanted, self._look(now)):
-            yield Published(BY_KEY[key], "", now.wall_ns, _recorded(message))
-        for event in step.said.events:
+        snapshot = self._snapshot(now)
+        for key, message in self._report.due(outputs, self._wanted, snapshot):
+            yield Published(BY_KEY[key], "", now.wall_ns, _without_measurements(message))
+        for event in step.recorded.events:
             line = log(event, Time.from_ns(now.wall_ns))
             yield Published(LOG, "", now.wall_ns, line)
 
-    def _look(self, now: Instant) -> Look:
+    def _snapshot(self, now: Instant) -> Look:
         return lambda: self._robot.snapshot(now.mono_ns)
 
     def _latched(self, now: Instant) -> Iterator[Published]:
-        """Yield `tf_static` once, and again when a setting has changed it."""
-        if self._latches and "tf_static" in self._wanted:
-            self._latches = False
+        """Yield `tf_static` once, and again after a setting has changed it."""
+        if self._static_due and "tf_static" in self._wanted:
+            self._static_due = False
             static = self._report.tf_static()
             if static != self._static:
                 self._static = static
                 yield Published(BY_KEY["tf_static"], "", now.wall_ns, static)
 
-    def _heard(self, command: Command, now: Instant) -> Published:
+    def _received(self, command: Command, now: Instant) -> Published:
         arrived_ns = command.arrived_ns + now.wall_ns - now.mono_ns
         frame = self._config.odometry.base_frame
         message = asked(command.twist, Time.from_ns(arrived_ns), frame)
         return Published(CMD_VEL_IN, command.source, arrived_ns, message)
 
 
-def _recorded(message: Any) -> Any:
-    """Return the message without the fields that a recording does not hold."""
+def _without_measurements(message: Any) -> Any:
+    """Return the message without the values that a recording does not hold."""
     match message:
         case RobotState():
             return replace(message, certificate_expiry="", latencies={})

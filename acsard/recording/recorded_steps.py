@@ -1,7 +1,7 @@
 """One control step as a recording stores it: all of its inputs, and its outputs.
 
 Poses are stored in um and urad. A checksum covers every bit of all estimates. `rows.py` encodes
-many steps.
+batches of steps.
 """
 
 from __future__ import annotations
@@ -31,27 +31,28 @@ _DOUBLES = struct.Struct("<9d")
 
 
 class Taken(NamedTuple):
-    """A step as the control loop hands it over, by reference."""
+    """A finished step that the control loop hands to the recorder."""
 
     inputs: Inputs
     outputs: Outputs
-    left: bytes | None
-    """Line that was handed to the port, or None if none was."""
+    sent: bytes | None
+    """Line that the daemon wrote to the serial port, or None if it wrote no line."""
 
 
 class Start(NamedTuple):
-    """Beginning of a file: the robot as it is before step `number`."""
+    """Request to begin a new file, with the robot as it is before step `number`."""
 
     number: int
     state: bytes
+    """The robot and its guard, encoded by `state.freeze`; empty for a new robot."""
     config: Config
-    """Configuration in force then. Settings may have changed since the daemon's start."""
+    """Configuration before that step. Settings may have changed since the daemon's start."""
 
 
 def runs(items: list[Taken | Start]) -> Iterator[tuple[Start | None, list[Taken]]]:
-    """Split the queue's items at each `Start`, and yield each start with the steps that follow it.
+    """Split the recorder's queue at each `Start`, and yield each `Start` with its steps.
 
-    The first group comes with None: its steps continue the current file.
+    The first group has None instead of a `Start`: its steps continue the current file.
     """
     start: Start | None = None
     steps: list[Taken] = []
@@ -71,29 +72,31 @@ class BlackBox(Protocol):
         """Record the robot and its guard before the first step."""
 
     def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
+        self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a finished step; `left` is the line that was sent to the board, or None."""
+        """Take a finished step; `sent` is the line that was sent to the board, or None."""
 
     def died(self, inputs: Inputs) -> None:
-        """Take the inputs of a step in which the daemon failed. The daemon ends because of it."""
+        """Take the inputs of the step in which the daemon failed. The failure ends the daemon."""
 
     @property
     def status(self) -> Recording:
         """Status of the recording."""
 
 
-class Said(Struct, frozen=True):
-    """Outputs of a step."""
+class RecordedOutputs(Struct, frozen=True):
+    """The part of a step's outputs that a recording stores."""
 
     line: bytes | None
-    left: bytes | None
+    """Line that the robot decided to send, or None."""
+    sent: bytes | None
+    """Line that the daemon wrote to the serial port, or None if it wrote no line."""
     status: Status
     poses: tuple[Micropose, ...]
     """One pose for each feedback line that odometry accepted."""
     events: tuple[Event, ...] = ()
     checksum: int | None = None
-    """CRC-32 of all estimates since the first step of the batch; only in the batch's last step."""
+    """CRC-32 of all estimates of the batch, in its last step; None in the other steps."""
 
 
 class Step(Struct, frozen=True):
@@ -101,17 +104,17 @@ class Step(Struct, frozen=True):
 
     number: int
     inputs: Inputs
-    said: Said
+    recorded: RecordedOutputs
     begins: bool = False
     """True for the first step of a batch, at which the checksum restarts."""
 
 
 class UnfinishedError(AcsardError):
-    """Bytes that are not an unfinished step."""
+    """The bytes are not an unfinished step."""
 
 
 class Unfinished(Struct, frozen=True):
-    """Inputs of the step in which the daemon failed. The step did not produce outputs."""
+    """Inputs of the step in which the daemon failed. This step has no outputs."""
 
     number: int
     inputs: Inputs
@@ -125,15 +128,20 @@ _unfinished = msgspec.msgpack.Decoder(Unfinished)
 
 
 def unfinished(data: bytes) -> Unfinished:
-    """Decode an unfinished step; raise `UnfinishedError` for other bytes."""
+    """Decode an unfinished step; raise `UnfinishedError` if the bytes are damaged."""
     try:
         return _unfinished.decode(data)
     except msgspec.MsgspecError as error:
-        raise UnfinishedError(f"not an unfinished step: {error}") from None
+        raise UnfinishedError(
+            f"the step in which the daemon failed cannot be read: {error}"
+        ) from None
 
 
 def checksum(estimates: Sequence[Estimate], before: int) -> int:
-    """Continue the CRC-32 `before` over every bit of the poses, speeds and wheel angles."""
+    """Return the CRC-32 of all bits of the poses, twists and wheel angles.
+
+    `before` is the CRC-32 of the estimates before these, or 0.
+    """
     for e in estimates:
         pose, twist = e.pose, e.twist
         data = _DOUBLES.pack(pose.x, pose.y, pose.yaw, twist.linear, twist.angular, *e.positions)
@@ -142,7 +150,7 @@ def checksum(estimates: Sequence[Estimate], before: int) -> int:
 
 
 def microposes(estimates: Sequence[Estimate]) -> tuple[Micropose, ...]:
-    """Return the rounded poses of all estimates."""
+    """Return the pose of each estimate, rounded to um and urad."""
     return tuple([micropose(estimate) for estimate in estimates])
 
 

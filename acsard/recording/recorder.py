@@ -1,9 +1,9 @@
-"""The black box of a running daemon: takes the inputs and outputs of each step, and never waits.
+"""The black box of a running daemon: takes the inputs and outputs of each step without waiting.
 
-The control loop puts references into a bounded queue. A thread encodes them, adds a block to
-the growing chunk each second and syncs it to the disk. If the disk is slow or stuck, the queue
-fills, and further steps are lost and counted. The recording then goes on in a new file that begins
-with the robot's state, so that it can be replayed.
+The control loop puts references to the steps into a bounded queue. Once a second a thread takes all
+steps from the queue, adds them to the file as a block, and syncs the file to the disk. If the disk
+is slow or hangs, the queue fills, and further steps are lost and counted. The recording then goes
+on in a new file that begins with the robot's state, so that the new file can be replayed.
 """
 
 from __future__ import annotations
@@ -17,139 +17,141 @@ from acsard.core.config.settings import Config
 from acsard.core.guard import Guard
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Outputs, Recording
-from acsard.recording.disk import Bug, OnDisk
 from acsard.recording.recorded_steps import Start, Taken, Unfinished
 from acsard.recording.state import freeze
+from acsard.recording.step_writer import Bug, StepWriter
 
-MOST = 4096
-"""Largest number of steps in the queue. At 100 Hz a disk may stall for 10 s without a loss."""
+MAX_QUEUED_STEPS = 4096
+"""With 400 steps a second, a disk may hang for 10 s without a loss of steps."""
 
 FLUSH_S = 0.98
-"""Pause between two syncs. With the time that one takes, there is one each second."""
+"""Pause between two syncs. Together with the duration of a sync, that is about one second."""
 
-MOST_TEXT = 200
+MAX_TEXT = 200
 """Largest number of characters of an exception's text."""
 
 CLOSE_S, MARK_S = 0.5, 0.1
-"""Times that `close` waits for the end of the file, and for a marker in its place."""
+"""Time limits of `close`: to write the end of the file, and then to write a marker instead."""
 
 
 class Recorder:
-    """The recorder. The control loop calls `step`; the thread does everything else."""
+    """The black box of a running daemon.
 
-    def __init__(self, config: Config, tell: Callable[[Event], None], started_ns: int = 0) -> None:
+    The control loop calls `step`, which never waits. A thread writes the steps to the disk.
+    """
+
+    def __init__(
+        self, config: Config, report: Callable[[Event], None], started_ns: int = 0
+    ) -> None:
         """Start the thread.
 
         Args:
             config: the configuration at the daemon's start.
-            tell: takes the recorder's own events; it is called from within `step`.
+            report: takes the recorder's own events; only `step` calls it.
             started_ns: wall-clock time of the daemon's start, ns since 1970. An export stamps the
-                messages
-                that never change with it.
+                messages that never change with it.
         """
         self._queue: deque[Taken | Start] = deque()
-        self._tell = tell
-        self._said: deque[Event] = deque()
+        self._report = report
+        self._events: deque[Event] = deque()
+        """Events of the thread, which `step` passes on."""
         self._number = 0
         """Number of steps so far."""
-        self._missing = 0
+        self._lost = 0
         """Number of steps lost because the queue was full."""
         self._full = False
-        self._died: Inputs | None = None
-        """Inputs of the step that failed."""
+        self._failed_inputs: Inputs | None = None
+        """Inputs of the step in which the daemon failed."""
         self._wants_state = False
-        """Request for a new file: the thread sets it, and `step` clears it."""
-        self._disk = OnDisk(config, self._say, self._ask, started_ns)
+        """The thread sets this to begin a new file. `step` queues a robot's state and clears it."""
+        self._writer = StepWriter(config, self._events.append, self._request_state, started_ns)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, name="record", daemon=True)
         self._thread.start()
 
-    # The control loop's side
+    # These methods run in the control loop's thread.
 
     def begins(self, robot: Robot, guard: Guard) -> None:
-        """Let the first file begin with this robot, not with a new one of the configuration."""
+        """Begin the first file with this robot. Without this call it begins with a new robot."""
         self._queue.append(Start(0, freeze(robot, guard.memory), robot.config))
 
     def step(
-        self, inputs: Inputs, outputs: Outputs, left: bytes | None, robot: Robot, guard: Guard
+        self, inputs: Inputs, outputs: Outputs, sent: bytes | None, robot: Robot, guard: Guard
     ) -> None:
-        """Take a finished step; `left` is the line that was sent to the board, or None."""
+        """Take a finished step; `sent` is the line that was sent to the board, or None."""
         queue = self._queue
         self._number += 1
-        if self._said:
-            self._tell(self._said.popleft())
+        if self._events:
+            self._report(self._events.popleft())
         if self._full:
-            self._missing += 1
-            if len(queue) > MOST // 2:
+            self._lost += 1
+            if len(queue) > MAX_QUEUED_STEPS // 2:
                 return
             self._full, self._wants_state = False, True
-        elif len(queue) >= MOST:
+        elif len(queue) >= MAX_QUEUED_STEPS:
             self._full = True
-            self._missing += 1
-            self._tell(Event("recording", "the disk is too slow; steps are lost", "warning"))
+            self._lost += 1
+            self._report(Event("recording", "the disk is too slow; steps are lost", "warning"))
             return
         else:
-            queue.append(Taken(inputs, outputs, left))
+            queue.append(Taken(inputs, outputs, sent))
         if self._wants_state:
             self._wants_state = False
             queue.append(Start(self._number, freeze(robot, guard.memory), robot.config))
 
     def died(self, inputs: Inputs) -> None:
-        """Take the inputs of a step in which the daemon failed. The daemon ends because of it."""
-        self._died = inputs
+        """Take the inputs of the step in which the daemon failed. The failure ends the daemon."""
+        self._failed_inputs = inputs
 
     @property
     def status(self) -> Recording:
         """Status of the recording, for `state` and `diagnostics`."""
-        trouble = "the disk is too slow" if self._full else self._disk.trouble
+        trouble = "the disk is too slow" if self._full else self._writer.trouble
         if not self._thread.is_alive():
             trouble = "the recorder has ended because of an error of its own, which is in the log"
-        return Recording(self._disk.where, trouble, self._missing + self._disk.missing)
+        return Recording(self._writer.where, trouble, self._lost + self._writer.lost)
 
     def close(self, error: BaseException | None = None) -> None:
         """Write the last steps and the end of the file, if the disk is quick enough.
 
-        `error` is the exception that ends the daemon. A `BaseException` that is not an `Exception`
-        is an ordinary end.
+        `error` is the exception that ends the daemon. A `BaseException` that is not an `Exception`,
+        such as a `KeyboardInterrupt`, is an ordinary end.
         """
         while isinstance(error, BaseExceptionGroup):
             error = error.exceptions[0]
         if isinstance(error, Exception):
-            self._disk.bug = self._bug(error)
+            self._writer.bug = self._bug(error)
         self._over.set()
         self._thread.join(CLOSE_S)
-        if self._thread.is_alive() and self._disk.bug is None:
+        if self._thread.is_alive() and self._writer.bug is None:
             # A disk that hangs must not delay the end of the daemon as well.
-            marking = threading.Thread(target=self._disk.leave, args=["late"], daemon=True)
+            marking = threading.Thread(target=self._writer.mark_cut, args=["late"], daemon=True)
             marking.start()
             marking.join(MARK_S)
 
     def _bug(self, error: Exception) -> Bug:
         why = type(error).__name__
-        # An exception whose text cannot be produced is reported by its type.
+        # The text of an exception may be impossible to produce. Then its type must be enough.
         with suppress(Exception):
-            why = f"{why}: {error}"[:MOST_TEXT].encode(errors="replace").decode()
-        if self._died is None:
+            why = f"{why}: {error}"[:MAX_TEXT].encode(errors="replace").decode()
+        if self._failed_inputs is None:
             return Bug(why, None, b"")
         number, data = self._number, b""
-        # The input that made the step fail may also be one that cannot be encoded.
+        # The input that made the step fail may also be impossible to encode.
         with suppress(Exception):
-            data = Unfinished(number, self._died).encode()
-        return Bug(f"in step {number}, {why}", self._died.now, data)
+            data = Unfinished(number, self._failed_inputs).encode()
+        return Bug(f"in step {number}, {why}", self._failed_inputs.now, data)
 
-    # The thread's side
+    # These methods run in the recorder's thread.
 
-    def _say(self, event: Event) -> None:
-        self._said.append(event)
-
-    def _ask(self) -> None:
+    def _request_state(self) -> None:
         self._wants_state = True
 
     def _work(self) -> None:
         over = False
         while not over:
             over = self._over.wait(FLUSH_S)
-            self._disk.round(self._taken(), over)
+            self._writer.write(self._taken(), over)
 
     def _taken(self) -> list[Taken | Start]:
         queue = self._queue

@@ -1,7 +1,7 @@
-"""Finishes a recording that was cut off: as a copy, or in place if the disk has no room.
+"""Finishes a recording that was cut off: as a copy, or in place if the disk has no room for a copy.
 
-No readable data is thrown away. A file that this version cannot read stays as it is, and so does a
-file whose end the disk has no room for.
+No readable data is thrown away. If this version cannot read a file, or the disk has no room even
+for the end of a file, the file keeps its content.
 """
 
 from __future__ import annotations
@@ -17,72 +17,79 @@ from mcap.records import Attachment, DataEnd, Footer, McapRecord, Metadata
 
 from acsard.core.formatting import many
 from acsard.host.errors import RecordingError
-from acsard.recording.chunks import LAST_BLOCK, places
-from acsard.recording.end_record import END, EndRecord, fields
-from acsard.recording.file import Gist, Index, Recording, event_of, rewrite
+from acsard.recording.chunks import LAST_BLOCK, chunk_places
+from acsard.recording.end_record import END, EndRecord, as_metadata
+from acsard.recording.file import EndRecordBuilder, Index, Recording, event_of, rewrite
 from acsard.recording.mcap_records import MAGIC, walk
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Error numbers of a disk without room."""
+"""Error numbers of a full disk."""
 
 NOTHING_BYTES = 64 << 10
-"""A file above this size is more than a header and one second, so it held data, even if this
-version cannot read it.
-"""
+"""A larger file has more than a header and one second, so it held data, perhaps unreadable."""
 
 
 def recover(part: Path, whole: Path, cut: str, room: bool) -> str:
-    """Make a finished file `whole` of `part`.
+    """Make a finished file of a recording that was cut off.
 
-    Returns a message for the log, or "" without trouble. `cut` is a key of `CUTS`; `room` says that
-    the disk has room for a copy. A file without content is deleted. A file that cannot be read or
-    ended is only renamed. Raises `OSError`.
+    A file that holds no data is deleted. A file that cannot be read is only renamed.
+
+    Args:
+        part: the file that was cut off; it is removed or renamed.
+        whole: path of the finished file.
+        cut: why the file was cut off, a key of `CUTS`.
+        room: true if the disk has room for a copy.
+
+    Returns:
+        A message for the log, or "" if the recovery succeeded completely.
+
+    Raises:
+        OSError: the disk refuses.
     """
-    seen, told = part.stat(), ""
+    before, message = part.stat(), ""
     try:
-        if not _begins(part):
-            if seen.st_size > NOTHING_BYTES or _has_chunks(part):
+        if not _has_configuration(part):
+            if before.st_size > NOTHING_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has no readable beginning")
             part.unlink()
-            return f"{part.name} is removed: it has no beginning" if seen.st_size else ""
+            return f"{part.name} is removed: it has no beginning" if before.st_size else ""
         recording = Recording(part)
         if not any(True for _ in recording.messages()):
-            if recording.damaged or seen.st_size > NOTHING_BYTES or _has_chunks(part):
+            if recording.damaged or before.st_size > NOTHING_BYTES or _has_chunks(part):
                 raise RecordingError(f"{part} has no intact data")
             part.unlink()
             return ""
-        if room and _beside(recording, part, whole, cut):
+        if room and _copy(recording, part, whole, cut):
             if recording.damaged:
                 lost = many(recording.damaged, "damaged place is", "damaged places are")
-                told = f"{lost} left out of {whole.name}"
+                message = f"{lost} left out of {whole.name}"
         else:
-            if not _in_place(recording, part, cut):
-                told = (
-                    f"{whole.name} was cut and gets no end record, because the disk is full; "
+            if not _finish_in_place(recording, part, cut):
+                message = (
+                    f"{whole.name} was cut off and gets no end record, because the disk is full; "
                     "everything else is in it"
                 )
             part.rename(whole)
     except RecordingError as error:
         part.rename(whole)
-        return f"it was cut and stays cut, as {whole.name}: {error}"
+        return f"a recording was cut off and cannot be finished; it is now {whole.name}: {error}"
     # The file time must be the time of the recording's end, not of its recovery.
-    os.utime(whole, ns=(seen.st_atime_ns, seen.st_mtime_ns))
-    return told
+    os.utime(whole, ns=(before.st_atime_ns, before.st_mtime_ns))
+    return message
 
 
-def _begins(part: Path) -> bool:
-    """Return whether the file has its configuration. Without it, none of the file can be read."""
-    records = (found.record for found in walk(part.read_bytes()))
-    return any(isinstance(record, Attachment) for record in records)
+def _has_configuration(part: Path) -> bool:
+    """Return whether the file has its configuration. `Recording` refuses a file without it."""
+    return any(isinstance(place.record, Attachment) for place in walk(part.read_bytes()))
 
 
 def _has_chunks(part: Path) -> bool:
-    """Return whether a chunk was begun in the file, even if none of it can be read."""
-    return any(True for _ in places(part.read_bytes(), 0))
+    """Return whether the file has the head of a chunk, even if the chunk is unreadable."""
+    return any(True for _ in chunk_places(part.read_bytes(), 0))
 
 
-def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
-    """Write a copy without the damaged parts; return False if the disk is full."""
+def _copy(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
+    """Write a copy without the damaged places; return False if the disk is full."""
     written = part.with_name(f".{part.name}.new")
     written.unlink(missing_ok=True)
     try:
@@ -96,31 +103,32 @@ def _beside(recording: Recording, part: Path, whole: Path, cut: str) -> bool:
     return True
 
 
-def _in_place(recording: Recording, part: Path, cut: str) -> bool:
-    """Write the end behind the last whole second, over the torn part.
+def _finish_in_place(recording: Recording, part: Path, cut: str) -> bool:
+    """Write the end of the file after the last readable second, over the torn rest.
 
-    A chunk that was cut, or whose head is not the true one, gets its true head. If a power cut
-    interrupted an earlier recovery behind the end, only the heads are written. Returns False if the
-    disk has no room; then the file is as it was. No second is given up to gain room: some disks
-    give none back, and then all would be lost.
+    A chunk without its true head gets it. If a power cut interrupted an earlier recovery after it
+    wrote the end, only the heads are written.
+
+    Returns False if the disk has no room; then the file is unchanged. No recorded second is given
+    up to gain room: some disks return no room, and then everything would be lost.
     """
-    gist = Gist(recording.about)
+    builder = EndRecordBuilder(recording.about)
     for topic, wall_ns, data in recording.messages():
-        gist.message(topic, wall_ns, data)
+        builder.message(topic, wall_ns, data)
         if topic == "events":
-            gist.event(event_of(recording, data))
+            builder.event(event_of(recording, data))
     before = part.read_bytes()
-    puts, size = _mends(before, gist.closing(cut))
-    if not puts and size == len(before):
+    writes, size = _writes(before, builder.end_record(cut))
+    if not writes and size == len(before):
         return True
     with part.open("r+b", buffering=0) as stream:
         try:
-            for at, data in puts:
+            for at, data in writes:
                 _put(stream, at, data)
         except OSError as error:
             with suppress(OSError):
                 stream.truncate(len(before))
-                for at, data in puts:
+                for at, data in writes:
                     _put(stream, at, before[at : at + len(data)])
             if error.errno not in FULL:
                 raise
@@ -130,22 +138,23 @@ def _in_place(recording: Recording, part: Path, cut: str) -> bool:
     return True
 
 
-def _mends(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
-    """Return the offset and the bytes of each write that finishes a file, and the file's new size.
+def _writes(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int]:
+    """Return the writes that finish a file, each with its offset, and the file's new size.
 
-    The end comes before the heads, because the disk may have no room for it.
+    `before` is the file as it is. The end of the file is written before the heads, because the disk
+    may have no room for it.
     """
     heads: list[tuple[int, bytes]] = []
     chunk, index = None, Index()
-    for found in walk(before):
-        if isinstance(found.record, Footer) and before.startswith(MAGIC, found.end):
-            return heads, found.end + len(MAGIC)
-        # A record behind a chunk belongs to an earlier end, which the new one overwrites.
-        if found.record is not None and chunk is None:
-            length = len(_encoded(found.record))
-            index.record(found.record, found.end - length, length)
-        if found.chunk and found.messages:
-            chunk = found.chunk
+    for place in walk(before):
+        if isinstance(place.record, Footer) and before.startswith(MAGIC, place.end):
+            return heads, place.end + len(MAGIC)
+        # A record after a chunk belongs to an earlier end, which the new end overwrites.
+        if place.record is not None and chunk is None:
+            length = len(_encoded(place.record))
+            index.record(place.record, place.end - length, length)
+        if place.chunk and place.messages:
+            chunk = place.chunk
             index.chunk()
             for message in chunk.messages:
                 index.message(message.channel, message.wall_ns)
@@ -163,7 +172,7 @@ def _mends(before: bytes, last: EndRecord) -> tuple[list[tuple[int, bytes]], int
 
 
 def _put(stream: FileIO, at: int, data: bytes) -> None:
-    """Write `data` at a position and sync it; after an `OSError` a part may have been written."""
+    """Write `data` at the offset `at` and sync it. After an `OSError`, a part may be written."""
     stream.seek(at)
     while data:
         data = data[stream.write(data) :]
@@ -171,14 +180,14 @@ def _put(stream: FileIO, at: int, data: bytes) -> None:
 
 
 def _end(last: EndRecord, index: Index, at: int) -> bytes:
-    """Return the end of an MCAP file, to be written at that offset.
+    """Return the end of an MCAP file, to be written at the offset `at`.
 
-    Its summary leaves out the copy of the schema and the channels, for want of room. Without the
-    statistics, some readers take the file for an empty one.
+    The summary section omits the copy of the schema and the channels, because the disk may be
+    nearly full. It has the statistics, because some readers take a file without them for empty.
     """
-    closing = Metadata(END, fields(last))
-    data = _encoded(closing)
-    index.record(closing, at, len(data))
+    record = Metadata(END, as_metadata(last))
+    data = _encoded(record)
+    index.record(record, at, len(data))
     data += _encoded(DataEnd(0))
     summary_at = at + len(data)
     return data + _encoded(*index.records(), Footer(summary_at, 0, 0)) + MAGIC

@@ -1,7 +1,7 @@
-"""Replays a recording: runs `Robot.step` over the recorded inputs and compares the outputs.
+"""Replays steps: runs `Robot.step` over the recorded inputs and compares the outputs.
 
-A robot's behaviour depends only on its inputs and its configuration. The same code and
-configuration therefore reproduce every line, mode and pose. With other code or another
+A robot's behaviour depends only on its inputs and its configuration. Therefore the same code with
+the same configuration reproduces every line, mode and pose. With other code or another
 configuration, the differences show how the robot would have behaved.
 """
 
@@ -30,7 +30,7 @@ FAULT = "fault"
 
 
 class Seen(Struct, frozen=True):
-    """Outputs of one side, recorded or replayed, for a step."""
+    """The recorded or the replayed outputs of a step."""
 
     line: bytes | None
     status: Status
@@ -40,18 +40,21 @@ class Seen(Struct, frozen=True):
 
 
 class Difference(Struct, frozen=True):
-    """A step whose replay differs from the recording."""
+    """A step whose replayed outputs differ from the recorded ones."""
 
     number: int
     at: Instant
     what: tuple[str, ...]
-    """The outputs that differ, out of `line`, `left`, `mode` and `pose`."""
-    then: Seen
-    now: Seen
+    """The outputs that differ, out of `line`, `sent line`, `mode` and `pose`.
+
+    `line` is the line that the robot decided, and `sent line` the line that the guard let pass.
+    """
+    recorded: Seen
+    replayed: Seen
 
 
 class Comparison(Struct):
-    """Totals of a replay so far."""
+    """Totals of the replay up to now."""
 
     steps: int = 0
     lines: int = 0
@@ -70,7 +73,7 @@ class Comparison(Struct):
     fastest: tuple[int, int] = (0, 0)
     """Speed of the fastest wheel in any line, recorded and replayed, in hundredths of rad/s."""
     end: tuple[Micropose, Micropose] | None = None
-    """The last poses, recorded and replayed."""
+    """The last recorded pose, and the replayed pose at the same step."""
 
     @property
     def same(self) -> bool:
@@ -78,17 +81,17 @@ class Comparison(Struct):
         return self.first is None
 
 
-def lived(robot: Robot, step: Step) -> Outputs:
-    """Run a step on the robot, and return its outputs.
+def replay_step(robot: Robot, step: Step) -> Outputs:
+    """Run a recorded step on the robot, and return its outputs.
 
-    The robot's counters of sent and superseded lines, which the daemon's loop keeps, are counted as
-    in the recording.
+    The robot's counters of sent and superseded lines are increased as the daemon's control loop
+    increased them during the recorded step.
     """
     outputs = robot.step(step.inputs)
-    said, inputs = step.said, step.inputs
-    if said.left is not None:
+    recorded, inputs = step.recorded, step.inputs
+    if recorded.sent is not None:
         robot.counters["lines_sent"] += 1
-    elif said.line is not None and inputs.tick and inputs.port_open:
+    elif recorded.line is not None and inputs.tick and inputs.port_open:
         robot.counters["lines_superseded"] += 1
     return outputs
 
@@ -99,88 +102,102 @@ class Replay:
     def __init__(
         self, config: Config, robot: Robot | None = None, memory: Memory | None = None
     ) -> None:
-        """Start with `robot` and the guard's `memory`, or with a new robot."""
+        """Start with `robot` and the guard's `memory`, or with a new robot of `config`."""
         self.robot = robot or Robot(config)
         self.outputs: Outputs | None = None
         """Outputs of the last replayed step."""
+        self.comparison = Comparison()
         self._config = self.robot.config
         self._guard = Guard(self.robot.session.codec.stop, self._config, memory)
         self._checksum = 0
-        self._here: Micropose = (0, 0, 0)
-        self.tally = Comparison()
+        self._pose: Micropose = (0, 0, 0)
+        """The last replayed pose."""
 
     def step(self, step: Step) -> Difference | None:
         """Replay a step.
 
-        Returns its difference from the recording, or None if all outputs are equal.
+        Returns the difference between the replayed and the recorded outputs, or None if all outputs
+        are equal.
         """
         if step.begins:
             self._checksum = 0
-        outputs = self.outputs = lived(self.robot, step)
-        # A setting was changed.
+        outputs = self.outputs = replay_step(self.robot, step)
+        # The step changed a setting.
         if self.robot.config is not self._config:
             self._config = self.robot.config
             self._guard.use(self._config)
         line, trip = self._guard.check(outputs)
         self._checksum = checksum(outputs.estimates, self._checksum)
-        if step.said.left is not None:
-            # The board obeyed the line that was sent then, even if the replay decides another.
-            self._guard.left(step.said.left)
-        now = Seen(outputs.line, status_of(outputs), microposes(outputs.estimates), trip)
-        difference = self._compare(step, now, line)
-        self._count(step, outputs, now)
+        if step.recorded.sent is not None:
+            # The board obeyed the recorded line, even if the replay decides another one.
+            self._guard.left(step.recorded.sent)
+        replayed = Seen(outputs.line, status_of(outputs), microposes(outputs.estimates), trip)
+        difference = self._compare(step, replayed, line)
+        self._count(step, outputs, replayed)
         if difference is not None:
             self._keep(difference)
         return difference
 
     def _keep(self, difference: Difference) -> None:
-        """Keep the first difference, and the first new fault."""
-        tally = self.tally
-        tally.first = tally.first or difference
-        if difference.now.status[0] == FAULT != difference.then.status[0]:
-            tally.fault = tally.fault or difference
+        """Keep the first difference, and the first fault that only the replay has."""
+        comparison = self.comparison
+        comparison.first = comparison.first or difference
+        if difference.replayed.status[0] == FAULT != difference.recorded.status[0]:
+            comparison.fault = comparison.fault or difference
 
-    def _compare(self, step: Step, now: Seen, line: bytes | None) -> Difference | None:
-        said = step.said
-        then = Seen(said.line, said.status, said.poses)
-        exact = said.checksum is None or said.checksum == self._checksum
-        self.tally.exact = self.tally.exact and exact
+    def _compare(self, step: Step, replayed: Seen, guarded: bytes | None) -> Difference | None:
+        """Compare a step's outputs; `guarded` is the line that the guard let pass in the replay."""
+        recorded = step.recorded
+        exact = recorded.checksum is None or recorded.checksum == self._checksum
+        self.comparison.exact = self.comparison.exact and exact
+        mode, _, *others = replayed.status
+        recorded_mode, _, *recorded_others = recorded.status
         what = tuple(
             name
             for name, same in (
-                ("line", now.line == said.line),
-                ("left", said.left is None or line == said.left),
-                ("mode", now.status[0] == said.status[0] and now.status[2:] == said.status[2:]),
-                ("pose", now.poses == said.poses),
+                ("line", replayed.line == recorded.line),
+                ("sent line", recorded.sent is None or guarded == recorded.sent),
+                ("mode", mode == recorded_mode and others == recorded_others),
+                ("pose", replayed.poses == recorded.poses),
             )
             if not same
         )
-        return Difference(step.number, step.inputs.now, what, then, now) if what else None
+        if not what:
+            return None
+        seen = Seen(recorded.line, recorded.status, recorded.poses)
+        return Difference(step.number, step.inputs.now, what, seen, replayed)
 
-    def _count(self, step: Step, outputs: Outputs, now: Seen) -> None:
-        tally, said = self.tally, step.said
-        tally.steps += 1
-        if said.line is not None or now.line is not None:
-            tally.lines += 1
-            tally.lines_same += said.line == now.line
-        tally.modes_same += now.status[0] == said.status[0]
-        tally.poses += len(said.poses)
-        tally.poses_same += sum(a == b for a, b in zip(said.poses, now.poses, strict=False))
-        then_most, now_most = tally.fastest
-        tally.fastest = max(then_most, fastest(said.line)), max(now_most, fastest(now.line))
+    def _count(self, step: Step, outputs: Outputs, replayed: Seen) -> None:
+        comparison, recorded = self.comparison, step.recorded
+        comparison.steps += 1
+        if recorded.line is not None or replayed.line is not None:
+            comparison.lines += 1
+            comparison.lines_same += recorded.line == replayed.line
+        comparison.modes_same += replayed.status[0] == recorded.status[0]
+        comparison.poses += len(recorded.poses)
+        pairs = zip(recorded.poses, replayed.poses, strict=False)
+        comparison.poses_same += sum(a == b for a, b in pairs)
+        recorded_speed, replayed_speed = comparison.fastest
+        comparison.fastest = (
+            max(recorded_speed, fastest(recorded.line)),
+            max(replayed_speed, fastest(replayed.line)),
+        )
         if outputs.estimates:
-            self._here = now.poses[-1]
-        if said.poses:
-            there = said.poses[-1]
-            tally.end = there, self._here
-            if there != self._here:
-                away = math.hypot(there[0] - self._here[0], there[1] - self._here[1]) / MICRO
-                tally.apart = max(tally.apart, away)
+            self._pose = replayed.poses[-1]
+        if recorded.poses:
+            pose = recorded.poses[-1]
+            comparison.end = pose, self._pose
+            if pose != self._pose:
+                apart = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / MICRO
+                comparison.apart = max(comparison.apart, apart)
 
 
 @lru_cache(64)
 def fastest(line: bytes | None) -> int:
-    """Return the highest wheel speed in a line, hundredths of rad/s; 0 if it cannot be read."""
+    """Return the highest wheel speed in a line, hundredths of rad/s.
+
+    Returns 0 if the line is None or holds no speeds.
+    """
     if line is None:
         return 0
     tokens = [line[start + 2 : start + 7].replace(b".", b"") for start in (0, 8, 16, 24)]

@@ -1,11 +1,11 @@
-"""Decides which recordings are deleted and which are retained.
+"""Decides which recordings are deleted, and which are retained because of an incident.
 
-It also decides whether the wall clock can tell their age.
+A recording is protected if an incident happened in it, or within a minute of it. Protected
+recordings are deleted last. Other programs use the disk too, so a part of the disk is left to them.
+If they need more than that part, the unprotected recordings other than the newest are deleted. All
+others are deleted only when the room to record is nearly used up.
 
-The recordings of incidents, and those within a minute of one, are deleted last. Other programs use
-the disk too, so a part of it is left to them. If they have used up that part, unprotected
-recordings other than the newest are deleted. The rest is deleted only when there would soon be no
-room to record at all.
+`ClockWatch` decides whether the wall clock can be trusted for the age of a recording.
 """
 
 from __future__ import annotations
@@ -26,26 +26,28 @@ AROUND_NS = 60 * NS_PER_S
 """Time before and after an incident within which recordings are retained."""
 
 KEPT_FILES = 50
-"""Number of the newest recordings with an incident that are retained, with those near them."""
+"""Number of recordings with an incident that are protected: the newest ones."""
 
 FILES = 100
-"""A file may have the 100th part of all bytes, so the retained ones are about half of the total."""
+"""A file may take a hundredth of the total size, so 50 protected files take about half of it."""
 
 LEAST_BYTES = 100_000
-"""Size that a file may have even on a small disk, in bytes."""
+"""Size up to which a file may grow even on a small disk, bytes."""
 
 SPARE = 0.05
+"""Fraction of the disk that is left to other programs."""
+
 SPARE_BYTES = 1_000_000_000
-"""Share of the disk that is left to other programs, and its upper bound in bytes."""
+"""Largest number of bytes that is left to other programs."""
 
 NEEDED = 0.2
-"""Share of the spare room, below which there would soon be no room to record at all."""
+"""If less than this fraction of `Disk.spare` is free, protected recordings are deleted too."""
 
 JUMP_NS = 60 * NS_PER_S
-"""A change of the wall clock against the monotonic clock above which it counts as set."""
+"""A larger change of the wall clock against the monotonic clock is a jump of the wall clock."""
 
 STEADY_NS = 600 * NS_PER_S
-"""Time without a step of the wall clock after which it may tell the age of a recording."""
+"""Time without a jump after which the wall clock is trusted for the age of a recording."""
 
 
 class Disk(NamedTuple):
@@ -56,12 +58,12 @@ class Disk(NamedTuple):
 
     @property
     def spare(self) -> int:
-        """Bytes that are left to other programs."""
+        """Number of bytes that the recordings leave to other programs."""
         return min(int(self.total * SPARE), SPARE_BYTES)
 
     @property
     def low(self) -> bool:
-        """True if other programs have less than the room left to them."""
+        """True if less is free than the recordings leave to other programs."""
         return self.free < self.spare
 
 
@@ -74,95 +76,103 @@ class Ended(NamedTuple):
     size: int
     """Size in bytes."""
     at_s: float
-    """Time at which it ended, s since 1970, by the wall clock of that time."""
-    here: bool = False
-    """True if it ended in this run of the daemon. Such a file never counts as too old."""
+    """Wall-clock time at which the recording ended, s since 1970."""
+    this_run: bool = False
+    """True if it ended in this run of the daemon. Such a recording never counts as too old."""
 
 
 class Bounds(NamedTuple):
-    """Bounds for all recordings together."""
+    """Limits of all recordings together."""
 
     size: int
     """Largest total size in bytes."""
     oldest_s: float
-    """Recordings that ended before this time are too old, s since 1970; -inf without a clock."""
+    """Recordings that ended before this wall-clock time are too old, s since 1970.
+
+    It is -inf if the wall clock is not trusted.
+    """
 
 
 def share(bound: int, own: int, disk: Disk) -> int:
-    """Return the largest size of one file in bytes.
+    """Return the largest size of one file, bytes.
 
-    `bound` is the largest total size of all recordings, and `own` their present size.
+    `bound` is the largest total size of all recordings, and `own` is their present total size.
     """
     return max(LEAST_BYTES, min(bound, own + disk.free - disk.spare) // FILES)
 
 
-def too_much(
-    ended: Sequence[Ended], bounds: Bounds, disk: Disk, given: int | None = None
+def to_delete(
+    ended: Sequence[Ended], bounds: Bounds, disk: Disk, freed: int | None = None
 ) -> set[str]:
-    """Return the names of the recordings to delete.
+    """Return the names of the recordings to delete, so that one more file fits.
 
-    `ended` is in the order of their numbers. One more file must fit afterwards. `given` is None
-    unless the disk refuses to write, whatever free space it reports. Then it is the number of bytes
-    that were deleted for that disk without success:
-    - With 0, at least one recording is deleted.
-    - Above 0 but below `LEAST_BYTES`, one more is deleted, but no protected one.
-    - From `LEAST_BYTES` on, none is deleted for this reason.
+    Args:
+        ended: the recordings in the order of their numbers.
+        bounds: limits of all recordings together.
+        disk: size and free space of the disk.
+        freed: None if the disk accepts data. Otherwise the disk refuses to write, although it may
+            report free space, and `freed` is the number of bytes that were already deleted in vain:
+
+            - 0: delete at least one recording, even a protected one.
+            - less than `LEAST_BYTES`: delete one more recording, but not a protected one.
+            - more: delete nothing for this reason.
     """
-    stays = _protected(ended)
-    plain = [one for one in ended if one.name not in stays]
-    old = [one for one in plain if one.at_s < bounds.oldest_s and not one.here]
-    gone = {one.name for one in old}
-    own = sum(one.size for one in ended if one.name not in gone)
-    free = disk.free + sum(one.size for one in old)
+    protected = _protected(ended)
+    plain = [file for file in ended if file.name not in protected]
+    old = [file for file in plain if file.at_s < bounds.oldest_s and not file.this_run]
+    names = {file.name for file in old}
+    own = sum(file.size for file in ended if file.name not in names)
+    free = disk.free + sum(file.size for file in old)
     most = bounds.size - share(bounds.size, own, disk)
     needed = int(disk.spare * NEEDED)
-    for one in plain + [one for one in ended if one.name in stays]:
-        if one.name in gone:
+    for file in plain + [file for file in ended if file.name in protected]:
+        if file.name in names:
             continue
-        gives_way = one.name not in stays and one is not ended[-1]
-        refused = given is not None and not gone
-        helps = not given or (one.name not in stays and given < LEAST_BYTES)
-        if own > most or free < (disk.spare if gives_way else needed) or (refused and helps):
-            gone.add(one.name)
-            own, free = own - one.size, free + one.size
-    return gone
+        is_plain = file.name not in protected
+        required = disk.spare if is_plain and file is not ended[-1] else needed
+        must_free = freed is not None and not names
+        may_help = not freed or (is_plain and freed < LEAST_BYTES)
+        if own > most or free < required or (must_free and may_help):
+            names.add(file.name)
+            own, free = own - file.size, free + file.size
+    return names
 
 
 def _protected(ended: Sequence[Ended]) -> set[str]:
     """Return the names of the newest recordings with an incident, and of those near them."""
-    last = {one.name for one in [one for one in ended if one.kind == "kept"][-KEPT_FILES:]}
+    kept = {file.name for file in [file for file in ended if file.kind == "kept"][-KEPT_FILES:]}
     return {
-        one.name
-        for run in _runs(ended)
-        if any(one.name in last for one in run)
-        for one in run
-        if one.kind == "near" or one.name in last
+        file.name
+        for group in _groups(ended)
+        if any(file.name in kept for file in group)
+        for file in group
+        if file.kind == "near" or file.name in kept
     }
 
 
-def _runs(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
-    """Yield the groups of recordings that are not plain and have consecutive numbers."""
-    run: list[Ended] = []
-    for one in ended:
-        if one.kind == "plain":
+def _groups(ended: Sequence[Ended]) -> Iterator[list[Ended]]:
+    """Yield groups of recordings with consecutive numbers, without the `plain` recordings."""
+    group: list[Ended] = []
+    for file in ended:
+        if file.kind == "plain":
             continue
-        if run and one.number - run[-1].number > 1:
-            yield run
-            run = []
-        run.append(one)
-    yield run
+        if group and file.number - group[-1].number > 1:
+            yield group
+            group = []
+        group.append(file)
+    yield group
 
 
-class Steady(Struct):
-    """Watch over the wall clock, which can be believed if it was not set for a while."""
+class ClockWatch(Struct):
+    """Detects jumps of the wall clock. The wall clock is trusted a while after the last jump."""
 
     _since_ns: int | None = None
-    """Monotonic time since which the wall clock was not set, ns; None before the first look."""
+    """Monotonic time of the last jump, or of the first call of `jump_ns`; None before it."""
     _ahead_ns: int = 0
-    """Offset of the wall clock from the monotonic clock at the last look, ns."""
+    """Offset of the wall clock from the monotonic clock at the last call of `jump_ns`, ns."""
 
-    def look(self, now: Instant) -> int:
-        """Return how far the wall clock was set since the last look, ns; 0 if it was not set."""
+    def jump_ns(self, now: Instant) -> int:
+        """Return how far the wall clock has jumped since the last call, ns; 0 without a jump."""
         ahead_ns = now.wall_ns - now.mono_ns
         jumped_ns = 0 if self._since_ns is None else ahead_ns - self._ahead_ns
         self._ahead_ns = ahead_ns
@@ -171,13 +181,13 @@ class Steady(Struct):
             return jumped_ns
         return 0
 
-    def believed(self, now: Instant) -> bool:
-        """Return whether the wall clock was watched, and not set, for `STEADY_NS`."""
+    def trusted(self, now: Instant) -> bool:
+        """Return whether the wall clock was watched for `STEADY_NS` without a jump."""
         return self._since_ns is not None and now.mono_ns - self._since_ns >= STEADY_NS
 
 
-class Around(Generic[File]):
-    """Retention of recording files around incidents, decided in the order in which the files end.
+class IncidentWindow(Generic[File]):
+    """Finds the recording files within a minute of an incident, while files begin and end.
 
     All times are ns of the monotonic clock.
     """
@@ -196,8 +206,8 @@ class Around(Generic[File]):
     def happened(self, now_ns: int) -> list[File]:
         """Retain the current file because of an incident at `now_ns`.
 
-        Returns the earlier files to retain as well, which ended less than a minute before the
-        incident.
+        Returns the plain files that ended less than a minute before the incident. The caller must
+        retain them too.
         """
         self.kind, self._happened_ns = "kept", now_ns
         close = [file for file, ended_ns in self._recent if now_ns - ended_ns < AROUND_NS]
@@ -206,17 +216,17 @@ class Around(Generic[File]):
 
     def end(self, file: File, last_ns: int) -> None:
         """Register the end of the current file as `file`, with its last step at `last_ns`."""
-        self._recent = [(one, ns) for one, ns in self._recent if last_ns - ns < AROUND_NS]
+        self._recent = [(older, ns) for older, ns in self._recent if last_ns - ns < AROUND_NS]
         if self.kind == "plain":
             self._recent.append((file, last_ns))
 
     def earlier(self, file: File, kind: Kind, ended_ns: int) -> None:
-        """Take over a file that the previous run of the daemon has finished."""
+        """Register a file of the previous run of the daemon, with its class and its end."""
         if kind == "plain":
             self._recent.append((file, ended_ns))
         elif kind == "kept":
             self.earlier_happened(ended_ns)
 
     def earlier_happened(self, at_ns: int) -> None:
-        """Take over the time of an earlier incident, such as the crash of the previous run."""
+        """Register the time of an incident of the previous run, such as its crash."""
         self._happened_ns = max(self._happened_ns, at_ns)

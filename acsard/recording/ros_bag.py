@@ -1,8 +1,8 @@
-"""Writes the `metadata.yaml` beside an MCAP file, which makes a ROS bag of the directory.
+"""Writes the `metadata.yaml` that makes a ROS bag of a directory with an MCAP file.
 
 The metadata has format version 5 with numeric QoS policies, which every ROS 2 release since Humble
-reads. The file itself holds the same QoS text for each channel, where `ros2 bag play FILE` finds
-it.
+reads. The MCAP file holds the same QoS text in the metadata of each channel, because `ros2 bag play
+FILE` reads it there.
 """
 
 from __future__ import annotations
@@ -23,12 +23,13 @@ _ENDLESS = "{sec: 9223372036, nsec: 854775807}"
 
 
 class Topic(Struct, frozen=True):
-    """Topic of the bag, with its ROS type, its QoS and its number of messages."""
+    """A topic of the bag."""
 
     name: str
     type: str
     qos: Qos
     count: int
+    """Number of messages."""
 
 
 def offered(qos: Qos) -> str:
@@ -50,9 +51,13 @@ def offered(qos: Qos) -> str:
 
 
 def metadata(file: str, topics: Sequence[Topic], first_ns: int, last_ns: int) -> str:
-    """Return the `metadata.yaml` of a bag that consists of this one MCAP file.
+    """Return the `metadata.yaml` of a bag with one MCAP file.
 
-    `first_ns` and `last_ns` are the wall-clock times of the first and the last message.
+    Args:
+        file: name of the MCAP file.
+        topics: the topics in the file.
+        first_ns: wall-clock time of the earliest message, ns since 1970.
+        last_ns: wall-clock time of the latest message, ns since 1970.
     """
     count = sum(topic.count for topic in topics)
     begins = f"nanoseconds_since_epoch: {first_ns}"
@@ -89,5 +94,5 @@ def metadata(file: str, topics: Sequence[Topic], first_ns: int, last_ns: int) ->
 
 
 def _quoted(text: str) -> str:
-    """Quote a YAML string: a name from a configuration or a path may contain YAML syntax."""
+    """Quote a YAML string, because a name or a path may contain YAML syntax."""
     return msgspec.json.encode(text).decode()

@@ -1,11 +1,12 @@
-"""Encodes steps as rows, in batches of at most about one second, and decodes them.
+"""Encodes steps as rows, in batches of about one second, and decodes them.
 
-A row is one step. Its numbers are differences from the row or the tick before, so that equal steps
-give equal bytes, which the compression of a chunk then removes. Each batch can be decoded alone,
-and decoding returns every `Step` exactly as it was encoded. A file may come from a stranger, so a
-batch with values that no daemon records is refused.
+A row is one step. Its numbers are differences from the previous row or from the previous tick of
+the control loop's clock. Similar steps therefore give equal bytes, which the compression of a chunk
+then removes. Each batch can be decoded alone, and decoding returns every `Step` exactly as it was
+encoded. A file may come from a stranger, so `decode` refuses a batch with values that no daemon
+records.
 
-A change of these structs is a new `FORMAT`.
+If you change one of these structs, change `FORMAT` as well.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from acsard.core.values import (
 )
 from acsard.recording.recorded_steps import (
     Micropose,
-    Said,
+    RecordedOutputs,
     Status,
     Step,
     Taken,
@@ -43,24 +44,29 @@ from acsard.recording.recorded_steps import (
 FORMAT = "3"
 """Format of the messages in a recording. A new number means a new encoding."""
 
-MOST_ROWS = 4096
-"""Largest number of rows that is read from a batch. The recorder's queue has no more steps."""
+MAX_ROWS = 4096
+"""Largest number of rows in a batch. The recorder's queue never holds more steps."""
 
-LONGEST_NS = 1 << 61
-"""Bound of the time since the computer's start and of the age of a read: 73 years."""
+MAX_TIME_NS = 1 << 61
+"""Largest time since the computer's start, and largest age of a serial read: 73 years."""
 
-LATEST_NS = 1 << 62
-"""Bound of the offset between the monotonic and the wall clock, which the wall clock reaches in
-the year 2116. The sum of all three fits in 64 bits.
+MAX_OFFSET_NS = 1 << 62
+"""Largest offset of the wall clock from the monotonic clock, which a recording reaches in 2116.
+
+The sum of such an offset, a time and an age fits in 64 bits.
 """
 
 
 class BatchError(AcsardError):
-    """Bytes that are not a valid batch of steps."""
+    """The bytes are not a valid batch of steps."""
 
 
 class Rare(Struct, frozen=True, omit_defaults=True):
-    """Values that most steps do not have. An absent value is as in the row before, or empty."""
+    """Values that most steps do not have.
+
+    `opened`, `trouble` and `status` are None if they are as in the previous row. `guard_trip` is
+    the input that says why the guard replaced the previous line.
+    """
 
     opened: int | None = None
     trouble: str | None = None
@@ -79,12 +85,12 @@ NOTHING = Rare()
 
 
 class Read(NamedTuple):
-    """One read of the port. Its times are in units of `Batch.unit`."""
+    """One read from the serial port. Its times are in units of `Batch.unit`."""
 
     age: int
-    """Time from the read to its step."""
+    """Time from the read to the step that takes the bytes."""
     offset: int
-    """Offset of the wall clock at the read, as in `Row.offset`."""
+    """Offset of the wall clock at the read, encoded as in `Row.offset`."""
     data: bytes
 
 
@@ -97,28 +103,30 @@ class Row(Struct, frozen=True, array_like=True):
     leaving: bool
     superseded: bool
     now: int
-    """Time since the last tick before this step, or since `Batch.mono_ns` if there is none."""
+    """Time since the previous tick of the batch, or since `Batch.mono_ns` before the first tick."""
     offset: int
-    """Offset of the wall clock from the monotonic clock, beyond `Batch.offset_ns`."""
+    """Offset of the wall clock from the monotonic clock, minus `Batch.offset_ns`."""
     reads: tuple[Read, ...]
     line: bytes | None
-    left: bytes | bool
-    """True if `line` was sent, False if no line was, or the bytes that were sent in its place."""
+    sent: bytes | bool
+    """True if `line` was sent, False if no line was sent, or the bytes that were sent instead."""
     poses: tuple[Micropose, ...]
-    """Poses, each as the difference from the pose before; the first of a batch as it is."""
+    """Poses, each minus the previous pose of the batch. The first pose is unchanged."""
     rare: Rare | None
 
 
 class Batch(Struct, frozen=True, array_like=True):
-    """A batch of steps as it is written."""
+    """A batch of steps as a recording stores it."""
 
     first: int
+    """Number of the first step."""
     mono_ns: int
+    """Monotonic time of the first step, ns."""
     offset_ns: int
     """Offset of the wall clock from the monotonic clock at the first step, ns."""
     unit: Annotated[int, Meta(ge=1)]
-    """Common divisor of all times, ns. Many clocks count in us."""
-    rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MOST_ROWS)]
+    """Common divisor of all times, ns. Many clocks count in us, and then it is 1000 or more."""
+    rows: Annotated[tuple[Row, ...], Meta(min_length=1, max_length=MAX_ROWS)]
     checksum: int
     """CRC-32 of all estimates of the batch."""
 
@@ -137,19 +145,19 @@ _decoder_of_first = msgspec.msgpack.Decoder(_First)
 
 
 def encode(first: int, taken: Sequence[Taken]) -> bytes:
-    """Encode 1 to `MOST_ROWS` steps; the first of them has the number `first`."""
+    """Encode 1 to `MAX_ROWS` steps; the first of them has the number `first`."""
     start = taken[0].inputs.now
     offset_ns = start.wall_ns - start.mono_ns
     times = list(_times(taken, start.mono_ns, offset_ns))
     unit = math.gcd(*chain.from_iterable(times)) or 1
     rares, pose, rows = _rares(taken), (0, 0, 0), []
-    for (inputs, outputs, left), ns, rare in zip(taken, times, rares, strict=True):
+    for (inputs, outputs, sent), ns, rare in zip(taken, times, rares, strict=True):
         now, offset, *reads = [n // unit for n in ns]
         poses = []
         for estimate in outputs.estimates:
-            there = micropose(estimate)
-            poses.append((there[0] - pose[0], there[1] - pose[1], there[2] - pose[2]))
-            pose = there
+            new = micropose(estimate)
+            poses.append((new[0] - pose[0], new[1] - pose[1], new[2] - pose[2]))
+            pose = new
         rows.append(
             Row(
                 tick=inputs.tick,
@@ -161,7 +169,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
                 offset=offset,
                 reads=tuple(map(Read, reads[::2], reads[1::2], [r.data for r in inputs.received])),
                 line=outputs.line,
-                left=False if left is None else (left == outputs.line or left),
+                sent=False if sent is None else (sent == outputs.line or sent),
                 poses=tuple(poses),
                 rare=None if rare == NOTHING else rare,
             )
@@ -171,7 +179,10 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
 
 
 def _times(taken: Sequence[Taken], mono_ns: int, offset_ns: int) -> Iterator[list[int]]:
-    """Yield the times of each step in ns: of itself, then of each of its reads."""
+    """Yield the `now` and `offset` of each row, then the `age` and `offset` of its reads, in ns.
+
+    `mono_ns` and `offset_ns` are those of the batch.
+    """
     tick_ns = mono_ns
     for inputs, _, _ in taken:
         now = inputs.now
@@ -210,19 +221,15 @@ def _rares(taken: Sequence[Taken]) -> Iterator[Rare]:
 
 
 def decode(data: bytes) -> list[Step]:
-    """Decode a batch.
-
-    Raises:
-        BatchError: the bytes are not a valid batch.
-    """
+    """Decode a batch; raise `BatchError` if it holds values that no daemon records."""
     try:
         return list(_steps(_decoder.decode(data)))
     except (msgspec.DecodeError, ValueError) as error:
-        raise BatchError(f"not a batch of steps: {error}") from None
+        raise BatchError(f"the batch of steps is damaged: {error}") from None
 
 
 def first_of(data: bytes) -> int | None:
-    """Return the number of the first step of a batch, or None for other bytes."""
+    """Return the number of the first step of a batch, or None if the bytes are damaged."""
     try:
         return _decoder_of_first.decode(data).number
     except msgspec.MsgspecError:
@@ -230,8 +237,8 @@ def first_of(data: bytes) -> int | None:
 
 
 def _steps(batch: Batch) -> Iterator[Step]:
-    standing = batch.rows[0].rare or NOTHING
-    opened, trouble, status = standing.opened, standing.trouble, standing.status
+    first = batch.rows[0].rare or NOTHING
+    opened, trouble, status = first.opened, first.trouble, first.status
     tick_ns, pose, last = batch.mono_ns, (0, 0, 0), len(batch.rows) - 1
     for index, row in enumerate(batch.rows):
         rare = row.rare or NOTHING
@@ -240,18 +247,18 @@ def _steps(batch: Batch) -> Iterator[Step]:
         trouble = trouble if rare.trouble is None else rare.trouble
         status = rare.status or status
         if opened is None or trouble is None or status is None:
-            raise ValueError("its first step lacks a field that every first step has")
+            raise ValueError("the first step lacks a value that every first step has")
         now = _instant(batch, tick_ns + row.now * batch.unit, row.offset)
         received = []
         for read in row.reads:
             age_ns = read.age * batch.unit
-            if abs(age_ns) >= LONGEST_NS:
-                raise ValueError("a time that no clock shows")
+            if abs(age_ns) >= MAX_TIME_NS:
+                raise ValueError("a time is out of range")
             at = _instant(batch, now.mono_ns - age_ns, read.offset)
             received.append(Received(at, read.data))
         poses = []
-        for step in row.poses:
-            pose = (pose[0] + step[0], pose[1] + step[1], pose[2] + step[2])
+        for delta in row.poses:
+            pose = (pose[0] + delta[0], pose[1] + delta[1], pose[2] + delta[2])
             poses.append(pose)
         inputs = Inputs(
             now=now,
@@ -271,9 +278,9 @@ def _steps(batch: Batch) -> Iterator[Step]:
             events=rare.events_in,
             leaving=row.leaving,
         )
-        said = Said(
+        recorded = RecordedOutputs(
             line=row.line,
-            left=_left(row),
+            sent=_sent(row),
             status=status,
             poses=tuple(poses),
             events=rare.events_out,
@@ -281,29 +288,29 @@ def _steps(batch: Batch) -> Iterator[Step]:
         )
         if row.tick:
             tick_ns = now.mono_ns
-        yield Step(batch.first + index, inputs, said, begins=index == 0)
+        yield Step(batch.first + index, inputs, recorded, begins=index == 0)
 
 
-def _left(row: Row) -> bytes | None:
-    if row.left is True:
+def _sent(row: Row) -> bytes | None:
+    if row.sent is True:
         return row.line
-    return None if row.left is False else row.left
+    return None if row.sent is False else row.sent
 
 
 def _instant(batch: Batch, mono_ns: int, offset: int) -> Instant:
-    """Return the instant; raise `ValueError` if no clock shows it."""
+    """Return the instant with an encoded `offset`; raise `ValueError` if it is out of range."""
     ahead_ns = batch.offset_ns + offset * batch.unit
-    if abs(mono_ns) >= 2 * LONGEST_NS or abs(ahead_ns) >= LATEST_NS:
-        raise ValueError("a time that no clock shows")
+    if abs(mono_ns) >= 2 * MAX_TIME_NS or abs(ahead_ns) >= MAX_OFFSET_NS:
+        raise ValueError("a time is out of range")
     return Instant(mono_ns, mono_ns + ahead_ns)
 
 
 def _require_finite(rare: Rare) -> None:
-    """Raise `ValueError` for a NaN or an infinity. The robot itself checks those of commands."""
+    """Raise `ValueError` for a NaN or an infinity. The robot itself checks the commands."""
     for request in rare.requests:
         pose = request.pose
         if pose is not None and not all(map(math.isfinite, (pose.x, pose.y, pose.yaw))):
-            raise ValueError("a pose that is not a number")
+            raise ValueError("a pose is not finite")
     for sample in rare.gyro:
         if not (math.isfinite(sample.rate) and math.isfinite(sample.variance)):
-            raise ValueError("a gyro sample that is not a number")
+            raise ValueError("a gyro sample is not finite")

@@ -1,8 +1,8 @@
 """Encodes a robot between two steps as bytes, and decodes it, for files that begin during a drive.
 
-`freeze` uses pickle, which copies a robot in a fraction of a millisecond. `thaw` uses
-`unpickling.py`, which makes only values and the robot's own parts, and refuses anything else that a
-forged file asks for.
+`freeze` uses pickle, which encodes a robot in a fraction of a millisecond. `thaw` does not use
+pickle, because a forged file could run code through it. It uses `unpickling.py`, which makes only
+plain values and the robot's own parts.
 """
 
 from __future__ import annotations
@@ -19,22 +19,25 @@ from acsard.core.guard import Memory
 from acsard.core.motion.modes import Mode
 from acsard.core.robot import Robot
 from acsard.core.values import AcsardError
-from acsard.recording.unpickling import unpickled
+from acsard.recording.unpickling import unpickle
 
-ROOMS = (
+PART_MODULES = (
     "acsard.core.values", "acsard.core.robot", "acsard.core.guard", "acsard.core.config.settings",
     "acsard.core.motion.", "acsard.core.link.",
 )  # fmt: skip
-"""Modules and packages that define the parts of a robot. Making an instance of such a class runs
-no code with effects elsewhere.
+"""Modules and packages (with a final dot) that define the parts of a robot.
+
+The constructors of their classes have no effects outside the new object.
 """
 
-BESIDE: dict[tuple[str, str], type] = {
+OTHER_PARTS: dict[tuple[str, str], type] = {
     ("collections", "Counter"): Counter,
     ("collections", "deque"): deque,
 }
+"""Classes of other modules that a robot contains."""
 
 PROTOCOL = 5
+"""Version of the pickle format that `unpickling.py` reads."""
 
 MOST_TEXT = 200
 """Largest number of characters of an error's text."""
@@ -42,21 +45,22 @@ MOST_TEXT = 200
 TABLE = copyreg.dispatch_table | {
     Mode: lambda mode: (Mode, (mode.value,)),
 }
-"""Extra reducers. Python 3.11 before 3.11.4, as in Debian 12, pickles enum members through
-`getattr`, which `unpickling.py` refuses.
+"""How pickle encodes a mode: as a call of `Mode` with its value.
+
+Python 3.11 before 3.11.4, as in Debian 12, would encode a call of `getattr`, which `unpickling.py`
+refuses.
 """
 
 
 class StateError(AcsardError):
-    """Bytes that do not hold a robot, or hold one that this version cannot make."""
+    """The bytes do not hold a robot, or this version cannot make that robot."""
 
 
 class State(NamedTuple):
-    """Everything besides the inputs that the next steps depend on."""
+    """A robot and its guard's memory. The next steps depend only on these and on their inputs."""
 
     robot: Robot
     memory: Memory
-    """Memory of the guard."""
 
 
 def freeze(robot: Robot, memory: Memory) -> bytes:
@@ -74,7 +78,7 @@ def thaw(data: bytes) -> State:
     Raises `StateError` if this version cannot make them.
     """
     try:
-        made = unpickled(data, part)
+        made = unpickle(data, part_class)
     except ValueError as error:
         text = f"this version cannot read the state at its start: {short(error)}"
         raise StateError(text) from None
@@ -85,20 +89,22 @@ def thaw(data: bytes) -> State:
 
 
 def short(error: Exception) -> str:
-    """Return the error's text, bounded and printable: it may quote a forged file."""
+    """Return the error's text, shortened and printable, because it may quote a forged file."""
     return printable(str(error))[:MOST_TEXT]
 
 
-def part(module: str, name: str) -> type:
-    """Return the class of a part of a robot.
+def part_class(module: str, name: str) -> type:
+    """Return the class `name` of a module that defines parts of a robot.
 
-    Raises `ValueError` for any other name. The class must have been defined in that module under
-    that name, and the module must be loaded already: nothing is imported. Re-exported names,
-    functions and attributes of attributes are refused.
+    The module must be loaded already, because this function imports nothing. The class must be
+    defined in that module under that name. Raises `ValueError` for every other name, such as a
+    function, a class that the module imports, or an attribute of an attribute.
     """
-    if (module, name) in BESIDE:
-        return BESIDE[module, name]
-    ours = module in ROOMS or any(r.endswith(".") and module.startswith(r) for r in ROOMS)
+    if (module, name) in OTHER_PARTS:
+        return OTHER_PARTS[module, name]
+    ours = module in PART_MODULES or any(
+        r.endswith(".") and module.startswith(r) for r in PART_MODULES
+    )
     found = vars(sys.modules[module]).get(name) if ours and module in sys.modules else None
     if not isinstance(found, type) or found.__module__ != module or found.__name__ != name:
         raise ValueError(f"{module:.50}.{name:.50} is not a part of a robot")

@@ -1,7 +1,7 @@
-"""Describes a recording as a timeline of sentences.
+"""Describes a recording as a timeline of short texts.
 
-Each event of the log is a sentence, and so is each drive: the time in mode `driving`, with its
-distance and its duration.
+The timeline has an entry for each event of the log, and one for each drive. A drive is a time in
+mode `driving`; its entry gives the distance and the duration.
 """
 
 from __future__ import annotations
@@ -20,65 +20,70 @@ from acsard.core.values import Event
 from acsard.recording.recorded_steps import MICRO, Step
 
 FURTHEST_S = 2**63 / 1e9
-"""Bound of a sentence's time, s from 1970: 292 years. No recording has a time beyond it."""
+"""Largest distance of an entry's time from 1970, s: 292 years. No recording has other times."""
 
 
 class TimelineEntry(Struct, frozen=True, omit_defaults=True):
-    """Sentence of the timeline; `seconds` is wall-clock time since 1970."""
+    """Entry of the timeline."""
 
     seconds: Annotated[float, Meta(ge=-FURTHEST_S, le=FURTHEST_S)]
+    """Wall-clock time, s since 1970."""
     name: str
     """Name of the event, or a name that only the timeline uses.
 
-    These are `link_late` for a `link_stale` that this computer caused, `link_heard` for a further
-    event about a link that is already lost, and `start`, `drive`, `gap` and `end`.
+    The names of the timeline are `link_late` for a `link_stale` that this computer caused,
+    `link_heard` for a further event about a link that is already lost, and `start`, `drive`, `gap`
+    and `end`.
     """
     text: str
     level: str = "info"
     by: str = ""
+    """The client that caused the event, or the source that commanded the drive."""
     count: int = 1
+    """Number of equal events that this entry stands for."""
 
 
-def told(event: Event, wall_ns: int) -> TimelineEntry:
-    """Return the sentence of an event at a wall-clock time in ns."""
+def entry_of(event: Event, wall_ns: int) -> TimelineEntry:
+    """Return the entry of an event that happened at a wall-clock time, ns since 1970."""
     late = event.name == "link_stale" and is_ours(event.text)
     name = "link_late" if late else event.name
     return TimelineEntry(wall_ns / 1e9, name, event.text, event.level, event.by, event.count)
 
 
-class Losses:
-    """Memory of the link's loss, to tell the first event about a loss from further ones."""
+class LinkLosses:
+    """Detects the further events about a link that is already lost."""
 
     def __init__(self) -> None:
-        self._told: set[str] = set()
-        """Names of the events since the link was last up."""
+        self._names: set[str] = set()
+        """Names of the events about the lost link since the link was last up."""
 
-    def again(self, name: str) -> bool:
-        """Return whether an event of this name has come since the link was last up."""
+    def repeated(self, name: str) -> bool:
+        """Take an event, and return whether it repeats one about the same loss of the link."""
         if name == "link_up":
-            self._told.clear()
+            self._names.clear()
         if name not in ("link_down", "link_booting", "link_stale", "link_late"):
             return False
-        before = name in self._told
-        self._told.add(name)
+        before = name in self._names
+        self._names.add(name)
         return before
 
 
 class TimelineWriter:
-    """Timeline of a recording. It takes the steps in order."""
+    """Makes the timeline of a recording from its steps."""
 
     def __init__(self) -> None:
         self._number: int | None = None
         self._pose: tuple[int, int, int] | None = None
         self._began_ns: int | None = None
         """Monotonic time at which the present drive began, ns; None between drives."""
-        self._way = 0.0
+        self._distance_m = 0.0
+        """Distance of the present drive."""
         self._source = ""
         self._leaving = False
-        self._losses = Losses()
+        self._losses = LinkLosses()
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
-        """Yield the sentences of a step."""
+        """Yield the entries of a step. The steps must come in order."""
         wall_s = step.inputs.now.wall_ns / 1e9
         if self._number is None and step.number == 0:
             yield TimelineEntry(wall_s, "start", "the daemon starts")
@@ -88,31 +93,33 @@ class TimelineWriter:
             yield TimelineEntry(wall_s, "gap", gap, "warning")
         self._number = step.number
         yield from self._drive(step, wall_s)
-        for event in step.said.events:
-            one = told(event, step.inputs.now.wall_ns)
-            yield replace(one, name="link_heard") if self._losses.again(one.name) else one
+        for event in step.recorded.events:
+            entry = entry_of(event, step.inputs.now.wall_ns)
+            repeated = self._losses.repeated(entry.name)
+            yield replace(entry, name="link_heard") if repeated else entry
         if step.inputs.leaving and not self._leaving:
             yield TimelineEntry(wall_s, "end", "the daemon received the request to end")
         self._leaving = step.inputs.leaving
 
     def _drive(self, step: Step, wall_s: float) -> Iterator[TimelineEntry]:
-        for pose in step.said.poses:
+        for pose in step.recorded.poses:
             if self._pose is not None and self._began_ns is not None:
-                self._way += math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1]) / MICRO
+                moved = math.hypot(pose[0] - self._pose[0], pose[1] - self._pose[1])
+                self._distance_m += moved / MICRO
             self._pose = pose
-        mode, _, _, source = step.said.status
+        mode, _, _, source = step.recorded.status
         now_ns = step.inputs.now.mono_ns
         if mode == "driving":
             if self._began_ns is None:
-                self._began_ns, self._way, self._source = now_ns, 0.0, source
+                self._began_ns, self._distance_m, self._source = now_ns, 0.0, source
         elif self._began_ns is not None:
             seconds = (now_ns - self._began_ns) / 1e9
-            text = f"drove {self._way:.2f} m in {seconds:.1f} s"
+            text = f"drove {self._distance_m:.2f} m in {seconds:.1f} s"
             yield TimelineEntry(wall_s, "drive", text, by=self._source)
             self._began_ns = None
 
 
-NEWS = {
+INCIDENTS = {
     "fault": "fault",
     "stop": "stop",
     "link_down": "lost port",
@@ -124,26 +131,29 @@ NEWS = {
     "wheel_fault": "wheel fault",
     "link_up": "",
 }
-"""Words for the events in a summary; "" for an event that only ends another one."""
+"""Words for the events in a summary.
+
+`link_up` has no words. It is in the table because it ends the loss of a link.
+"""
 
 
 def summary(events: Iterable[TimelineEntry], starts: bool = False) -> str:
-    """Summarize the events in a few words.
+    """Summarize the events of a recording in a few words.
 
-    The summary says whether the daemon starts, counts each kind of incident, and names the clients
-    that stopped the robot.
+    The summary counts each kind of incident and names the clients that stopped the robot. It begins
+    with "start" if `starts` is true, because the recording begins with the daemon's start.
     """
     counts: Counter[str] = Counter()
     stopped: list[str] = []
-    losses = Losses()
+    losses = LinkLosses()
     for event in events:
-        word = NEWS.get(event.name)
-        if losses.again(event.name) or not word:
+        word = INCIDENTS.get(event.name)
+        if losses.repeated(event.name) or not word:
             continue
         if event.name == "stop" and event.by and event.by not in stopped:
             stopped.append(event.by)
         counts[word] += event.count
-    said = ["start"] if starts else []
-    said += [many(count, word) for word, count in counts.items()]
-    text = ", ".join(said)
+    parts = ["start"] if starts else []
+    parts += [many(count, word) for word, count in counts.items()]
+    text = ", ".join(parts)
     return f"{text} (stopped by {', '.join(stopped)})" if stopped else text

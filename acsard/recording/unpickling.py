@@ -1,23 +1,24 @@
 """Rebuilds a pickled robot, and nothing else, even if a stranger wrote the bytes.
 
 A recording may come from a stranger, and Python's own unpickler obeys its bytes: it calls
-functions, imports modules, changes classes and nests without bound. This reader knows only the
-opcodes that a pickled robot consists of. It calls only constructors of plain data, and checks each
-part when it is made:
+functions, imports modules, changes classes, and nests objects without limit. This reader knows only
+the opcodes that a pickled robot consists of. It calls only constructors of plain data, and checks
+each part when it makes the part:
 
     a number, text, bytes    a number has at most 128 bits
-    a list, a tuple ...      depth and size are bounded; a part that occurs twice counts twice
+    a list, a tuple ...      depth and size are limited; a part that occurs twice counts twice
     a Struct                 each field has the type that the Struct declares
-    another part             made without a call of its code, then given attributes; none of them
-                             hides an attribute of its class
+    any other object         made without its constructor, then given attributes; no attribute
+                             hides an attribute of the class
 
-A list of allowed classes in `Unpickler.find_class` is not enough. With the list of `state`, nested
-tuples as keys, keys of one hash and copies of one dict ran past 3 s of processor time, a few bytes
-asked for more than 2 GB, and an attack changed the class of the robot for the whole process. The
-commands that read a recording are such processes, and not bounded children.
+A list of allowed classes in `Unpickler.find_class` is not enough. With the classes that `state.py`
+allows, forged bytes still did this: nested tuples as keys, keys with equal hashes, and copies of
+one dict each took more than 3 s of processor time. A few bytes allocated more than 2 GB. One attack
+changed the class of the robot for the whole process. The commands that read a recording have no
+limits of time or memory that would stop such an attack.
 
-A part that has been referred to cannot grow any more. Therefore, no part contains itself, and the
-depth and the size are exact.
+A part that the bytes have referred to cannot grow any more. Therefore no part contains itself, and
+the depth and the size are exact.
 """
 
 from __future__ import annotations
@@ -31,37 +32,40 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-MOST_BYTES = 1 << 20
-"""Largest size of a pickled robot. One takes 12 000 to 40 000 bytes, and a few times as much
+MAX_BYTES = 1 << 20
+"""Largest size of a pickled robot. A robot takes 12 000 to 40 000 bytes, or a few times as much
 with many command senders.
 """
 
-MOST_OPCODES = 1 << 17
+MAX_OPCODES = 1 << 17
 
-MOST_PARTS = 1 << 19
+MAX_PARTS = 1 << 19
 """Largest number of values in a robot. A value that occurs several times counts each time."""
 
-MOST_COPIED = 4 * MOST_PARTS
-"""Largest number of values copied while parts are made. A few bytes can ask for copies of the
-same part again and again.
+MAX_COPIED = 4 * MAX_PARTS
+"""Largest number of values that are copied while parts are made.
+
+Without this limit a few bytes could copy the same part again and again.
 """
 
-HASHED = 2**61 - 1
-"""Bound of the integers used as keys. Below it, Python gives each integer a hash of its own, so
-forged keys cannot collide.
+MAX_KEY = 2**61 - 1
+"""Integers used as keys are smaller than this number. Their hashes all differ, so forged keys
+cannot collide.
 """
 
-DEEPEST = 50
+MAX_DEPTH = 50
 """Largest nesting depth."""
 
-LONGEST = 128
-"""Largest number of bits of an integer. Sums over times in ns have more than 64."""
+MAX_INT_BITS = 128
+"""Largest number of bits of an integer. Sums of times in ns have more than 64 bits."""
 
-MOST_IN_KEY = 4
+MAX_KEY_PARTS = 4
+"""Largest number of elements of a tuple that is used as a key."""
 
-Find = Callable[[str, str], type]
-"""Function that returns the class of a module and a name. It raises `ValueError` for a class
-that a robot does not consist of.
+FindClass = Callable[[str, str], type]
+"""Function that returns a class from the names of its module and of itself.
+
+It raises `ValueError` for a class that is not a part of a robot.
 """
 
 ARGUMENTS = {
@@ -71,26 +75,31 @@ ARGUMENTS = {
 """Opcodes that push their argument."""
 
 VALUES = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+"""Opcodes that push a constant."""
 
 CONTAINERS: dict[str, type] = {"EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
+"""Opcodes that push a new, empty container."""
 
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+"""Opcodes that make a tuple of the top values, each with the number of these values."""
 
 SIMPLE = (str, int, float, bool, bytes, type(None))
+"""Types of the values that a key may consist of, besides enum members."""
 
 
-def unpickled(data: bytes, find: Find) -> object:
+def unpickle(data: bytes, find: FindClass) -> object:
     """Return the object that the bytes describe.
 
-    Raises `ValueError` with a reason if it is not a robot's.
+    `find` looks up the classes. Raises `ValueError` with the reason if the bytes are damaged or
+    contain anything that the state of a robot never contains.
     """
-    if len(data) > MOST_BYTES:
+    if len(data) > MAX_BYTES:
         raise ValueError(f"it has {len(data)} bytes, more than any robot")
     machine = _Machine(find)
     at = -1
     try:
         for count, (opcode, argument, place) in enumerate(pickletools.genops(data)):
-            if count >= MOST_OPCODES:
+            if count >= MAX_OPCODES:
                 raise ValueError("it has more parts than any robot")
             machine.do(opcode.name, argument)
             at = place or 0
@@ -102,7 +111,7 @@ def unpickled(data: bytes, find: Find) -> object:
 
 
 class _Entry:
-    """A value on the stack, with its depth and its size."""
+    """A value on the stack, with its nesting depth and its number of parts."""
 
     __slots__ = ("closed", "depth", "size", "value")
 
@@ -111,12 +120,12 @@ class _Entry:
         self.depth = 0
         self.size = 1
         self.closed = False
-        """True once the value has been referred to. It cannot grow any more."""
+        """True once an opcode has referred to the value. Then it cannot grow any more."""
 
     def holds(self, parts: Sequence[_Entry]) -> None:
-        """Add the depth and size of new parts to the container.
+        """Add the depth and the size of new parts to those of this container.
 
-        Raises `ValueError` if a bound is exceeded.
+        Raises `ValueError` if a limit is exceeded.
         """
         if self.closed:
             raise ValueError("a part of it contains itself, or grows while it is built")
@@ -125,21 +134,24 @@ class _Entry:
                 raise ValueError("it has a class where a value should be")
             self.depth = max(self.depth, 1 + part.depth)
             self.size += part.size
-        if self.depth > DEEPEST:
-            raise ValueError(f"its parts are nested deeper than {DEEPEST}")
-        if self.size > MOST_PARTS:
+        if self.depth > MAX_DEPTH:
+            raise ValueError(f"its parts are nested deeper than {MAX_DEPTH}")
+        if self.size > MAX_PARTS:
             raise ValueError("it has more parts than any robot")
 
 
 class _Machine:
-    """Pickle's virtual machine: the stack, its marks, and the memo."""
+    """The stack machine that executes the opcodes of a pickle."""
 
-    def __init__(self, find: Find) -> None:
+    def __init__(self, find: FindClass) -> None:
         self._find = find
         self._stack: list[_Entry] = []
         self._marks: list[int] = []
+        """Heights of the stack at the `MARK` opcodes."""
         self._memo: list[_Entry] = []
+        """Values that later opcodes may refer to."""
         self._copied = 0
+        """Number of values copied so far."""
 
     def result(self) -> object:
         """Return the only value that is left on the stack."""
@@ -148,9 +160,12 @@ class _Machine:
         return self._stack[0].value
 
     def do(self, name: str, argument: Any) -> None:
-        """Execute one opcode; raise `ValueError`, or an exception that its operands cause."""
+        """Execute the opcode `name` with its argument from the bytes.
+
+        Raises `ValueError` for a forbidden opcode, or the exception that damaged operands cause.
+        """
         if name in ARGUMENTS:
-            if type(argument) is int and argument.bit_length() > LONGEST:
+            if type(argument) is int and argument.bit_length() > MAX_INT_BITS:
                 raise ValueError(f"it has a number of {argument.bit_length()} bits")
             self._push(argument)
         elif name in VALUES:
@@ -159,8 +174,8 @@ class _Machine:
             self._push(CONTAINERS[name]())
         elif name in TUPLES:
             self._push_of(tuple, self._top(TUPLES[name]))
-        elif name in DOES:
-            DOES[name](self)
+        elif name in OPCODES:
+            OPCODES[name](self)
         elif name in ("BINGET", "LONG_BINGET"):
             entry = self._memo[argument]
             entry.closed = True
@@ -174,7 +189,7 @@ class _Machine:
         return entry
 
     def _push_of(self, kind: type, parts: list[_Entry]) -> None:
-        """Push a container that is made at once."""
+        """Push a tuple or a frozenset, which cannot be made empty and filled later."""
         entry = _Entry(None)
         entry.holds(parts)
         entry.value = kind([part.value for part in parts])
@@ -196,15 +211,15 @@ class _Machine:
         return taken
 
     def _copies(self, entry: _Entry) -> None:
-        """Count the values that are copied to make a part."""
+        """Count the values of `entry`, which are copied to make a part."""
         self._copied += entry.size
-        if self._copied > MOST_COPIED:
+        if self._copied > MAX_COPIED:
             raise ValueError("it has more parts than any robot")
 
-    # The opcodes
+    # Each method below executes the opcodes that `OPCODES` assigns to it.
 
     def proceed(self) -> None:
-        """Ignore an opcode that does not touch values."""
+        """Ignore an opcode that does not change the stack."""
 
     def mark(self) -> None:
         self._marks.append(len(self._stack))
@@ -212,10 +227,10 @@ class _Machine:
     def memoize(self) -> None:
         self._memo.append(self._stack[-1])
 
-    def many(self) -> None:
+    def make_tuple(self) -> None:
         self._push_of(tuple, self._marked())
 
-    def frozen(self) -> None:
+    def make_frozenset(self) -> None:
         parts = self._marked()
         _keys(parts)
         self._push_of(frozenset, parts)
@@ -233,10 +248,10 @@ class _Machine:
         whole.holds(parts)
         whole.value.extend([part.value for part in parts])
 
-    def item(self) -> None:
+    def set_item(self) -> None:
         self._update(self._top(2))
 
-    def items(self) -> None:
+    def set_items(self) -> None:
         self._update(self._marked())
 
     def _update(self, parts: list[_Entry]) -> None:
@@ -245,9 +260,10 @@ class _Machine:
             raise TypeError("it sets keys of an object that is not a dict")
         _keys(keys)
         whole.holds(parts)
-        whole.value.update({key.value: one.value for key, one in zip(keys, values, strict=True)})
+        pairs = zip(keys, values, strict=True)
+        whole.value.update({key.value: value.value for key, value in pairs})
 
-    def added(self) -> None:
+    def add_items(self) -> None:
         parts = self._marked()
         whole = self._stack[-1]
         if not isinstance(whole.value, set):
@@ -256,14 +272,14 @@ class _Machine:
         whole.holds(parts)
         whole.value.update([part.value for part in parts])
 
-    def found(self) -> None:
+    def find_class(self) -> None:
         module, name = [entry.value for entry in self._top(2)]
         if not isinstance(module, str) or not isinstance(name, str):
             raise TypeError("the name of a class is not a text")
         self._push(self._find(module, name))
 
-    def reduced(self) -> None:
-        """Make a value of a class from constructor arguments."""
+    def construct(self) -> None:
+        """Make an object of a class from the arguments of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or not isinstance(given.value, tuple):
             raise TypeError("it calls an object that is not a class")
@@ -273,8 +289,8 @@ class _Machine:
         entry.value = _made(kind.value, given.value)
         self._stack.append(entry)
 
-    def bare(self) -> None:
-        """Make a part without attributes, and without a call of its constructor."""
+    def make_bare(self) -> None:
+        """Make an object without attributes, and without a call of its constructor."""
         kind, given = self._top(2)
         if not isinstance(kind.value, type) or given.value != ():
             raise TypeError(
@@ -284,8 +300,8 @@ class _Machine:
             raise ValueError(f"{kind.value.__name__} cannot be constructed without values")
         self._push(object.__new__(kind.value))
 
-    def built(self) -> None:
-        """Set the attributes of a part."""
+    def set_attributes(self) -> None:
+        """Set the attributes of an object that `make_bare` made."""
         (state,) = self._top(1)
         whole, named = self._stack[-1], state.value
         if not _is_part(type(whole.value)) or not isinstance(named, dict):
@@ -300,47 +316,51 @@ class _Machine:
         vars(whole.value).update(named)
 
 
-DOES: dict[str, Callable[[_Machine], None]] = {
+OPCODES: dict[str, Callable[[_Machine], None]] = {
     "PROTO": _Machine.proceed,
     "FRAME": _Machine.proceed,
     "STOP": _Machine.proceed,
     "MARK": _Machine.mark,
     "MEMOIZE": _Machine.memoize,
-    "TUPLE": _Machine.many,
-    "FROZENSET": _Machine.frozen,
+    "TUPLE": _Machine.make_tuple,
+    "FROZENSET": _Machine.make_frozenset,
     "APPEND": _Machine.append,
     "APPENDS": _Machine.appends,
-    "SETITEM": _Machine.item,
-    "SETITEMS": _Machine.items,
-    "ADDITEMS": _Machine.added,
-    "STACK_GLOBAL": _Machine.found,
-    "REDUCE": _Machine.reduced,
-    "NEWOBJ": _Machine.bare,
-    "BUILD": _Machine.built,
+    "SETITEM": _Machine.set_item,
+    "SETITEMS": _Machine.set_items,
+    "ADDITEMS": _Machine.add_items,
+    "STACK_GLOBAL": _Machine.find_class,
+    "REDUCE": _Machine.construct,
+    "NEWOBJ": _Machine.make_bare,
+    "BUILD": _Machine.set_attributes,
 }
+"""The methods that execute opcodes. `_Machine.do` handles the opcodes of the other tables."""
 
 
 def _keys(entries: Sequence[_Entry]) -> None:
-    """Refuse keys that are slow to hash, or cannot be hashed."""
+    """Raise `ValueError` for keys that are slow to hash, or cannot be hashed."""
     for entry in entries:
         value = entry.value
-        parts = value if type(value) is tuple and len(value) <= MOST_IN_KEY else (value,)
+        parts = value if type(value) is tuple and len(value) <= MAX_KEY_PARTS else (value,)
         if not all(type(part) in SIMPLE or isinstance(part, Enum) for part in parts):
             raise ValueError(f"it uses a {type(value).__name__} as a key")
-        if any(type(part) is int and abs(part) >= HASHED for part in parts):
+        if any(type(part) is int and abs(part) >= MAX_KEY for part in parts):
             raise ValueError("it uses a number of more than 60 bits as a key")
 
 
 def _is_part(kind: Any) -> bool:
-    """Return whether an instance is its attributes alone, and is made without code of its class."""
+    """Return whether objects of a class have only attributes, and need no code of the class.
+
+    Such an object can be made without its constructor.
+    """
     plain = kind.__new__ is object.__new__ and kind.__reduce_ex__ is object.__reduce_ex__
     return plain and kind.__module__ != "builtins" and not hasattr(kind, "__setstate__")
 
 
 def _made(kind: type, given: tuple[Any, ...]) -> object:
-    """Make a value of this class.
+    """Make an object of a class from the arguments of its constructor.
 
-    Raises `ValueError` or `TypeError` if the arguments do not suit it.
+    Raises `ValueError` or `TypeError` if the arguments do not suit the class.
     """
     match given:
         case (dict(),) if kind is Counter:
@@ -351,6 +371,7 @@ def _made(kind: type, given: tuple[Any, ...]) -> object:
             return kind(value)
         case _ if issubclass(kind, Struct):
             made = kind(*given)
+            # A constructor of a Struct does not check the types of its arguments. `convert` does.
             msgspec.convert({name: getattr(made, name) for name in kind.__struct_fields__}, kind)
             return made
     raise ValueError(f"{kind.__name__} cannot be constructed from these values")

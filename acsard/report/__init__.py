@@ -1,6 +1,6 @@
 """`acsard recording report`: turns a recording into the text of one HTML file.
 
-All modules here are pure.
+All modules here are pure, except `page.drawn`, which replays the recording.
 
 `course` processes the steps one by one and keeps the data to draw, limited as it arrives
 (`acsard.core.thinning`), so a day takes no more memory than a minute. `command_sources` keeps the

@@ -107,7 +107,7 @@ class CommandSources:
             self.bands[name].add(t, does, words)
 
     def _do(self, step: Step, t: float, robot: Robot) -> Iterator[tuple[str, str, str]]:
-        mode, reason, _, holder = step.said.status
+        mode, reason, _, holder = step.recorded.status
         for one in robot.snapshot(step.inputs.now.mono_ns).sources:
             lately, wait = self._lately(one.name, t), one.waits_for
             if mode == "driving" and one.name == holder:

@@ -305,11 +305,11 @@ class Course:
     # Distance and speeds.
 
     def _drive(self, step: Step, t: float, counts: bool) -> None:
-        mode, _, _, source = step.said.status
+        mode, _, _, source = step.recorded.status
         by = self._driven(source) if mode == "driving" and counts else None
         if by is not None and t > self.seconds:
             by.seconds += t - self.seconds
-        for x, y, yaw in step.said.poses:
+        for x, y, yaw in step.recorded.poses:
             place = Place(t, x / MICRO, y / MICRO, yaw / MICRO, self._jumps)
             if self._place is not None and not self._jumps and counts:
                 way = math.hypot(place.x - self._place.x, place.y - self._place.y)
@@ -334,9 +334,9 @@ class Course:
             self._asked(curve["limited"], step, t, getattr(outputs.applied, axis))
         for wheel, speed in zip(self.asked, outputs.speeds.as_tuple(), strict=True):
             self._asked(wheel, step, t, speed)
-        if step.said.left is not None:
+        if step.recorded.sent is not None:
             self._left = t
-        if step.said.status[2] != "up":
+        if step.recorded.status[2] != "up":
             for one in (self.linear["measured"], self.angular["measured"], *self.turned):
                 one.add(t, None)
         for estimate in outputs.estimates:
@@ -354,7 +354,7 @@ class Course:
 
         A sent line is valid until the microcontroller's watchdog expires.
         """
-        if step.said.left is not None:
+        if step.recorded.sent is not None:
             curve.add(t, speed)
         elif t - self._left > WATCHDOG_S:
             curve.add(t, None)
@@ -362,7 +362,7 @@ class Course:
     # Serial line and modes.
 
     def _line(self, step: Step, outputs: Outputs, robot: Robot, t: float, known: bool) -> None:
-        inputs, left = step.inputs, step.said.left is not None
+        inputs, left = step.inputs, step.recorded.sent is not None
         session = robot.session
         rejected = {f"line_{reason}": count for reason, count in session.rejects.items()}
         impossible = {"line_implausible": robot.counters["line_implausible"]}
@@ -373,7 +373,7 @@ class Course:
             self.lateness.at_once()
 
     def _look(self, step: Step, t: float, robot: Robot, refused: bool) -> None:
-        mode, reason, link, _ = status = step.said.status
+        mode, reason, link, _ = status = step.recorded.status
         if status == self._status and t - self._looked < LOOK_S and not refused:
             return
         self._status, self._looked = status, t

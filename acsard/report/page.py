@@ -10,11 +10,19 @@ from __future__ import annotations
 import binascii
 import hashlib
 import html
+import time
+from collections import deque
 from collections.abc import Sequence
 
 import msgspec
 
 from acsard.core.formatting import lasting, printable
+from acsard.core.values import NS_PER_S
+from acsard.host.errors import RecordingError
+from acsard.recording.file import Recording
+from acsard.recording.file_replay import PROGRESS_STEPS, DisplayReplay, Progress, no_progress
+from acsard.recording.replay_text import verdict
+from acsard.recording.time_span import WHOLE, Span, clock
 from acsard.report.account import Clock, Origin, differences, notes, reasons, rows, summary
 from acsard.report.course import Course
 from acsard.report.drawing import Figure
@@ -155,6 +163,42 @@ def page(course: Course, origin: Origin, library: str, clock: Clock, offset_s: f
             "</body></html>\n",
         ]
     )
+
+
+def drawn(
+    recording: Recording, library: str, span: Span = WHOLE, progress: Progress = no_progress
+) -> tuple[str, list[str]]:
+    """Replay a part of a recording; return the text of the file and notes about the recording.
+
+    `progress` is called with the wall-clock time reached, in ns. Raises `RecordingError` if nothing
+    was recorded in that time.
+    """
+    about, looked = recording.about, DisplayReplay(recording)
+    began = about.wall_ns / NS_PER_S
+    course = Course(looked.config, began + span.begin, began + span.end)
+    for number, (step, outputs, robot) in enumerate(looked.steps()):
+        if number % PROGRESS_STEPS == 0:
+            progress(step.inputs.now.wall_ns)
+        course.step(step, outputs, robot)
+        if course.over:
+            # Read the rest, so that the notes count every damaged place.
+            deque(recording.messages(), maxlen=0)
+            break
+    if course.began is None:
+        raise RecordingError(
+            f"{recording.path} has no step in that span of time, so there is nothing to draw"
+        )
+    course.end()
+    said = [*filter(None, [recording.missing]), *looked.notes]
+    comparison = looked.replay.comparison
+    if not (comparison.same or looked.notes or course.missing):
+        said.append(
+            "this version of acsard computes other results than the recorded ones: "
+            f"{verdict(comparison)}"
+        )
+    origin = Origin(recording.path.name, about.robot, about.version, about.python, tuple(said))
+    offset_s = time.localtime(course.began).tm_gmtoff
+    return page(course, origin, library, clock, offset_s), notes(course, origin)
 
 
 def _hash(program: str) -> str:

@@ -20,8 +20,8 @@ SPAN_S = 1.0
 class Feed:
     """The received states of a robot."""
 
-    def __init__(self, robot: Client, endpoint: str, robot_id: str) -> None:
-        self._robot, self._endpoint, self._id = robot, endpoint, robot_id
+    def __init__(self, robot: Client) -> None:
+        self._robot = robot
         # The first query also fails with the usual message if no daemon answers.
         self._info = self._ask_info()
         self._watch = Watch(robot, time.monotonic())
@@ -64,8 +64,8 @@ class Feed:
         """Return the data for the screen; `hint` is shown in the header."""
         now, watch, past = time.monotonic(), self._watch, self._past
         return ScreenData(
-            self._id,
-            self._endpoint,
+            self._robot.where.robot_id,
+            self._robot.where.endpoint,
             watch.state,
             past[0][1] if past else None,
             watch.age(now),

@@ -23,6 +23,12 @@ MOST = 1000
 """Maximum number of robots. The bound is needed because any client of the bus can invent robot
 names."""
 
+GATHER_S = 1.5
+"""Time within which every robot that is present has answered, s."""
+
+NOBODY_S = 3.0
+"""Time after which no robot is there, s. On a busy computer the first answer arrives late."""
+
 
 class _Known:
     """The known facts of one robot."""
@@ -41,8 +47,8 @@ class _Known:
 class Fleet:
     """Follows the robots with these ids, or all robots. The callbacks run on Zenoh's threads."""
 
-    def __init__(self, robot: Client, ids: Sequence[str], endpoint: str) -> None:
-        self._robot, self._ids, self._endpoint = robot, ids, endpoint
+    def __init__(self, robot: Client, ids: Sequence[str]) -> None:
+        self._robot, self._ids, self._endpoint = robot, ids, robot.where.endpoint
         self._lock = Lock()
         self._left_out = False
         self._known = {one: _Known() for one in ids if one != ALL}
@@ -78,6 +84,17 @@ class Fleet:
                 state = None  # wait for the robot's own answer
             rows.append(Row(name, one.here, state, age, one.version, silent))
         return rows
+
+    def gather(self) -> list[Row]:
+        """Wait until every robot that is present has answered; return no rows if none is there."""
+        began, rows = time.monotonic(), self.rows()
+        while not self.whole:
+            present = any(row.here or row.state for row in rows)
+            if time.monotonic() - began >= (GATHER_S if present else NOBODY_S):
+                return self.rows() if present else []
+            time.sleep(0.05)
+            rows = self.rows()
+        return self.rows()
 
     @property
     def whole(self) -> bool:

@@ -65,9 +65,8 @@ class Keyboard:
 class Ride:
     """The connection between the keys and the robot: sends commands and follows `state`."""
 
-    def __init__(self, robot: Client, keyboard: Keyboard, robot_id: str, endpoint: str) -> None:
+    def __init__(self, robot: Client, keyboard: Keyboard) -> None:
         self._robot, self._keyboard = robot, keyboard
-        self._names = robot_id, endpoint
         # After a silence the robot may require a return to neutral, for example because it was
         # stopped and cleared meanwhile.
         self._commander = Commander(leads=True)
@@ -107,7 +106,8 @@ class Ride:
         if watch.state is not None and now - self._fine > GRACE_S:
             why = objection(watch.state, robot.source, robot.sender)
         return Teleop(
-            *self._names,
+            robot.where.robot_id,
+            robot.where.endpoint,
             robot.source,
             self._keyboard.linear,
             self._keyboard.angular,

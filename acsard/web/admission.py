@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from acsard.host import clock
 from acsard.host.rate_limits import Buckets
 from acsard.host.threads import in_thread
+from acsard.web.acceptor import Acceptor
 from acsard.web.answers import READ_S, STATUS, TroubleError, problem, secured
 from acsard.web.callers import (
     MAINTAINER,
@@ -25,6 +26,7 @@ from acsard.web.callers import (
     Reason,
     RefusedError,
     Who,
+    network_of,
     place,
     require_own_origin,
     tokens_in,
@@ -32,7 +34,6 @@ from acsard.web.callers import (
 )
 from acsard.web.counts import Counts
 from acsard.web.frames import MAX_BYTES
-from acsard.web.gate import Gate
 from acsard.web.limits import GUESSES, GUESSES_OF_ONE, REQUESTS
 from acsard.web.routes import Route
 from acsard.web.tokens import Vault
@@ -63,7 +64,7 @@ class Admission:
     """Finds the row of each request, and refuses the request or hands it to the row's handler."""
 
     def __init__(
-        self, robot: str, names: frozenset[str], vault: Vault, gate: Gate, counts: Counts
+        self, robot: str, names: frozenset[str], vault: Vault, acceptor: Acceptor, counts: Counts
     ) -> None:
         """Store how clients are known.
 
@@ -71,7 +72,7 @@ class Admission:
         robot.
         """
         self._robot, self._names, self._vault = robot, names, vault
-        self._gate, self._counts = gate, counts
+        self._acceptor, self._counts = acceptor, counts
         self._guesses, self._paces = Buckets(GUESSES_OF_ONE, GUESSES), Buckets(REQUESTS)
         self._rows: dict[web.AbstractRoute, Route] = {}
 
@@ -99,7 +100,7 @@ class Admission:
         # guesses lock nobody out.
         if who is not None:
             return replace(who, address=peer)
-        if not self._guesses.take(peer, clock.mono_ns()):
+        if not self._guesses.take(network_of(peer), clock.mono_ns()):
             raise RefusedError("too_fast", "too many wrong tokens: wait a minute")
         raise RefusedError(
             "bad_token",
@@ -108,7 +109,7 @@ class Admission:
 
     @web.middleware
     async def _serve(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._gate.spoke(request.transport)
+        self._acceptor.spoke(request.transport)
         try:
             await self._admit(request, self._rows.get(request.match_info.route))
             return await handler(request)
@@ -146,6 +147,7 @@ class Admission:
         if not here:
             who = await self.owner(said.peer, tokens_shown(request, self._robot))
         request[WHO] = who
+        self._acceptor.admitted(request.transport, who)
         # Clients on the robot itself have no token and no rate limit.
         paced = who.token and (row is None or row.paced)
         if paced and not self._paces.take(who.token, clock.mono_ns()):

@@ -25,6 +25,7 @@ from acsard.core.values import Role
 from acsard.host.errors import MendableError, NoAnswerError
 from acsard.host.threads import in_thread
 from acsard.web import metrics, openapi
+from acsard.web.acceptor import Acceptor
 from acsard.web.admission import WHO, Admission, own_port, peer_of
 from acsard.web.answers import READ_S, TroubleError, reply, sent, takes_gzip
 from acsard.web.callers import RefusedError, cookie_name
@@ -34,7 +35,6 @@ from acsard.web.counts import Counts
 from acsard.web.files import PAGE, Files
 from acsard.web.fleet import Fleet
 from acsard.web.frames import MAX_BYTES, Begin
-from acsard.web.gate import Gate
 from acsard.web.guide import Choices, Guide
 from acsard.web.limits import Seats
 from acsard.web.recordings import BlackBox, Recording
@@ -85,7 +85,7 @@ class Page:
         counts: Counts,
         vault: Vault,
         names: frozenset[str],
-        gate: Gate,
+        acceptor: Acceptor,
         guide: Guide,
         page: Path = PAGE,
     ) -> None:
@@ -95,7 +95,7 @@ class Page:
         self._files, self._box, self._reports = Files(page), BlackBox(robots), Reports()
         self._seats = Seats()
         self._viewers: set[Viewer] = set()
-        self._admission = Admission(robots.id, names, vault, gate, counts)
+        self._admission = Admission(robots.id, names, vault, acceptor, counts)
         self.app = self._admission.application(ROUTES, self)
 
     def end_all(self, why: str) -> None:

@@ -164,6 +164,19 @@ def unmapped(address: str) -> str:
     return address.removeprefix("::ffff:") if "." in address else address
 
 
+def network_of(address: str) -> str:
+    """Return the name under which an address is counted: an IPv6 address by its /64 network.
+
+    One machine may use any number of addresses of its /64 network.
+    """
+    if ":" not in address:
+        return address
+    try:
+        return str(ipaddress.ip_network((address.partition("%")[0], 64), strict=False))
+    except ValueError:
+        return address
+
+
 def is_loopback(text: str) -> bool:
     """Return whether the text is a loopback IP address; a host name never is."""
     try:

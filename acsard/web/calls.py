@@ -1,12 +1,13 @@
 """Service calls and queries to the robot.
 
 Each one blocks a thread of its own and their number is limited, so a stop never waits behind them.
+The stops of one client to one robot are merged: each is answered by one that was sent after it.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Hashable, Mapping
 from typing import Any, NamedTuple, TypeVar
 
 from acsard.client import Client
@@ -16,10 +17,12 @@ from acsard.core.messages.schema import ServiceReply
 from acsard.core.messages.topics import SERVICES
 from acsard.daemon.bus import robot_discovery
 from acsard.daemon.bus.address import require_id
+from acsard.host import clock
 from acsard.host.errors import MendableError, UsageError
-from acsard.host.rate_limits import Places
+from acsard.host.rate_limits import Buckets, Places
 from acsard.host.threads import in_thread
 from acsard.web.callers import RefusedError, Who
+from acsard.web.limits import STOPS_ELSEWHERE
 from acsard.web.robots import Robots
 
 AT_ONCE, STOPS_AT_ONCE = 16, 32
@@ -30,6 +33,13 @@ ELSEWHERE_AT_ONCE = 8
 """Limit on concurrent stops of other robots that wait for an answer. A stop beyond the limit is
 still sent to its robot, but without waiting for the answer."""
 
+MERGE_S = 0.02
+"""Shortest interval between two stops of one client to one robot. A stop within it is sent at its
+end, together with all others of that interval."""
+
+ANSWERED = 200
+"""Maximum number of other robots of which it is known that they answer a stop."""
+
 ANSWER_S = 8.0
 """Longer than a client waits for its answer, so the client's own error message is what the caller
 gets."""
@@ -37,6 +47,9 @@ gets."""
 BUSY = "busy: too many queries at once; ask again"
 
 T = TypeVar("T")
+
+Stop = Callable[[], Awaitable[ServiceReply]]
+"""Sends a stop and returns the reply."""
 
 
 class Ending(NamedTuple):
@@ -58,7 +71,10 @@ class Calls:
     def __init__(self, robots: Robots, ends: Callable[[], Awaitable[Ending]] = _nothing) -> None:
         """Store the robots, and `ends`, which ends the server's check or calibration."""
         self._robots, self._ends = robots, ends
-        self._stops = Stops()
+        self._stops, self._merged = Stops(), Merged()
+        self._unknown = Buckets(STOPS_ELSEWHERE)
+        self._answered: set[str] = set()
+        """The other robots that have answered a stop, so they exist."""
         self._asks = Places(AT_ONCE, AT_ONCE)
         self._elsewhere = Places(ELSEWHERE_AT_ONCE, ELSEWHERE_AT_ONCE)
 
@@ -93,11 +109,18 @@ class Calls:
         def request() -> ServiceReply:
             return _named(client, other or self._robots.id, who).request(verb, payload)
 
-        try:
+        async def stop() -> ServiceReply:
             if other:
-                reply = await self._stop(other, client, who, request)
+                return await self._stop(other, client, who, request)
+            return await self._stops.ask(request)
+
+        if verb == "stop" and other and other not in self._answered:
+            self._require_few(who)
+        try:
+            if verb == "stop":
+                reply = await self._merged.ask((who.token, other), stop)
             else:
-                reply = await (self._stops.ask(request) if verb == "stop" else self._ask(request))
+                reply = await self._ask(request)
         except (MendableError, DecodeError, TimeoutError) as error:
             return ServiceReply(False, str(error) or "no answer in time")
         if verb == "set" and reply.success:
@@ -123,7 +146,10 @@ class Calls:
         """
         with self._elsewhere.held() as free:
             if free:
-                return await in_thread(request, ANSWER_S)
+                reply = await in_thread(request, ANSWER_S)
+                if len(self._answered) < ANSWERED:
+                    self._answered.add(robot)
+                return reply
         await in_thread(
             lambda: robot_discovery.stop(
                 client.session, [robot], _named(client, robot, who).caller
@@ -132,11 +158,58 @@ class Calls:
         )
         return ServiceReply(False, f"{robot} was told to stop; check that it did: {BUSY}")
 
+    def _require_few(self, who: Who) -> None:
+        """Raise `RefusedError` if the client stops too many robots that may not exist."""
+        if not self._unknown.take(who.token or who.name, clock.mono_ns()):
+            rate = STOPS_ELSEWHERE
+            raise RefusedError(
+                "too_fast",
+                f"not sent: more than {rate.most:g} stops at once, or {rate.hz:g} a second, to "
+                "robots that have not answered yet; ask again",
+            )
+
     async def _ask(self, call: Callable[[], T]) -> T:
         with self._asks.held() as free:
             if not free:
                 raise MendableError(BUSY)
             return await in_thread(call, ANSWER_S)
+
+
+class Merged:
+    """The stops of each client to each robot, at most one every `MERGE_S`.
+
+    No stop is lost. The stops within that time share one that is sent at its end.
+    """
+
+    def __init__(self) -> None:
+        self._rests: dict[Hashable, asyncio.Event] = {}
+        """The names of which a stop was sent within the last `MERGE_S`. The event is its end."""
+        self._next: dict[Hashable, asyncio.Task[ServiceReply]] = {}
+        """The stop of each name that waits for that end."""
+
+    async def ask(self, name: Hashable, stop: Stop) -> ServiceReply:
+        """Return the reply to a stop that is sent after this call began.
+
+        `name` stands for the client and the robot.
+        """
+        if name in self._next:
+            return await asyncio.shield(self._next[name])
+        if name not in self._rests:
+            self._rest(name)
+            return await stop()
+        task = self._next[name] = asyncio.create_task(self._later(name, stop))
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
+        return await asyncio.shield(task)
+
+    def _rest(self, name: Hashable) -> None:
+        self._rests[name] = asyncio.Event()
+        asyncio.get_running_loop().call_later(MERGE_S, lambda: self._rests.pop(name).set())
+
+    async def _later(self, name: Hashable, stop: Stop) -> ServiceReply:
+        await self._rests[name].wait()
+        del self._next[name]  # later callers share the next stop
+        self._rest(name)
+        return await stop()
 
 
 class Stops:

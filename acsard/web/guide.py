@@ -1,6 +1,6 @@
 """Runs a board check or a calibration for a browser, as a child process of the same command.
 
-Only one runs at a time. The child's lines (`--json-lines`, see prompts/json_prompt.py) go to the
+Only one runs at a time. The child's lines (`--json-lines`, see terminal/json_prompt.py) go to the
 connection that started it, and only that connection may send answers and key presses. If the
 connection ends, the child is interrupted as by Ctrl-C, so it still sends its zeros to the board.
 The child also watches its standard input and does not outlive this server. Nothing is queued: a
@@ -23,8 +23,8 @@ from acsard.host import clock
 from acsard.host.child import acsard, running
 from acsard.host.errors import WORDS, Exit
 from acsard.host.rate_limits import Bucket, Rate
-from acsard.host.serial_ports import serial_devices
 from acsard.host.threads import in_thread
+from acsard.machine.serial_ports import serial_devices
 from acsard.web.calls import Ending
 from acsard.web.frames import Begin, FrameError, Press, Reply
 from acsard.web.jobs import Reach, words

@@ -1,15 +1,31 @@
 """The limits of the page per client. This module is pure.
 
-The rates are those of messages, requests and wrong tokens. The places are those of connections and
-subscriptions.
+The rates are those of messages, requests and wrong tokens. The places are those of TCP connections,
+WebSockets and subscriptions.
 """
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Hashable
+from typing import Generic, TypeVar
 
 from acsard.host.rate_limits import Places, Rate
+
+SOCKETS, SOCKETS_HERE = 256, 96
+"""Maximum number of TCP connections from other machines, and from the robot itself. A browser opens
+six in addition to its WebSocket."""
+
+SOCKETS_OF_ONE, SOCKETS_OF_TOKEN = 64, 64
+"""Maximum number of TCP connections without a valid token from one network, and of connections that
+one token keeps from being displaced."""
+
+SOCKETS_LEAST = 16
+"""Connections from other machines that are accepted even if the limit of open files is very low."""
+
+OWN_FILES = 128
+"""Files of the process beside those of its connections: it has 30 open when nobody is connected. A
+report and a calibration need more for a while."""
 
 OVERRUNS = 600
 """Number of messages beyond the rate limit that ends a connection."""
@@ -38,8 +54,98 @@ MESSAGES = Rate(200.0, 400.0)
 """Limit on messages per WebSocket. The burst allowance covers the messages a client sends when its
 network returns."""
 
+STOPS_ELSEWHERE = Rate(4.0, 16.0)
+"""Limit on the stops of one token to other robots that have never answered a stop here. They may
+not exist. A robot that has answered one is stopped whenever a client asks."""
+
 GUESSES_OF_ONE, GUESSES = Rate(10 / 60, 10.0), Rate(100 / 60, 100.0)
 """Limits on wrong tokens: from one address, and in all."""
+
+
+C = TypeVar("C", bound=Hashable)
+
+
+def sockets_for(files: int) -> int:
+    """Return the maximum number of connections from other machines for a limit of open files.
+
+    A connection needs two files while it fetches a recording.
+    """
+    return max(SOCKETS_LEAST, min(SOCKETS, (files - OWN_FILES) // 2 - SOCKETS_HERE))
+
+
+class Sockets(Generic[C]):
+    """The open TCP connections. A new one displaces the oldest one that has shown no valid token.
+
+    It is displaced from the network that has the most such connections, so a flood from a few
+    networks displaces its own connections.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._strangers: dict[str, dict[C, None]] = {}
+        """The connections without a valid token, by network, oldest first."""
+        self._networks: dict[C, str] = {}
+        """The network of each connection."""
+        self._known: dict[C, str] = {}
+        """The token of each connection that is kept."""
+        self._tokens: Counter[str] = Counter()
+
+    def enter(self, network: str, one: C) -> C | None:
+        """Take a place; return the connection to close for it, or None if there was room.
+
+        If all places are taken by connections with a valid token, return `one` itself, which then
+        has no place.
+        """
+        own = self._strangers.get(network, {})
+        gone = None
+        if len(own) >= SOCKETS_OF_ONE:
+            gone = next(iter(own))
+            self.leave(gone)
+        elif len(self._networks) >= self._most and (gone := self.displaced()) is None:
+            return one
+        self._strangers.setdefault(network, {})[one] = None
+        self._networks[one] = network
+        return gone
+
+    def displaced(self) -> C | None:
+        """Take the place of the connection that has to go first, and return it, if there is one."""
+        if not self._strangers:
+            return None
+        network = max(self._strangers, key=lambda name: len(self._strangers[name]))
+        gone = next(iter(self._strangers[network]))
+        self.leave(gone)
+        return gone
+
+    def prove(self, one: C, token: str) -> None:
+        """Note that a connection has shown a valid token; "" stands for the robot itself."""
+        network = self._networks.get(one)
+        if network is None or one in self._known or self._tokens[token] >= SOCKETS_OF_TOKEN:
+            return
+        self._forget(network, one)
+        self._known[one] = token
+        self._tokens[token] += 1
+
+    def leave(self, one: C) -> None:
+        """Give the place back, if the connection has one."""
+        network = self._networks.pop(one, None)
+        if network is None:
+            return
+        token = self._known.pop(one, None)
+        if token is None:
+            self._forget(network, one)
+            return
+        self._tokens[token] -= 1
+        if not self._tokens[token]:
+            del self._tokens[token]
+
+    def strangers(self) -> list[C]:
+        """Return the connections that have shown no valid token."""
+        return [one for network in self._strangers.values() for one in network]
+
+    def _forget(self, network: str, one: C) -> None:
+        del self._strangers[network][one]
+        if not self._strangers[network]:
+            del self._strangers[network]
 
 
 class Seats:

@@ -15,7 +15,7 @@ from msgspec import Meta, Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.topics import FOLLOWED
-from acsard.prompts import json_messages
+from acsard.terminal import json_messages
 from acsard.web import socket_messages
 from acsard.web.frames import KINDS
 from acsard.web.routes import Body, Problem, Route

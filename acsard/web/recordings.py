@@ -13,7 +13,7 @@ from acsard.core.values import NS_PER_S
 from acsard.host.errors import RecordingError
 from acsard.host.threads import in_thread
 from acsard.recording.directory import PART, STAMP, listed
-from acsard.recording.end_record import closing, how_it_ends
+from acsard.recording.end_record import how_it_ends, read_end
 from acsard.web.answers import READ_S, TroubleError
 from acsard.web.callers import RefusedError, is_loopback
 from acsard.web.robots import Robots
@@ -88,7 +88,7 @@ def _row(path: Path) -> Recording:
     if path.name.endswith(PART):
         return Recording(path.name, _begun(path), None, size, "being recorded, or cut off")
     try:
-        last = closing(path)
+        last = read_end(path)
     except RecordingError as error:
         return Recording(path.name, _begun(path), None, size, str(error))
     if last is None:

@@ -24,6 +24,7 @@ from acsard.daemon.bus.tls import CERTIFICATE, KEY, names_in
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.child import BEAT_S, Parent, end_with_parent
 from acsard.host.logs import Log
+from acsard.web.acceptor import Acceptor, Reader
 from acsard.web.app import Page
 from acsard.web.callers import is_loopback
 from acsard.web.calls import Calls
@@ -31,7 +32,6 @@ from acsard.web.commands import SOURCE, Hand
 from acsard.web.counts import Counts
 from acsard.web.files import PAGE
 from acsard.web.fleet import Fleet
-from acsard.web.gate import Gate, Reader
 from acsard.web.guide import Guide
 from acsard.web.jobs import Reach
 from acsard.web.listen import Listen, bound, own_name, require_certificate
@@ -42,8 +42,6 @@ TIDY_S, TELL_S = 1.0, 1.0
 
 NICE = 5
 """Niceness when the daemon starts this server: the daemon must come first."""
-
-HANDSHAKE_S = 10.0
 
 IDLE_S = 20.0
 """Time limit for an idle HTTP connection between two requests."""
@@ -92,8 +90,8 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
     hand = Hand(lambda: robots.client, counts)
     guide = Guide(_reach(wanted), wanted.config.mcu.port)
     calls, fleet = Calls(robots, guide.stop), Fleet(robots)
-    vault, gate = Vault(wanted.state, wanted.address.robot_id), Gate(counts)
-    page = Page(robots, hand, calls, fleet, counts, vault, names, gate, guide, wanted.page)
+    vault, acceptor = Vault(wanted.state, wanted.address.robot_id), Acceptor(counts)
+    page = Page(robots, hand, calls, fleet, counts, vault, names, acceptor, guide, wanted.page)
     runner = web.AppRunner(
         page.app, access_log=None, handle_signals=False, keepalive_timeout=IDLE_S,
         shutdown_timeout=LEAVE_S,
@@ -104,14 +102,9 @@ async def serve(wanted: Wanted, announce: Callable[[Sequence[Listen]], None], lo
         stack.push_async_callback(guide.close)
         places = bound(wanted.listen, wanted.next_port)
         for one, opened in places:
-            server = await asyncio.get_running_loop().create_server(
-                gate.guarded(lambda: Reader(counts, runner.server)),
-                sock=opened,
-                ssl=secure if one.secure else None,
-                ssl_handshake_timeout=HANDSHAKE_S if one.secure else None,
-                backlog=128,
-            )
-            stack.callback(server.close)
+            tls = secure if one.secure else None
+            acceptor.listen(opened, tls, lambda: Reader(counts, runner.server))
+        stack.callback(acceptor.close)
         announce([one for one, _ in places])
         stack.callback(asyncio.create_task(_tell(counts, log)).cancel)
         await _until(leaving, robots, hand, page, wanted)

@@ -32,7 +32,8 @@ CLOSES_S = 1.0
 """Time limit for the client's answer to a close; the connection is cut after that."""
 
 REPORTS = Rate(1.0)
-"""Rate of the reported refusals with the same reason. All refusals are counted."""
+"""Rate of the reported refusals of one kind of message with the same reason. All refusals are
+counted."""
 
 
 class Following:
@@ -77,9 +78,12 @@ class Outgoing:
         self._news.set()
 
     def refuse(self, what: str, reason: Reason, text: str) -> None:
-        """Count a refusal, and report it to the client at most once a second for each reason."""
+        """Count a refusal, and report it at most once a second for each kind and reason.
+
+        `what` is the kind of the refused message.
+        """
         self._counts.refuse(reason, self._origin)
-        if self._reports.take(reason, clock.mono_ns()):
+        if self._reports.take(f"{what} {reason}", clock.mono_ns()):
             self.say(Refused(what, text))
 
     async def pump(self, look_around: Callable[[float], float]) -> None:

@@ -154,9 +154,7 @@ class Viewer:
             if room or urgent:
                 self._obey(frame)
             else:
-                self._out.refuse(
-                    "message", "too_fast", f"more than {MESSAGES.hz:g} messages a second"
-                )
+                self._refuse(frame, f"more than {MESSAGES.hz:g} messages a second")
         if self._overruns >= OVERRUNS:
             self.end("too many messages")
 
@@ -217,10 +215,18 @@ class Viewer:
             self._start(self._answer(frame), self._stops)
         else:
             if self._calling >= CALLS_AT_ONCE:
-                self._out.refuse("call", "too_fast", f"{CALLS_AT_ONCE} calls are running already")
+                self._refuse(frame, f"{CALLS_AT_ONCE} calls are running already")
                 return
             self._calling += 1
             self._start(self._answer(frame))
+
+    def _refuse(self, frame: Frame, text: str) -> None:
+        """Refuse a message that came too fast. Answer each call, because a program waits for it."""
+        if isinstance(frame, Call):
+            self._counts.refuse("too_fast", self.who.origin)
+            self._out.say(socket_messages.Answer(frame.id, False, text))
+        else:
+            self._out.refuse(frame.kind, "too_fast", text)
 
     async def _answer(self, frame: Call) -> None:
         try:

@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--port")
     parser.add_argument("--rate", type=float)
     args = parser.parse_args()
-    _, config = load(args.config, {"mcu": {"port": args.port}})
+    _, config = load(args.config, {"mcu.port": args.port})
     config = replace(
         config,
         control=replace(config.control, rate=args.rate),

@@ -28,7 +28,7 @@ from tests.firmware.board import (
 )
 from tests.system.harness import until
 
-pytestmark = [pytest.mark.firmware, pytest.mark.xdist_group("board")]
+pytestmark = pytest.mark.firmware
 
 KNOWN = b"!acsard-mcu 1 counts=3200 watchdog_ms=300 check=1 sample=1"
 """The beginning of the identity line, whatever follows."""

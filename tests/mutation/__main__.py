@@ -45,7 +45,7 @@ CORE = (
     "acsard/core/link/negotiation.py",
     "acsard/core/link/minimum_delay.py",
     "acsard/core/robot.py",
-    "acsard/daemon/kept_latches.py",
+    "acsard/daemon/latch_rules.py",
 )
 SAFETY = (
     "acsard/core/guard.py",
@@ -54,7 +54,7 @@ SAFETY = (
     "acsard/core/motion/lifecycle.py",
     "acsard/core/motion/modes.py",
     "acsard/core/motion/sanity.py",
-    "acsard/daemon/kept_latches.py",
+    "acsard/daemon/latch_rules.py",
 )
 ENOUGH, ENOUGH_OF_ALL = 0.95, 0.98
 """Share of the mutants that tests must notice: of a sample, and of every mutant of some modules."""

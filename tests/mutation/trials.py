@@ -34,7 +34,7 @@ from tests.mutation.mutants import Mutant, traced
 TESTS = [
     "tests/unit/core/motion",
     "tests/unit/core/link",
-    "tests/unit/daemon/test_kept_latches.py",
+    "tests/unit/daemon/test_latch_rules.py",
     "tests/unit/daemon/test_latch_file.py",
     "tests/unit/core/test_guard.py",
 ]

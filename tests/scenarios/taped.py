@@ -21,7 +21,7 @@ from acsard.recording.recorded_steps import Step, Taken
 from acsard.recording.replay import Replay
 from acsard.recording.rows import decode, encode
 from acsard.recording.state import freeze, thaw
-from acsard.recording.timeline import told
+from acsard.recording.timeline import entry_of
 from tests.scenarios.world import START, World
 
 BATCH = 200
@@ -89,7 +89,7 @@ class Tape:
             writing.add("steps", batch[0].inputs.now.wall_ns, encode(at, batch))
             for _, outputs, _ in batch:
                 for event in outputs.events:
-                    writing.event(told(event, outputs.now.wall_ns))
+                    writing.event(entry_of(event, outputs.now.wall_ns))
             writing.flush()
             if apart:
                 writing.end_chunk()

@@ -37,9 +37,9 @@ from acsard.core.ros.channels import BY_KEY, CHANNELS, CMD_VEL_IN, LOG
 from acsard.core.ros.shapes import log, state
 from acsard.recording.export import export
 from acsard.recording.file import Recording
+from acsard.recording.file_replay import RecordedRun
 from acsard.recording.published import MEASURED, Publisher
-from acsard.recording.replay import lived
-from acsard.recording.replayed import Course
+from acsard.recording.replay import replay_step
 from tests.each import each
 from tests.scenarios.taped import Tape, drive_through_faults, happenings
 from tests.scenarios.world import EVERY_KEY, World
@@ -70,12 +70,12 @@ def driven(config: Config) -> tuple[World, Tape]:
 
 
 def exported(recording: Recording) -> Said:
-    course = Course(recording)
-    publisher, said = Publisher(course.robot, recording.about.started_ns), defaultdict(list)
-    for step in course.steps():
-        for one in publisher.step(step, lived(course.robot, step)):
+    run = RecordedRun(recording)
+    publisher, said = Publisher(run.robot, recording.about.started_ns), defaultdict(list)
+    for step in run.steps():
+        for one in publisher.step(step, replay_step(run.robot, step)):
             said[one.channel.native.replace("<source>", one.source)].append(one.message)
-    assert course.trouble == ""
+    assert run.trouble == ""
     return said
 
 
@@ -191,7 +191,7 @@ def commanded(source: str) -> str:
     return CMD_VEL_IN.topic("", source)
 
 
-def live(world: World, tape: Tape) -> Said:
+def replay_file(world: World, tape: Tape) -> Said:
     """Return an independent client's messages of each topic except the log, in ROS's form."""
     found: Said = defaultdict(list)
     for key in BY_KEY:
@@ -223,7 +223,7 @@ def test_the_file_has_each_message_that_was_published_to_the_byte(
         for _, channel, message in SeekingReader(stream).iter_messages():
             written[channel.topic].append(message.data)
     rows = {row.topic("", "app"): row for row in CHANNELS}
-    published = live(world, tape)
+    published = replay_file(world, tape)
     assert set(written) == {*published, "/log"} >= set(rows)
     for name, messages in published.items():
         data = [rows.get(name, CMD_VEL_IN).encode(one) for one in messages]
@@ -282,7 +282,7 @@ def test_two_libraries_make_of_the_definitions_in_the_file_what_was_published(
     told: Said = defaultdict(list)
     for name, message in messages:
         told[name].append(message)
-    for name, published in live(world, tape).items():
+    for name, published in replay_file(world, tape).items():
         assert len(told[name]) == len(published) > 0
         for number, (one, ours) in enumerate(zip(told[name], published, strict=True)):
             assert same(one, ours), f"{name}, message {number}: {one} for {ours}"

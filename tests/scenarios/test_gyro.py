@@ -238,9 +238,9 @@ def test_what_was_learned_is_lived_again_to_the_last_bit() -> None:
     made.hold(0.3, 0.8, 1.0)
     (first,) = tape.states
     for begun in (0, first):
-        tally = replayed(tape, made.config, begun).tally
-        assert tally.same
-        assert tally.exact
-        assert tally.steps == len(tape.taken) - begun
+        comparison = replayed(tape, made.config, begun).comparison
+        assert comparison.same
+        assert comparison.exact
+        assert comparison.steps == len(tape.taken) - begun
     without = Config(odometry=OdometryConfig(gyro=True), sim=made.config.sim)
-    assert not replayed(tape, without).tally.same
+    assert not replayed(tape, without).comparison.same

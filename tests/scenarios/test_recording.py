@@ -37,12 +37,12 @@ def taped(config: Config, seconds: float) -> Tape:
 
 
 def lives_again(tape: Tape, config: Config, first: int = 0, least: int = 100) -> None:
-    tally = replayed(tape, config, first).tally
-    assert tally.first is None
-    assert tally.exact
-    assert tally.steps == tally.modes_same == len(tape.taken) - first
-    assert tally.lines == tally.lines_same >= least
-    assert tally.poses == tally.poses_same >= least
+    comparison = replayed(tape, config, first).comparison
+    assert comparison.first is None
+    assert comparison.exact
+    assert comparison.steps == comparison.modes_same == len(tape.taken) - first
+    assert comparison.lines == comparison.lines_same >= least
+    assert comparison.poses == comparison.poses_same >= least
 
 
 @pytest.mark.parametrize("after", [0.1, 0.5, 1.2])
@@ -144,10 +144,10 @@ def test_a_line_that_was_otherwise_is_named_with_what_each_side_knew() -> None:
     taken = tape.taken[number]
     other = replace(taken.outputs, line=b"ap01.00,bp01.00,cp01.00,dp01.00\r\n")
     tape.taken[number] = taken._replace(outputs=other)
-    first = replayed(tape, PLAIN).tally.first
+    first = replayed(tape, PLAIN).comparison.first
     assert first is not None
     assert (first.number, first.what) == (number, ("line",))
-    assert (first.then.line, first.now.line) == (other.line, taken.outputs.line)
+    assert (first.recorded.line, first.replayed.line) == (other.line, taken.outputs.line)
 
 
 def test_a_command_that_had_not_come_makes_another_drive() -> None:
@@ -157,7 +157,7 @@ def test_a_command_that_had_not_come_makes_another_drive() -> None:
     number = moves[0]
     taken = tape.taken[number]
     tape.taken[number] = taken._replace(inputs=replace(taken.inputs, commands=()))
-    first = replayed(tape, PLAIN).tally.first
+    first = replayed(tape, PLAIN).comparison.first
     assert first is not None
     assert number <= first.number <= number + 1
     assert "line" in first.what or "mode" in first.what
@@ -171,8 +171,8 @@ def test_one_bit_of_a_pose_is_told_from_none() -> None:
     (estimate,) = taken.outputs.estimates
     nudged = replace(estimate, pose=replace(estimate.pose, x=estimate.pose.x + 1e-15))
     tape.taken[number] = taken._replace(outputs=replace(taken.outputs, estimates=(nudged,)))
-    tally = replayed(tape, PLAIN).tally
-    assert (tally.same, tally.exact) == (True, False)
+    comparison = replayed(tape, PLAIN).comparison
+    assert (comparison.same, comparison.exact) == (True, False)
 
 
 def test_other_limits_name_the_first_line_that_differs() -> None:
@@ -181,11 +181,12 @@ def test_other_limits_name_the_first_line_that_differs() -> None:
     replay = Replay(SLOW_LIMITS)
     for step in tape.steps():
         replay.step(step)
-    first, tally = replay.tally.first, replay.tally
+    comparison = replay.comparison
+    first = comparison.first
     assert first is not None
-    assert first.what == ("line", "left")
-    assert first.then.status[0] == first.now.status[0] == "driving"
-    assert tally.fastest == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
+    assert first.what == ("line", "sent line")
+    assert first.recorded.status[0] == first.replayed.status[0] == "driving"
+    assert comparison.fastest == (1000, 600)  # 0.5 and 0.3 m/s on wheels of 0.05 m
 
 
 def test_other_limits_take_over_in_the_middle_of_a_drive() -> None:
@@ -200,12 +201,12 @@ def test_other_limits_take_over_in_the_middle_of_a_drive() -> None:
     replay = Replay(SLOW_LIMITS, *state)
     for step in tape.steps(first):
         replay.step(step)
-    tally = replay.tally
-    assert tally.modes_same == tally.steps
-    assert tally.first is not None
-    line = tape.steps(first)[-1].said.line
+    comparison = replay.comparison
+    assert comparison.modes_same == comparison.steps
+    assert comparison.first is not None
+    line = tape.steps(first)[-1].recorded.line
     assert line is not None
     last = replay.step(tape.steps(first)[-1])
     assert last is not None
-    assert last.now.line is not None
-    assert last.now.line < line  # slower, both forwards
+    assert last.replayed.line is not None
+    assert last.replayed.line < line  # slower, both forwards

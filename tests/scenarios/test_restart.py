@@ -21,11 +21,11 @@ from acsard.core.messages.signature import public_name
 from acsard.core.robot import Robot
 from acsard.core.values import NS_PER_S, Event, Inputs, Instant, Latch, Latches, Outputs
 from acsard.daemon.control_loop import ControlLoop
-from acsard.daemon.kept_latches import LatchFileError, decode, encode, stopped, unreadable
+from acsard.daemon.latch_rules import LatchFileError, decode, encode, stopped, unreadable
 from acsard.recording.directory import listed
 from acsard.recording.file import Recording
+from acsard.recording.file_replay import replay_file
 from acsard.recording.recorder import Recorder
-from acsard.recording.replayed import live
 from tests.each import each
 from tests.scenarios.speakers import Speaker, moved
 from tests.scenarios.test_diagnostics import row
@@ -390,8 +390,8 @@ def test_a_drive_that_begins_stopped_is_replayed_to_the_last_bit(tmp_path: Path)
     assert world.state.mode == "driving"
     recorder.close()
     (path,) = listed(tmp_path)
-    lived = live(Recording(path))
-    assert lived.trouble == ""
-    assert lived.tally.same
-    assert lived.tally.exact
-    assert lived.tally.steps == world.steps
+    result = replay_file(Recording(path))
+    assert result.trouble == ""
+    assert result.comparison.same
+    assert result.comparison.exact
+    assert result.comparison.steps == world.steps

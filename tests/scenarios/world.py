@@ -27,7 +27,7 @@ from acsard.core.simulator.simulated_robot import Sight, WatchedMcu
 from acsard.core.simulator.true_messages import turn_rate
 from acsard.core.values import NS_PER_S, Event, Instant, Latches, Outputs, Pose, Received
 from acsard.daemon.control_loop import ControlLoop
-from acsard.daemon.kept_latches import LatchKeeper
+from acsard.daemon.latch_rules import LatchKeeper
 from acsard.daemon.pacing import NO_PERIOD, Period
 from acsard.recording.recorded_steps import BlackBox
 

@@ -39,7 +39,7 @@ FRESHNESS, LIMITS, LIFECYCLE = (
 )
 MODES, ROBOT, SESSION = "core/motion/modes.py", "core/robot.py", "core/link/session.py"
 SANITY, ODOMETRY, PATH = "core/motion/sanity.py", "core/motion/odometry.py", "core/motion/path.py"
-LATCHES, VALUES, LOOP = "daemon/kept_latches.py", "core/values.py", "daemon/control_loop.py"
+LATCHES, VALUES, LOOP = "daemon/latch_rules.py", "core/values.py", "daemon/control_loop.py"
 COMMANDS, KINEMATICS, CODEC = (
     "core/incoming/commands.py",
     "core/motion/kinematics.py",

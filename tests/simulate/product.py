@@ -23,7 +23,7 @@ from acsard.core.messages.encodings import encode as encode_message
 from acsard.core.simulator.simulated_robot import WatchedMcu
 from acsard.core.values import Estimate as Measured
 from acsard.core.values import Event, Instant, Latches, Outputs, Received
-from acsard.daemon.kept_latches import (
+from acsard.daemon.latch_rules import (
     LatchFileError,
     at_start,
     decode,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from tests.system import cores
 from tests.system.browser import NAME, Page
 from tests.system.bystander import standing_by

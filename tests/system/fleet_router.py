@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from acsard.certificates.authority import Authority
 from acsard.daemon.gateway.fleet_router import router_file
+from acsard.machine.authority import Authority
 from tests.system.harness import ROOT, Program, acsard
 from tests.system.strangers import words
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import zenoh
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from tests.system.harness import acsard, client_config, finish, free_endpoint
 
 Identity = Literal[

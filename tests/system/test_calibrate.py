@@ -31,8 +31,8 @@ from acsard.core.link.link_diagnosis import is_ours
 from acsard.core.messages.encodings import FORMATS, encode
 from acsard.core.messages.schema import Odometry, PoseStamped
 from acsard.daemon.bus.zenoh_sessions import client_session
-from acsard.prompts.prompt import Ask
-from acsard.prompts.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import Ask
+from acsard.terminal.terminal_prompt import NoPrompt
 from tests.system.bystander import lost
 from tests.system.harness import (
     Bus,

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from tests.each import each
 from tests.system.harness import (
     Bus,

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from acsard.daemon.gateway.watch import UNANSWERED
+from acsard.daemon.gateway.session_health import MAX_UNANSWERED
 from tests.system.harness import (
     Bus,
     Daemon,
@@ -171,7 +171,7 @@ def test_a_daemon_that_is_connected_and_takes_nothing_in_has_it_opened_anew(
     with zenoh.open(listening(plain)) as daemon:
         daemon.declare_queryable("acsard/acsar/info", on_query)
         with Program(acsard("gateway", "--config", str(config)), tmp_path) as gateway:
-            until(lambda: len(asked) > UNANSWERED + 2 * answers, 30.0, f"questions\n{gateway}")
+            until(lambda: len(asked) > MAX_UNANSWERED + 2 * answers, 30.0, f"questions\n{gateway}")
             if answers:
                 assert gateway.process.poll() is None
                 return

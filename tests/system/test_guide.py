@@ -14,8 +14,8 @@ from typing import Any, cast
 import aiohttp
 import pytest
 
-from acsard.certificates.authority import Authority
-from acsard.prompts.json_prompt import HEARD_S
+from acsard.machine.authority import Authority
+from acsard.terminal.json_prompt import HEARD_S
 from tests import described
 from tests.system.browser import Page, run, text
 from tests.system.bystander import lost
@@ -23,7 +23,7 @@ from tests.system.guided import Guided, NoDaemon, commands, guiding, none_left
 from tests.system.harness import Bus, Daemon, FarPeer, Program, acsard, until, wheels
 from tests.system.hosts import Hosts, inside, on
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("pages")]
+pytestmark = pytest.mark.slow
 
 
 async def beside(call: Callable[[], Any]) -> Any:

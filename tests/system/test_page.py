@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import aiohttp
 import pytest
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from acsard.web.limits import CONNECTIONS_HERE
 from acsard.web.viewer import HEARTBEAT_S
 from tests import pictures

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from tests.system.browser import NAME, Page
 from tests.system.chromium import CHROMIUM, PHONE, Browser, browsing
 from tests.system.harness import Bus, Daemon, until

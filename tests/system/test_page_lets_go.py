@@ -24,7 +24,7 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from acsard.certificates.authority import Authority
+from acsard.machine.authority import Authority
 from tests.system.browser import Page, hands, run
 from tests.system.bystander import lost
 from tests.system.chromium import CHROMIUM, PHONE, browsing

@@ -52,9 +52,9 @@ def replayed(where: Path, path: Path) -> int:
 def last_s(where: Path, path: Path) -> float:
     """Return the wall clock of the last step that can be read."""
     code = (
-        "import sys, pathlib; from acsard.recording import replayed, file;"
+        "import sys, pathlib; from acsard.recording import file, file_replay;"
         "recording = file.Recording(pathlib.Path(sys.argv[1]));"
-        "print(max(step.inputs.now.wall_ns for step in replayed.steps(recording)))"
+        "print(max(step.inputs.now.wall_ns for step in file_replay.steps(recording)))"
     )
     return int(finish([sys.executable, "-c", code, str(path)], where).out) / 1e9
 

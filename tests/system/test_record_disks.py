@@ -18,10 +18,10 @@ import pytest
 
 from acsard.core.config.settings import RecordConfig
 from acsard.recording.directory import Ring, Run
-from acsard.recording.disk import HAPPENED
-from acsard.recording.end_record import closing
+from acsard.recording.end_record import read_end
 from acsard.recording.file import About, Recording, Writing
 from acsard.recording.recovery import recover
+from acsard.recording.step_writer import INCIDENTS
 from acsard.web.recordings import rows
 from tests.system import bystander
 from tests.system.harness import Bus, Daemon, Periods, environment, until
@@ -270,12 +270,12 @@ def test_two_seconds_a_sync_cost_no_period(tmp_path: Path) -> None:
         assert bus.state()["recording_error"] == ""
         daemon.process.terminate()
         assert daemon.ended(5.0) == 0
-        happened = any(daemon.events(name) for name in HAPPENED)
+        happened = any(daemon.events(name) for name in INCIDENTS)
     with records(tmp_path, tmp_path / "record"):
         pass
     lived_again(tmp_path, tmp_path / "record")
     first, *_ = files(tmp_path)
-    last = closing(first)
+    last = read_end(first)
     assert last is not None
     assert last.cut in ("", "late"), "no crash has cut it"
     assert happened or first.name.endswith("Z.mcap"), "it is kept for nothing"

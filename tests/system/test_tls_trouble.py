@@ -13,10 +13,10 @@ from threading import Thread
 import pytest
 import zenoh
 
-from acsard.certificates import authority as making
-from acsard.certificates.authority import Authority
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import CertificateError, MendableError, UnreachableError
+from acsard.machine import authority as making
+from acsard.machine.authority import Authority
 from tests.system.harness import free_endpoint
 
 ALL_NAMES = ["localhost", "127.0.0.1"]

@@ -17,10 +17,11 @@ import aiohttp
 import pytest
 from yarl import URL
 
+from acsard.web.acceptor import REQUEST_S
 from acsard.web.app import BODY_S
-from acsard.web.gate import REQUEST_S, SOCKETS_OF_ONE
+from acsard.web.limits import SOCKETS_OF_ONE
 from tests.system.browser import NAME, Hands, Page, hands, run
-from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, resident_kb
+from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, cpu_seconds, resident_kb
 
 pytestmark = pytest.mark.network
 
@@ -32,7 +33,7 @@ class Table:
     """The attempts, their results, and the check that the robot stood meanwhile."""
 
     def __init__(self, page: Page, daemon: Daemon) -> None:
-        self.page, self._daemon = page, daemon
+        self.page, self.daemon = page, daemon
         self.rows: list[str] = []
 
     @contextmanager
@@ -51,7 +52,7 @@ class Table:
         It is refused this number of times for that reason, by the page or the robot, and nothing
         moves unless another client may drive.
         """
-        with Bus(self._daemon.endpoint) as bus:
+        with Bus(self.daemon.endpoint) as bus:
             before, counted = bus.comes_to("ready"), self._refused(bus, reason, by)
             yield
             after, more = bus.comes_to("ready"), self._refused(bus, reason, by) - counted
@@ -430,3 +431,48 @@ def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
         answer = keeps.recv(4096)
     assert answer.startswith(b"HTTP/1.1 408"), answer
     assert time.monotonic() - begun < max(BODY_S, REQUEST_S) + PATIENCE_S
+
+
+VIEWERS, A_SECOND, LASTS_S = 6, 190, 4.0
+
+
+def test_stops_of_robots_that_do_not_exist_cost_no_more_than_pings(
+    table: Table, bus: Bus, tokens: dict[str, str]
+) -> None:
+    """Every viewer sends as much as its limit allows, pings and stops in turns."""
+    page, daemon = table.page.pid, table.daemon.pid
+
+    async def told(number: int, stops: bool) -> None:
+        async with hands(table.page, tokens["viewer"]) as theirs:
+            reading = asyncio.create_task(_drained(theirs))
+            begun = time.monotonic()
+            for n in range(round(A_SECOND * LASTS_S)):
+                if stops:
+                    await theirs.say(call="stop", id=n, robot=f"nobody{number}{n}")
+                else:
+                    await theirs.say(ping=n)
+                await asyncio.sleep(max(0.0, begun + n / A_SECOND - time.monotonic()))
+            reading.cancel()
+
+    async def wave(stops: bool) -> tuple[float, int]:
+        """Return the processor time of page and daemon, s, and the missed periods."""
+        before, spent = bus.state(), cpu_seconds(page) + cpu_seconds(daemon)
+        await asyncio.gather(*(told(number, stops) for number in range(VIEWERS)))
+        spent = cpu_seconds(page) + cpu_seconds(daemon) - spent
+        return spent, Periods.between(before, bus.state()).missed
+
+    async def story() -> None:
+        pings, stops, again, more = [await wave(stops) for stops in (False, True, False, True)]
+        quiet, attack = pings[0] + again[0], stops[0] + more[0]
+        missed = pings[1] + again[1], stops[1] + more[1]
+        print(f"\npage and daemon: {50 * quiet / LASTS_S:.0f} % of a core with pings, "
+              f"{50 * attack / LASTS_S:.0f} % with stops; missed periods {missed}")  # fmt: skip
+        assert attack < 2 * quiet
+        assert missed[1] <= missed[0] + 2
+
+    run(story)
+
+
+async def _drained(ours: Hands) -> None:
+    async for _ in ours.socket:
+        pass

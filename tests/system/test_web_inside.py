@@ -18,12 +18,12 @@ from acsard.core.messages.signature import MOST
 from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import UnreachableError
+from acsard.web.acceptor import Acceptor
 from acsard.web.app import Page
 from acsard.web.calls import Calls
 from acsard.web.commands import Hand
 from acsard.web.counts import Counts
 from acsard.web.fleet import Fleet
-from acsard.web.gate import Gate
 from acsard.web.guide import Guide
 from acsard.web.jobs import Reach
 from acsard.web.limits import OVERRUNS
@@ -53,10 +53,11 @@ class Inside:
 
         self.robots = Robots(Address("tcp/127.0.0.1:1", "acsar", ""), connect, ABOUT, self.counts)
         self.hand = Hand(lambda: self.robots.client, self.counts)
-        self.fleet, self.gate = Fleet(self.robots), Gate(self.counts)
+        self.fleet, self.acceptor = Fleet(self.robots), Acceptor(self.counts)
         self.page = Page(
             self.robots, self.hand, Calls(self.robots), self.fleet, self.counts,
-            Vault(where, "acsar"), frozenset(), self.gate, Guide(Reach("", "", "acsar", ""), "sim"),
+            Vault(where, "acsar"), frozenset(), self.acceptor,
+            Guide(Reach("", "", "acsar", ""), "sim"),
         )  # fmt: skip
 
     @asynccontextmanager

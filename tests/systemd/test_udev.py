@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pytest
 
-from acsard.host.serial_ports import BOARDS
+from acsard.machine.serial_ports import BOARDS
 from tests.system.harness import ROOT
 from tests.systemd.container import Container
 

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from acsard.calibration.error_budget.budget import Basis, Budget, Cause, Share
 from acsard.core.motion.uncertainty import COARSE_COUNTS
-from acsard.terminal.tables import table
+from acsard.terminal.output import table
 
 MEANING: dict[Cause, str] = {
     "time": "errors in the times of feedback lines",

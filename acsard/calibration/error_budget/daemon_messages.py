@@ -1,13 +1,19 @@
-"""Collects the messages of a running daemon as the input of the error budget."""
+"""Follows a running daemon, and collects its messages as the input of the error budget."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections import deque
+from collections.abc import Iterator, Mapping
 
-from acsard.calibration.error_budget.budget import Received
+from acsard.calibration.error_budget.budget import Budget, Received, budget
 from acsard.calibration.error_budget.drive_log import Line
+from acsard.client import Client, Subscription
+from acsard.client.follower import FIRST_S
+from acsard.client.synchronous import decoder
 from acsard.core.config.settings import Config
+from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import (
     DiagnosticArray,
     JointState,
@@ -17,6 +23,8 @@ from acsard.core.messages.schema import (
     TwistStamped,
 )
 from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.subscription import encoded
+from acsard.host.errors import ReplyError
 
 KEYS = ("odom", "wheel_states", "cmd_vel_out")
 """Keys to subscribe to."""
@@ -33,6 +41,47 @@ end at the same moment.
 
 SAMPLED = "checked with samples"
 """Name of the link check whose lines carry the encoder counts, as in `diagnostics`."""
+
+LOOK_S = 0.05
+"""Time between two looks for messages, s."""
+
+
+def budgets(robot: Client, config: Config, seconds: float) -> Iterator[Budget]:
+    """Yield the error budget of the drive so far, every `seconds` s.
+
+    Raises `ReplyError` if no feedback lines come, and if a message cannot be read.
+    """
+    queues = {key: robot.subscribe(key) for key in KEYS}
+    _await_line(robot, queues["wheel_states"])
+    feed = Feed(config, robot.get("state"))
+    while True:
+        _follow(feed, queues, seconds)
+        yield budget(feed.received(robot.get("state"), robot.get("diagnostics")), config)
+
+
+def _await_line(robot: Client, lines: Subscription) -> None:
+    """Wait for the first feedback line, after which all keys are published."""
+    end = time.monotonic() + FIRST_S
+    while lines.try_recv() is None:
+        if time.monotonic() > end:
+            raise ReplyError(f"no feedback lines come: {robot.get('state').reason}")
+        time.sleep(LOOK_S)
+
+
+def _follow(feed: Feed, queues: Mapping[str, Subscription], seconds: float) -> None:
+    """Pass all messages of the next `seconds` s to `feed`."""
+    decoders = {key: decoder(key) for key in queues}
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        time.sleep(LOOK_S)
+        for key, queue in queues.items():
+            while (sample := queue.try_recv()) is not None:
+                try:
+                    feed.add(decoders[key].decode(*encoded(sample)))
+                except DecodeError as error:
+                    raise ReplyError(
+                        f"cannot read {key} ({error}); does the daemon have another version?"
+                    ) from None
 
 
 class Feed:

@@ -22,7 +22,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import Config, DriveConfig
 from acsard.core.values import AcsardError
-from acsard.prompts.prompt import Ask
+from acsard.terminal.prompt import Ask
 
 
 class GuideError(AcsardError):

@@ -24,7 +24,7 @@ from acsard.calibration.guided.drive_plan import (
     Slant,
 )  # fmt: skip
 from acsard.calibration.tape_distance import LEAST_M
-from acsard.prompts.prompt import Ask
+from acsard.terminal.prompt import Ask
 
 TAPE_M = 0.005
 """Standard deviation of the length of the straight drive by tape, m, both ends included."""

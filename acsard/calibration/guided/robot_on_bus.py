@@ -24,7 +24,7 @@ from acsard.core.messages.encodings import DecodeError, Decoder
 from acsard.core.messages.schema import Imu, JointState, Odometry, PoseStamped
 from acsard.core.messages.topics import by_key
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
-from acsard.prompts.prompt import Prompt
+from acsard.terminal.prompt import Prompt
 
 SOURCE = "app"
 

@@ -14,7 +14,7 @@ from acsard.calibration.guided.tape_readings import Answers, Reading, reading, t
 from acsard.calibration.runs import Log, Run
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.tape_distance import LEAST_M, Tape
-from acsard.prompts.prompt import Ask, Prompt
+from acsard.terminal.prompt import Ask, Prompt
 
 
 def guide(name: str, setup: Setup, prompt: Prompt, ride: Callable[[Leg], Run]) -> Calibration:

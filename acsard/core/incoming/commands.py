@@ -14,6 +14,7 @@ A refused command does not keep the robot moving: it does not refresh the timeou
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Literal
 
 from msgspec import UNSET, Struct, UnsetType
@@ -290,6 +291,8 @@ class Identity(Struct, frozen=True):
     """The public name without the certificate; "" unless a native command has a sender id."""
 
 
+# Each command needs the parts of its key twice, and few keys ever command.
+@lru_cache(64)
 def parts(key: str) -> tuple[str, str, str]:
     """Return kind, source and certificate of a command's key, with "" for a missing part."""
     kind, _, rest = key.partition("/")
@@ -353,8 +356,9 @@ def sender(arrival: Arrival) -> str:
 
 
 def _twist_payload(arrival: Arrival) -> _TwistPayload:
-    if detect(arrival.encoding, arrival.payload) != "cdr":
-        return _twists.decode(arrival.encoding, arrival.payload)
+    form = detect(arrival.encoding, arrival.payload)
+    if form != "cdr":
+        return _twists.decode_as(form, arrival.payload)
     named, size = arrival.encoding.partition(";")[2], len(arrival.payload)
     # If the Encoding names no type, the size decides. DDS pads a payload to a multiple of four.
     plain, known = named in TWISTS, named in TWISTS + STAMPED_TWISTS

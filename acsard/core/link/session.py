@@ -190,11 +190,11 @@ class McuSession:
 
     def _settle(self, went: bool, port_open: bool) -> None:
         """Note whether the line just made has left. A line that did not uses up no throttle."""
-        self.negotiation.settle(went)
-        made, self._made = self._made, None
-        blind, self._just_blind = self._just_blind, False
+        made = self._made
         if made is None:
             return
+        blind, self._made, self._just_blind = self._just_blind, None, False
+        self.negotiation.settle(went)
         self._held_up = not went
         if went:
             line, made_ns = made
@@ -229,19 +229,22 @@ class McuSession:
         self.negotiation.begin()
 
     def _judge(self, now_ns: int) -> None:
-        # A step that comes late also finds an old line, but then the computer was late.
-        late = self.lateness.step_s > 0.0
-        long = now_ns - self._left_ns > BLOCKED_NS
-        self.blocked = self._held_up and (self.blocked or (long and not late))
+        link, check = self._link, self.negotiation
+        if not self._held_up:
+            self.blocked = False
+        elif now_ns - self._left_ns > BLOCKED_NS and not self.lateness.step_s:
+            # A step that comes late also finds an old line, but then the computer was late.
+            self.blocked = True
         if self.blocked:
-            self._link.sign("blocked")
+            link.sign("blocked")
         # The link is never up in the update that saw a restart: the arbiter must see it lost first.
-        self._link.judge(now_ns, may_rise=not self._starting_over)
-        check, up = self.negotiation, self._link.state == "up"
-        quiet = not up and self.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
+        link.judge(now_ns, may_rise=not self._starting_over)
+        up = link.state == "up"
+        quiet = not up and link.silent(now_ns) and now_ns - check.settled_ns > self.quiet_ns
         if quiet and (check.state == "plain" or check.checked):
             check.begin()
-        check.judge(now_ns)
+        if check.asking:
+            check.judge(now_ns)
         if up or self.blocked:
             self._hearing.forget()
         elif self._hearing.judge(now_ns):

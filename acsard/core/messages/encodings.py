@@ -26,6 +26,7 @@ _MIME: dict[Format, str] = {
     "json": "application/json",
     "cdr": "application/cdr",
 }
+_FORM_OF: dict[str, Format] = {mime: form for form, mime in _MIME.items()} | {"text/json": "json"}
 _pack = msgspec.msgpack.Encoder()
 _text = msgspec.json.Encoder()
 
@@ -70,12 +71,9 @@ def detect(encoding: str, payload: bytes) -> Format:
 
     `encoding` is the Zenoh Encoding of the payload.
     """
-    mime = encoding.partition(";")[0]
-    for form in FORMATS:
-        if mime == _MIME[form]:
-            return form
-    if mime == "text/json":
-        return "json"
+    form = _FORM_OF.get(encoding.partition(";")[0])
+    if form is not None:
+        return form
     first = payload.lstrip(b" \t\r\n")[:1]
     if first == b"{":
         return "json"
@@ -102,7 +100,10 @@ class Decoder(Generic[T]):
 
         `encoding` is the Zenoh Encoding of the payload.
         """
-        form = detect(encoding, payload)
+        return self.decode_as(detect(encoding, payload), payload)
+
+    def decode_as(self, form: Format, payload: bytes) -> T:
+        """Return the message in a payload of a known encoding. Raises `DecodeError`."""
         if form == "cdr":
             return decode_cdr(self._cls, payload)
         try:

@@ -111,14 +111,16 @@ class Report:
             self._happened.add(outputs.events, outputs.now)
         if outputs.estimates:
             self._estimate = outputs.estimates[-1]
-        if not wanted:
-            return iter(())
-        if not outputs.estimates and not (
-            outputs.due or outputs.events or "state" in wanted or "diagnostics" in wanted
+        if (
+            (outputs.estimates and wanted)
+            or "state" in wanted
+            or "diagnostics" in wanted
+            or (outputs.due and "cmd_vel_out" in wanted)
+            or (outputs.events and "events" in wanted)
         ):
-            # Most steps end here, because nothing is due that a client follows.
-            return iter(())
-        return self._due(outputs, wanted, look)
+            return self._due(outputs, wanted, look)
+        # Most steps end here, because nothing is due that a client follows.
+        return iter(())
 
     def _due(
         self, outputs: Outputs, wanted: Collection[str], look: Look

@@ -194,20 +194,21 @@ class Arbiter:
 
     def choose(self, now_ns: int) -> Choice:
         """Return the command that the robot follows now."""
-        live = [
-            (source, found[0])
-            for source in self._ranking
-            if source.senders and (found := source.live(now_ns))
-        ]
-        if not live:
+        first: tuple[_Source, Sender] | None = None
+        for source in self._ranking:
+            if not source.senders or not (live := source.live(now_ns)):
+                continue
+            if first is None or (
+                source.priority == first[0].priority and live[0].came_ns < first[1].came_ns
+            ):
+                first = source, live[0]
+        if first is None:
             self._holder = None
             for source in self._ranking:
                 if source.senders and (wait := source.doubted(now_ns)) is not None:
                     return Choice(wait=wait)
             return IDLE
-        source, sender = live[0]
-        if len(live) > 1:
-            source, sender = min(live, key=lambda one: (-one[0].priority, one[1].came_ns))
+        source, sender = first
         self._holder = source
         if not sender.armed(now_ns):
             wait = source.neutral(sender, _lasts(now_ns - sender.came_ns))

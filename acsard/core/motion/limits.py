@@ -59,6 +59,8 @@ class Limiter:
             limits.angular_jerk,
         )
         self._wheel_speed = limits.wheel_speed
+        self._wished = self._goal = REST
+        """The last wished twist, and the same twist within the limits of speed."""
 
     @property
     def twist(self) -> Twist:
@@ -67,8 +69,10 @@ class Limiter:
 
     def follow(self, wished: Twist, dt: float) -> Twist:
         """Move towards the finite twist `wished` for `dt` s; return the twist to apply."""
-        goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
-        now = self.state
+        if wished is not self._wished:  # a sender repeats its command less often than the daemon
+            self._wished = wished
+            self._goal = self._kinematics.saturate(self._within_speed(wished), self._wheel_speed)
+        goal, now = self._goal, self.state
         linear, slope_v = _approach(
             now.twist.linear, goal.linear, now.linear_slope, dt, self._linear
         )

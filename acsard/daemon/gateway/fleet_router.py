@@ -1,12 +1,12 @@
-"""A router for a fleet: writes its Zenoh configuration file, and runs Zenoh in router mode with it.
+"""The router of a fleet: writes its Zenoh configuration file, and runs Zenoh as a router with it.
 
-As with zenohd, the rules in the file are the permissions of the clients. Within these rules, any
-client with a certificate can still block a router. This one detects it and restarts within 2 s
-(`supervision.py`).
+As with zenohd, the access rules in the file say what each client may do. Within these rules, any
+client with a certificate can still make a router hang. This router detects that and restarts within
+2 s (`listener_process.py`).
 
-The file is made of `deploy/zenoh/router.json5`, which is for one robot, and edited as text. The
-lines between the marks ROBOT and END are repeated for each robot. Those between PERSON and END
-PERSON are repeated for each certificate that may command.
+`router_file` makes the file from the text of `deploy/zenoh/router.json5`, a template for one robot.
+It repeats the lines between the marks ROBOT and END for each robot. It repeats the lines between
+PERSON and END PERSON for each certificate that may command.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import zenoh
 
 from acsard.core.values import ROLES, Role
 from acsard.daemon.bus.zenoh_sessions import first_line
-from acsard.daemon.gateway.watch import Events, Look, Watch
+from acsard.daemon.gateway.session_health import Events, Observation, SessionHealth
 from acsard.host import clock
 from acsard.host.errors import InUseError, RouterFileError, UsageError
 
@@ -29,13 +29,13 @@ EXAMPLE = "robot1"
 """Id of the robot in the template."""
 
 IS_FOR = "// It is for {}. For yours:\n"
-"""Line at the head of the template."""
+"""Line at the head of the template, with the ids of the robots."""
 
 _BLOCK = re.compile(r"^ *// ROBOT\n(.*?)^ *// END\n", re.M | re.S)
 _NAME = re.compile(rf"\b{EXAMPLE}\b")
 
 PERSON: Role = "operator"
-"""Common name in the template's lines for a person."""
+"""Common name of the certificate in the template's lines between PERSON and END PERSON."""
 
 _PERSONS = re.compile(r"^ *// PERSON\n(.*?)^ *// END PERSON\n", re.M | re.S)
 # Match a whole name, or the last part of a key, because a robot may be called operator-1.
@@ -43,70 +43,84 @@ _PERSON = re.compile(rf'(?<=[/" ]){PERSON}(?=")')
 
 
 def router_file(template: str, robots: Sequence[str], people: Mapping[Role, Sequence[str]]) -> str:
-    """Return the configuration for these robots and for the further certificates of people.
+    """Return the text of the router's configuration file.
 
-    `people` maps a role to the common names of further certificates. Raises `UsageError` for a name
-    that occurs twice, because a certificate belongs to one robot or to one role.
+    Args:
+        template: the text of `deploy/zenoh/router.json5`.
+        robots: ids of the robots.
+        people: for each role, the common names of the certificates that have this role, besides the
+            certificate with the role's own name.
+
+    Raises:
+        UsageError: a name occurs twice. A certificate belongs to one robot or to one role.
     """
     names = [*robots, *ROLES, *(name for role in ROLES for name in people.get(role, ()))]
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise UsageError(
-            f"{', '.join(twice)}: named twice; a certificate belongs to one robot, or to the "
-            f"list of one role, and {', '.join(ROLES)} are in their own lists"
+            f"{', '.join(twice)}: named twice; name each certificate once, as a robot or in the "
+            f"list of one role, and do not name {', '.join(ROLES)}, which have their roles already"
         )
-    # The replacement is a function, since an id or a name may look like a reference to a group.
-    text = _BLOCK.sub(lambda block: "".join(_for(one, block[1]) for one in robots), template)
+    text = _BLOCK.sub(
+        lambda block: "".join(_with(_NAME, robot, block[1]) for robot in robots), template
+    )
     text = text.replace(IS_FOR.format(EXAMPLE), IS_FOR.format(", ".join(robots)))
     for role in ROLES:
         listed = ", ".join(json.dumps(name) for name in (role, *people.get(role, ())))
-        alone = _SUBJECT.format(f"{role}s", f'"{role}"')
-        text = text.replace(alone, _SUBJECT.format(f"{role}s", listed))
-    # The template has lines for the certificate "maintainer" as well as for "operator".
-    drivers = [PERSON, *people.get("operator", ()), *people.get("maintainer", ())]
-    return _PERSONS.sub(lambda block: "".join(_by(one, block[1]) for one in drivers), text)
+        template_list = _SUBJECT.format(f"{role}s", f'"{role}"')
+        text = text.replace(template_list, _SUBJECT.format(f"{role}s", listed))
+    # The template has separate lines for the certificate "maintainer", which may command too.
+    commanders = [PERSON, *people.get("operator", ()), *people.get("maintainer", ())]
+    names = [json.dumps(name)[1:-1] for name in commanders]
+    return _PERSONS.sub(
+        lambda block: "".join(_with(_PERSON, name, block[1]) for name in names), text
+    )
 
 
 _SUBJECT = 'id: "{}", link_protocols: ["tls"], cert_common_names: [{}]'
+"""Line of the template that lists the certificates of a role."""
 
 
-def _by(person: str, block: str) -> str:
-    return _PERSON.sub(lambda _: json.dumps(person)[1:-1], block)
-
-
-def _for(robot: str, block: str) -> str:
-    return _NAME.sub(lambda _: robot, block)
+def _with(pattern: re.Pattern[str], name: str, block: str) -> str:
+    """Return the block with `name` in place of each match of the pattern."""
+    # The replacement is a function, because a name may look like a reference to a group.
+    return pattern.sub(lambda _: name, block)
 
 
 ROUTER_EVENTS: Events = {
     "open": "router_open",
     "full": "router_full",
     "stuck": "router_stuck",
-    # "alone" is missing because the router does not wait for a daemon.
+    # "alone" is absent because the router does not wait for a daemon.
 }
 
 AN_ADDRESS = re.compile(r"^(tcp|tls|udp|quic|ws)/[^?#]*")
-"""Part of an endpoint that may be in use or not exist yet."""
+"""Protocol and address of an endpoint, without its settings."""
 
-_KNOWN = re.compile(
+_VALUE_ERROR = re.compile(
     r'msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+) \}\)'
 )
-_GRAMMAR = re.compile(r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)?$", re.M | re.S)
+"""Zenoh's error about a wrong key or value in a configuration."""
+
+_SYNTAX_ERROR = re.compile(
+    r"--> (\d+):(\d+)\n.*^ *= ([^\n]*?)(?: at /\S+\.rs:\d+\.?)?$", re.M | re.S
+)
+"""Zenoh's error about text that is not JSON5."""
 
 
-def why(error: zenoh.ZError) -> str:
-    """Return Zenoh's complete message about an invalid configuration, with the position."""
+def reason(error: zenoh.ZError) -> str:
+    """Return the readable part of Zenoh's error about a configuration, with its position."""
     text = str(error)
-    if match := _KNOWN.search(text):
+    if match := _VALUE_ERROR.search(text):
         message = re.sub(r"\\(.)", r"\1", match[1])
         return f"line {match[2]}, column {match[3]}: {message}"
-    if match := _GRAMMAR.search(text):
+    if match := _SYNTAX_ERROR.search(text):
         return f"line {match[1]}, column {match[2]}: {match[3]}"
     return first_line(error)
 
 
 class Router:
-    """The router that zenohd would open, without its plugins."""
+    """The router that zenohd would run with a configuration file, but without plugins."""
 
     events = ROUTER_EVENTS
 
@@ -114,7 +128,7 @@ class Router:
         """Read the file; raise `RouterFileError` if Zenoh does not accept it."""
         self._file = file
         try:
-            # Zenoh reports only that it could not open the file.
+            # Zenoh would not say why it could not open the file.
             file.read_bytes()
         except OSError as error:
             raise RouterFileError(f"cannot read {file}: {error.strerror}; correct it") from None
@@ -126,9 +140,9 @@ class Router:
             self._config.insert_json5("plugins_loading/enabled", "false")
         except zenoh.ZError as error:
             raise RouterFileError(
-                f"{file} is not a Zenoh configuration: {why(error)}; correct it"
+                f"{file} is not a Zenoh configuration: {reason(error)}; correct it"
             ) from error
-        # Zenoh's default is a table by mode: every address, without encryption.
+        # A file without endpoints gets Zenoh's default, a dict: every address, without encryption.
         if isinstance(endpoints, dict):
             endpoints = []
         if mode != "router" or not endpoints:
@@ -144,25 +158,29 @@ class Router:
         return True
 
     def open(self) -> zenoh.Session:
-        """Listen; raise `InUseError` if that may be possible later, else `RouterFileError`."""
+        """Open the router's session and listen.
+
+        Raises `InUseError` if listening may be possible later, because an address is in use or does
+        not exist yet. Raises `RouterFileError` if the file must be corrected.
+        """
         try:
             return zenoh.open(self._config)
         except zenoh.ZError as error:
             if not self._opens_elsewhere():
                 raise RouterFileError(
-                    f"{self._file} cannot be used: {why(error)}; correct it, or provide the "
+                    f"{self._file} cannot be used: {reason(error)}; correct it, or provide the "
                     "files that it names, readable for this user"
                 ) from error
             raise InUseError(
-                f"cannot listen on {self.where}: {why(error)}; are the addresses free, and do "
-                "they belong to this machine?"
+                f"cannot listen on {self.where}: {reason(error)}; end the program that uses the "
+                "address, or name addresses of this machine in listen: { endpoints: [...] }"
             ) from error
 
     def _opens_elsewhere(self) -> bool:
-        """Return whether the configuration opens on free addresses of this machine.
+        """Return whether Zenoh accepts the configuration with other addresses of this machine.
 
-        If it does, only its own addresses are at fault, and they may become free later. Zenoh's
-        messages do not tell this case from a mistake in the file.
+        If it does, only the configured addresses are at fault, and they may become free later.
+        Zenoh's messages do not distinguish this case from a mistake in the file.
         """
         config = zenoh.Config.from_file(str(self._file))
         free = [AN_ADDRESS.sub(r"\1/127.0.0.1:0", endpoint) for endpoint in self._endpoints]
@@ -175,10 +193,10 @@ class Router:
             return False
         return True
 
-    def look(self, session: zenoh.Session) -> Look:
-        """Return the connections. All come from outside, and no daemon is awaited."""
-        links = session.info.links()
-        return Look(clock.mono_ns(), tuple(link.auth_identifier or "" for link in links), True)
+    def observe(self, session: zenoh.Session) -> Observation:
+        """Return the connections of the router."""
+        holders = tuple(link.auth_identifier or "" for link in session.info.links())
+        return Observation(clock.mono_ns(), holders, linked=True)
 
-    def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
-        """Do nothing: the log has all reports of a router."""
+    def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
+        """Do nothing: a router has no daemon to report to, and the log has all its events."""

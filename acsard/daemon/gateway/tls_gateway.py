@@ -1,8 +1,8 @@
 """The TLS gateway between clients on other machines and the daemon on loopback.
 
-The gateway is a Zenoh router of its own that forwards only what the access rules allow. The worst
-that a client can cause is a restart of the gateway (`supervision.py`), after which all clients
-reconnect.
+The gateway is a Zenoh router in a process of its own. It forwards only the messages that the access
+rules allow. The worst harm that a client can do is a restart of the gateway
+(`listener_process.py`), after which all clients reconnect.
 """
 
 from __future__ import annotations
@@ -23,29 +23,31 @@ from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.bus.tls import ends_ns, require_usable
 from acsard.daemon.bus.zenoh_sessions import MAX_SESSIONS, gateway_session, reachable
-from acsard.daemon.gateway.watch import GATEWAY_EVENTS, Look, Watch
+from acsard.daemon.gateway.session_health import GATEWAY_EVENTS, Observation, SessionHealth
 from acsard.host import clock
 
 CONNECT_S = 1.0
 
-ASK_NS = NS_PER_S
-"""Interval between two queries to the daemon, ns. A query that has not ended by then counts."""
+PROBE_NS = NS_PER_S
+"""Time between two queries to the daemon, ns. A query that has not ended by then is unanswered."""
 
-LET_GO_S = 60.0
-"""Time after which Zenoh itself ends a query, s; that is not an answer. It is long after the
-unanswered queries have been counted, even if the gateway waits for a core between its looks.
+QUERY_TIMEOUT_S = 60.0
+"""Time after which Zenoh itself ends a query, s. Such an end is not an answer.
+
+The time is much longer than `PROBE_NS`, so that the query counts as unanswered before, even if the
+gateway has to wait for a core.
 """
 
 
 class Gateway:
-    """The TLS gateway. It opens when the daemon runs, and reports its connections to the daemon."""
+    """The TLS gateway: opens once the daemon runs, and reports its connections to the daemon."""
 
     most = MAX_SESSIONS - 1
-    """Largest number of connections from the network; one more is the daemon's."""
+    """Largest number of connections from the network. The daemon takes one more connection."""
     events = GATEWAY_EVENTS
 
     def __init__(self, config: Config) -> None:
-        """Check the certificates.
+        """Check the certificates of `[bus.tls]`.
 
         Raises `CertificateError` or `NotPermittedError` if they cannot be used.
         """
@@ -54,10 +56,13 @@ class Gateway:
         self._opened_ns = 0
         self._publisher: Any = None
         self._ends_ns = 0
-        self._question = Question(full_key(config.robot.id, "info"))
+        self._probe = DaemonProbe(full_key(config.robot.id, "info"))
 
     def ready(self) -> bool:
-        """Return whether the daemon accepts connections. Clients are not admitted before."""
+        """Return whether the daemon accepts connections.
+
+        The gateway admits no client before the daemon does.
+        """
         host, _, port = reachable(self._config.bus.plain[0]).partition("/")[2].rpartition(":")
         try:
             with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
@@ -74,48 +79,54 @@ class Gateway:
         self._opened_ns = clock.mono_ns()
         return session
 
-    def look(self, session: zenoh.Session) -> Look:
+    def observe(self, session: zenoh.Session) -> Observation:
         """Return the connections from the network, and whether the daemon is connected."""
         links = session.info.links()
-        near = [link for link in links if str(link.dst).startswith("tcp/")]
-        holders = tuple(link.auth_identifier or "" for link in links if link not in near)
-        unanswered = self._question.unanswered(session, clock.mono_ns()) if near else 0
-        return Look(clock.mono_ns(), holders, bool(near), unanswered)
+        # Only the daemon connects without TLS.
+        local = [link for link in links if str(link.dst).startswith("tcp/")]
+        holders = tuple(link.auth_identifier or "" for link in links if link not in local)
+        unanswered = self._probe.unanswered(session, clock.mono_ns()) if local else 0
+        return Observation(clock.mono_ns(), holders, bool(local), unanswered)
 
-    def tell(self, session: zenoh.Session, look: Look, watch: Watch) -> None:
-        """Report to the daemon, which shows it in `state`."""
+    def report(self, session: zenoh.Session, observed: Observation, health: SessionHealth) -> None:
+        """Publish the number of connections. The daemon shows it in `state`."""
         if self._publisher is None:
             self._ends_ns = ends_ns(self._config.bus.tls) or 0
             key, kind = full_key(self._config.robot.id, "gateway"), "GatewayState"
             encoding = encoding_name("msgpack", kind)
             self._publisher = session.declare_publisher(key, encoding=encoding)
-        said = GatewayState(self._opened_ns, len(look.holders), watch.full, self._ends_ns)
-        self._publisher.put(encode(said, "msgpack"))
+        state = GatewayState(self._opened_ns, len(observed.holders), health.full, self._ends_ns)
+        self._publisher.put(encode(state, "msgpack"))
 
 
-class Question:
-    """Repeated query to the daemon, because an open connection does not prove that data arrives.
+class DaemonProbe:
+    """Queries the daemon again and again, because an open connection may carry no data.
 
     On a machine with forty times the work that it can do, two gateways ended within half a minute.
-    The connection of the third stayed open for minutes, while the daemon's Zenoh did not read from
-    it.
+    The connection of the third gateway then stayed open for minutes, while the daemon's Zenoh did
+    not read from it.
     """
 
     def __init__(self, key: str) -> None:
+        """Prepare queries of `key`, which the daemon answers."""
         self._key, self._asked_ns, self._unanswered = key, 0, 0
         self._ended = threading.Event()
-        """Set when the query has ended. An end without a reply also counts as an answer, because
-        the daemon has received the query.
+        """Set when the query has ended.
+
+        An end without a reply is an answer too, because the daemon has received the query.
         """
 
     def unanswered(self, session: zenoh.Session, now_ns: int) -> int:
-        """Return the number of consecutive queries that have not ended yet."""
-        if now_ns - self._asked_ns < ASK_NS:
+        """Send a query if the last one is a second old.
+
+        Returns the number of consecutive queries that did not end within a second.
+        """
+        if now_ns - self._asked_ns < PROBE_NS:
             return self._unanswered
         if self._asked_ns:
             self._unanswered = 0 if self._ended.is_set() else self._unanswered + 1
         self._asked_ns = now_ns
         self._ended.clear()
         handler: Any = Callback(lambda reply: None, self._ended.set, indirect=False)
-        session.get(self._key, handler=handler, timeout=LET_GO_S)
+        session.get(self._key, handler=handler, timeout=QUERY_TIMEOUT_S)
         return self._unanswered

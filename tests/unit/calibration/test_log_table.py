@@ -33,6 +33,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.topics import by_key
+from tests.unit.calibration import cut
 
 LOG_HEADER = b"t,left,right,yaw_rate\n"
 
@@ -363,3 +364,14 @@ def test_the_keys_are_of_the_table() -> None:
 def test_what_tells_nothing_of_wheels_or_turns_is_no_row(message: Message) -> None:
     with pytest.raises(ValueError, match="cannot be in a log"):
         row(message, 0)
+
+
+def test_a_table_is_that_of_the_written_log() -> None:
+    """`cut.table` spares the other tests the text between a drive and its table."""
+    seen = cut.usual()
+    for gyro, places in ((False, True), (True, False), (True, True)):
+        direct = cut.table(seen, gyro=gyro, places=places)
+        written = read(seen.csv(gyro=gyro, places=places).encode())
+        assert list(direct.columns) == list(written.columns)
+        for name, values in direct.columns.items():
+            assert np.allclose(values, written.columns[name], rtol=0, atol=1e-12, equal_nan=True)

@@ -5,23 +5,14 @@ from __future__ import annotations
 import pytest
 
 from acsard.checkup import checkup_report, lateness
-from acsard.checkup.checkup_report import report, row, summary
+from acsard.checkup.checkup_report import report, summary
 from acsard.checkup.findings import REST, Finding
 from acsard.core.config.contradictions import contradictions
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
-from acsard.terminal.output import plain
 from tests.unit.checkup.robots import configured
 
 RATE = Finding("baud rate", "PASS", keys={"mcu.baud_rate": 57600})
-
-
-def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
-    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
-    head, *rest = plain(row(finding), width=100).splitlines()
-    assert head == "FAIL    watchdog               none"
-    assert all(line.startswith(" " * 8) for line in rest)
-    assert rest[-1] == "        -> give it one"
 
 
 def test_a_board_passes_that_answered_and_failed_in_nothing() -> None:

@@ -6,14 +6,12 @@ import argparse
 
 import pytest
 
-from acsard.cli import accuracy
+from acsard.cli import parser
 from tests.each import each
 
 
 def parsed(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    accuracy.add(parser.add_subparsers())
-    return parser.parse_args(["accuracy", *words])
+    return parser(["accuracy"]).parse_args(["accuracy", *words])
 
 
 def test_it_looks_for_ten_seconds_and_ends() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import re
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from acsard.cli import calibrate
+from acsard.cli import parser
 from acsard.core.config.parsing import parse
 from acsard.host.errors import Exit, ExitError, UnreachableError, UsageError
 from tests.unit.calibration.cut import usual
@@ -23,10 +22,8 @@ def called(where: Path, log: str, *words: str, text: str = "# mine\n") -> int:
     """Return the exit code of `acsard calibrate --log drive.csv` with these further arguments."""
     (where / "acsard.toml").write_text(text)
     (where / "drive.csv").write_text(log)
-    parser = argparse.ArgumentParser()
-    calibrate.add(parser.add_subparsers())
     given = ["calibrate", "--log", str(where / "drive.csv"), "--config", str(where / "acsard.toml")]
-    args = parser.parse_args([*given, *words])
+    args = parser(["calibrate"]).parse_args([*given, *words])
     return int(args.main(args))
 
 
@@ -120,9 +117,7 @@ def test_a_refusal_has_what_was_told_of_the_log(
 
 
 def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
-    parser = argparse.ArgumentParser()
-    calibrate.add(parser.add_subparsers())
-    args = parser.parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
+    args = parser(["calibrate"]).parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
     with pytest.raises(ExitError, match="correct --log"):
         args.main(args)
 
@@ -142,9 +137,7 @@ def test_what_ros_records_is_told_to_be_exported(
             channel = writer.register_channel("/odom", "cdr", schema)
             writer.add_message(channel, 1, b"\0\1\0\0", 1)
             writer.finish()
-    parser = argparse.ArgumentParser()
-    calibrate.add(parser.add_subparsers())
-    args = parser.parse_args(["calibrate", "--json", "--log", str(log)])
+    args = parser(["calibrate"]).parse_args(["calibrate", "--json", "--log", str(log)])
     with pytest.raises(ExitError, match="export it as CSV"):
         args.main(args)
     assert "export it as CSV" in json.loads(capsys.readouterr().out)["refused"]
@@ -161,9 +154,7 @@ def test_a_distance_is_a_length_in_metres(tmp_path: Path, word: str) -> None:
 
 def driving(*words: str) -> int:
     """Return the exit code of `acsard calibrate` with these arguments and no terminal."""
-    parser = argparse.ArgumentParser()
-    calibrate.add(parser.add_subparsers())
-    args = parser.parse_args(["calibrate", *words])
+    args = parser(["calibrate"]).parse_args(["calibrate", *words])
     return int(args.main(args))
 
 

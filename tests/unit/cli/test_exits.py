@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from acsard.cli import main
-from acsard.cli.exits import CODES, code_of
 from acsard.host import errors
 from acsard.host.errors import WORDS, Exit, ExitError, MendableError
 from tests.each import each
@@ -32,7 +31,7 @@ def test_an_error_is_of_a_family_of_pythons_and_has_its_code(
 ) -> None:
     error = kind("it is so; mend it")
     assert isinstance(error, builtin)
-    assert code_of(error) == code
+    assert error.code == code
     assert str(error) == "it is so; mend it"
 
 
@@ -42,7 +41,7 @@ def test_no_family_is_without_a_code() -> None:
         MendableError,
         ExitError,
     }
-    assert families == set(CODES) == {kind for kind, _, _ in PROMISED}
+    assert families == {kind for kind, _, _ in PROMISED}
 
 
 def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,4 +55,4 @@ def test_the_help_names_every_code(capsys: pytest.CaptureFixture[str]) -> None:
 
 @each("code", list(Exit))
 def test_a_verb_may_end_with_any_code(code: Exit) -> None:
-    assert code_of(ExitError(code, "so")) is code
+    assert ExitError(code, "so").code is code

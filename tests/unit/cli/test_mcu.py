@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import fcntl
 import io
 import json
@@ -19,15 +18,14 @@ import pytest
 from msgspec import structs
 
 from acsard.checkup import procedure
-from acsard.cli import mcu
-from acsard.cli.exits import code_of
+from acsard.cli import mcu, parser
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
 from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
-from acsard.prompts.prompt import ended_by_signals
-from acsard.prompts.terminal_prompt import TerminalPrompt
+from acsard.terminal.prompt import ended_by_signals
+from acsard.terminal.terminal_prompt import TerminalPrompt
 from tests.unit.checkup.robots import Busy, Robot
 
 
@@ -36,9 +34,7 @@ def called(where: Path, *words: str, text: str = "") -> int:
     file = where / "acsard.toml"
     if not file.exists():
         file.write_text(text)
-    parser = argparse.ArgumentParser()
-    mcu.add(parser.add_subparsers())
-    args = parser.parse_args(["mcu", "check", "--config", str(file), *words])
+    args = parser(["mcu"]).parse_args(["mcu", "check", "--config", str(file), *words])
     return int(args.main(args))
 
 
@@ -143,9 +139,7 @@ def test_write_without_a_file_is_told_before_anything_moves(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
     monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
-    parser = argparse.ArgumentParser()
-    mcu.add(parser.add_subparsers())
-    args = parser.parse_args(["mcu", "check", "--port", "sim", "--yes", "--write"])
+    args = parser(["mcu"]).parse_args(["mcu", "check", "--port", "sim", "--yes", "--write"])
     with pytest.raises(ExitError, match="no configuration file"):
         args.main(args)
 
@@ -162,7 +156,7 @@ def test_without_a_terminal_and_without_yes_it_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("lifted\n"))
-    with pytest.raises(ExitError, match="terminal") as end:
+    with pytest.raises(UsageError, match="terminal") as end:
         called(tmp_path, "--port", "sim")
     assert end.value.code == Exit.USAGE
 
@@ -172,7 +166,7 @@ def test_without_a_terminal_and_without_yes_it_refuses(
 def test_the_simulator_is_never_taken_for_a_board(
     tmp_path: Path, text: str, words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(ExitError, match="acsard ports") as end:
+    with pytest.raises(UsageError, match="acsard ports") as end:
         called(tmp_path, *words, text=text)
     assert end.value.code == Exit.USAGE
     assert capsys.readouterr().out == ""
@@ -208,7 +202,7 @@ def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
     ends = pty.openpty()
     try:
         for port in (os.ttyname(ends[1]), "/dev/null"):
-            with pytest.raises(ExitError, match="--wheels-are-lifted") as end:
+            with pytest.raises(UsageError, match="--wheels-are-lifted") as end:
                 called(tmp_path, "--yes", "--port", port)
             assert end.value.code == Exit.USAGE
     finally:
@@ -220,7 +214,7 @@ def test_yes_alone_is_refused_on_what_is_no_simulator(tmp_path: Path) -> None:
 def test_a_port_that_is_not_there_is_66(tmp_path: Path, words: list[str]) -> None:
     with pytest.raises(NoPortError, match="acsard ports") as end:
         called(tmp_path, *words, "--port", str(tmp_path / "none"))
-    assert code_of(end.value) == 66
+    assert end.value.code == 66
 
 
 def test_a_person_is_asked_until_the_answer_is_one(
@@ -277,7 +271,7 @@ def test_progress_does_not_go_into_a_pipe(
 
 
 def test_yes_and_a_program_that_asks_are_not_both(tmp_path: Path) -> None:
-    with pytest.raises(ExitError, match="--json-lines") as end:
+    with pytest.raises(UsageError, match="--json-lines") as end:
         called(tmp_path, "--port", "sim", "--yes", "--json-lines")
     assert end.value.code == Exit.USAGE
 

@@ -273,10 +273,10 @@ def test_a_replay_says_what_it_has_compared(
     _, out, _ = log(capsys, where, "replay", "1")
     _, told = out.splitlines()
     for word in (
-        "every line to the board",
-        "every pose",
-        "the mode in every step",
-        "the recording",
+        "Each line to the board",
+        "each pose",
+        "the mode of each step",
+        "the recorded inputs",
     ):
         assert word in told
 
@@ -294,9 +294,9 @@ def test_with_another_configuration_it_tells_what_would_have_been(
     other.write_text("[limits]\nlinear_speed = 0.3\n")
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
     assert code == 0
-    assert "the first difference, in its line, left: step " in out
-    assert "  then  ap" in out
-    assert "the fastest wheel: 10.00 rad/s then, 6.00 rad/s now" in out
+    assert " s after the beginning: line, sent line\n" in out
+    assert "  recorded  ap" in out
+    assert "the fastest wheel of all lines: 10.00 rad/s recorded, 6.00 rad/s replayed" in out
 
 
 def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_nothing_of_it(
@@ -307,10 +307,10 @@ def test_it_tells_which_limits_are_others_what_they_do_and_that_the_wheels_knew_
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(other))
     assert code == 0
     (keys,) = [line for line in out.splitlines() if line.startswith("changed settings: ")]
-    assert "limits.linear_speed 1.0 then, 0.1 now" in keys
-    assert "limits.linear_acceleration 1.0 then, 0.5 now" in keys
-    (told,) = [line for line in out.splitlines() if line.startswith("there the fastest wheel")]
-    assert told.endswith(": by limits.linear_speed, limits.linear_acceleration")
+    assert "limits.linear_speed was 1.0, is 0.1" in keys
+    assert "limits.linear_acceleration was 1.0, is 0.5" in keys
+    (told,) = [line for line in out.splitlines() if line.startswith("the fastest wheel of that")]
+    assert told.endswith(", because of limits.linear_speed, limits.linear_acceleration")
     then, now = (float(word) for word in re.findall(r"(\d+\.\d+) rad/s", told))
     assert then > now
     (fault,) = [line for line in out.splitlines() if "in fault from " in line]
@@ -325,8 +325,8 @@ def test_settings_that_change_no_line_are_told_all_the_same(
     same.write_text("[rates]\nstate = 5.0\n")
     code, out, _ = log(capsys, where, "replay", "1", "--config", str(same))
     assert (code, "differs" in out) == (0, False)
-    assert "as that configuration computes them from the same inputs" in out
-    assert out.splitlines()[-1].startswith("changed settings: rates.state 10.0 then, 5.0 now")
+    assert "computed with that configuration from the recorded inputs" in out
+    assert out.splitlines()[-1].startswith("changed settings: rates.state was 10.0, is 5.0")
 
 
 def test_what_was_cut_is_written_as_a_finished_file(

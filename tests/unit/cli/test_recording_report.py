@@ -14,8 +14,8 @@ import pytest
 
 from acsard.cli import main
 from acsard.recording.file import Recording
+from acsard.recording.file_replay import steps
 from acsard.recording.recorded_steps import MICRO
-from acsard.recording.replayed import steps
 from tests.scenarios.taped import chunks
 from tests.unit.report.seen import column
 
@@ -39,7 +39,7 @@ def pictures(path: Path) -> dict[str, list[dict[str, Any]]]:
 @lru_cache
 def ends_at() -> tuple[float, float]:
     """Return the robot's last recorded position, m."""
-    poses = [pose for step in steps(Recording(QUIET)) for pose in step.said.poses]
+    poses = [pose for step in steps(Recording(QUIET)) for pose in step.recorded.poses]
     return poses[-1][0] / MICRO, poses[-1][1] / MICRO
 
 

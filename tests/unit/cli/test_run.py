@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 import pytest
 
-from acsard.cli import run
+from acsard.cli import parser, run
+from acsard.cli.common import tables
 from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config, McuConfig, WebConfig
-from acsard.doctor.running import OPTIONS
+from acsard.machine.running import OPTIONS
 from tests.each import each
 
 
 def given_by(*words: str) -> dict[str, dict[str, object]]:
-    parser = argparse.ArgumentParser()
-    run.add(parser.add_subparsers())
-    return run.overrides(parser.parse_args(["run", *words]))
+    return tables(run.options(parser(["run"]).parse_args(["run", *words])), {})
 
 
 def test_without_options_nothing_is_overridden() -> None:
@@ -86,12 +84,10 @@ def test_the_banner_has_what_a_newcomer_types_next_and_the_page_where_it_is_serv
 
 
 def test_the_banner_s_tools_reach_this_daemon_and_no_other() -> None:
-    parser = argparse.ArgumentParser()
-    run.add(parser.add_subparsers())
-    bare = parser.parse_args(["run"])
+    bare = parser(["run"]).parse_args(["run"])
     assert run.reach(bare) == ""
     words = ["run", "--id", "two", "--listen", "tcp/0.0.0.0:7458", "--config", "my robot.toml"]
-    options = run.reach(parser.parse_args(words))
+    options = run.reach(parser(["run"]).parse_args(words))
     assert options == " --config 'my robot.toml' --connect tcp/127.0.0.1:7458 --id two"
     told = run.banner(Config(), "acsard.toml", "/dev/pts/3", reach=options)
     assert f"acsard call stop{options} " in told

@@ -84,7 +84,7 @@ def test_the_answer_says_how_long_the_setting_lasts(
         def set(self, settings: dict[str, object]) -> ServiceReply:
             return ServiceReply(True, "done")
 
-    monkeypatch.setattr("acsard.client.connect", lambda *words, **more: Robot())
+    monkeypatch.setattr("acsard.cli.connection.connect", lambda *words, **more: Robot())
     args = parser().parse_args(["set", key, "0.5"])
     assert args.main(args) == 0
     assert capsys.readouterr().out == f"done{until}\n"

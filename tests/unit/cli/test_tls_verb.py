@@ -375,7 +375,7 @@ def test_add_with_a_broken_authority_says_so(
 
 AS_NOBODY = """\
 import os, sys
-import acsard.certificates.authority
+import acsard.machine.authority
 from acsard.cli import main
 try:
     main(["tls", "init", "--help"])  # nobody may not be let read what is imported late

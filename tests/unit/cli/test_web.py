@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.certificates.authority import Authority
 from acsard.cli import main
+from acsard.machine.authority import Authority
 
 
 def test_an_invitation_that_nobody_could_follow_names_the_file_that_was_read(

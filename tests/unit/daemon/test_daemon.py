@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config, RecordConfig
 from acsard.daemon.daemon import _recorder
 from acsard.recording import recorder
-from acsard.recording.end_record import closing
+from acsard.recording.end_record import read_end
 from tests.scenarios.world import World
 
 
@@ -37,6 +37,6 @@ def test_the_black_box_hears_by_what_it_ends_and_hides_nothing_of_it(
     with pytest.raises(type(error)) as raised:
         asyncio.run(run())
     assert cut == "" or raised.value is error
-    last = closing(next(tmp_path.glob("*.mcap")))
+    last = read_end(next(tmp_path.glob("*.mcap")))
     assert last is not None
     assert (last.cut, last.why) == (cut, "ValueError: a fault of our own" if cut else "")

@@ -17,8 +17,8 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.values import Event, Instant, Latch, Latches
 from acsard.daemon import latch_file as module
-from acsard.daemon.kept_latches import MAX_BYTES, encode
 from acsard.daemon.latch_file import LatchFile, place
+from acsard.daemon.latch_rules import MAX_BYTES, encode
 from acsard.host.atomic_file import replace as replace_file
 from acsard.host.atomic_file import sync as sync_file
 from acsard.host.errors import InUseError

@@ -90,14 +90,14 @@ def test_every_figure_is_there_from_the_start() -> None:
 
 def test_a_measurement_counts_for_both() -> None:
     figures = Figures()
-    figures.add("step_time", NS_PER_S, 250 * US)
+    figures["step_time"].add(NS_PER_S, 250 * US)
     one = step_time(figures, NS_PER_S)
     assert one.since_start == one.last_minute == Spread(1, 250.0, 250.0, 250.0)
 
 
 def test_after_a_minute_it_counts_for_the_start_alone() -> None:
     figures = Figures()
-    figures.add("step_time", 0, 250 * US)
+    figures["step_time"].add(0, 250 * US)
     assert step_time(figures, MINUTE_NS - 1).last_minute.count == 1
     one = step_time(figures, MINUTE_NS + NS_PER_S)
     assert (one.since_start.count, one.last_minute.count) == (1, 0)
@@ -107,7 +107,7 @@ def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
     for pause in range(1, 3 * SLOTS):
         figures = Figures()
         for slot in range(SLOTS):
-            figures.add("step_time", slot * SLOT_NS, 100 * US)
+            figures["step_time"].add(slot * SLOT_NS, 100 * US)
         now_ns = (SLOTS - 1 + pause) * SLOT_NS
         left = max(0, SLOTS - pause)
         assert step_time(figures, now_ns).last_minute.count == left
@@ -115,9 +115,9 @@ def test_a_pause_of_any_length_leaves_nothing_old_in_the_minute() -> None:
 
 def test_what_is_told_is_at_most_a_second_old() -> None:
     figures = Figures()
-    figures.add("step_time", 0, 100 * US)
+    figures["step_time"].add(0, 100 * US)
     assert step_time(figures, 0).since_start.count == 1
-    figures.add("step_time", 1, 100 * US)
+    figures["step_time"].add(1, 100 * US)
     assert step_time(figures, NS_PER_S - 1).since_start.count == 1
     assert step_time(figures, NS_PER_S).since_start.count == 2
 
@@ -129,7 +129,7 @@ def test_the_minute_is_what_a_histogram_of_its_measurements_says(
     figures, now_ns, kept = Figures(), 0, []
     for wait_ns, duration_ns in measurements:
         now_ns += wait_ns
-        figures.add("mcu_round_trip", now_ns, duration_ns)
+        figures["mcu_round_trip"].add(now_ns, duration_ns)
         kept.append((now_ns, duration_ns))
     minute = Histogram()
     for at_ns, duration_ns in kept:
@@ -148,10 +148,10 @@ def test_a_day_takes_no_more_memory_than_a_minute() -> None:
 
     figures = Figures()
     for second in range(60):
-        figures.add("period_lateness", second * NS_PER_S, second * US)
+        figures["period_lateness"].add(second * NS_PER_S, second * US)
     after_a_minute = size(figures)
     for second in range(60, 86_400, 7):
-        figures.add("period_lateness", second * NS_PER_S, second * US)
+        figures["period_lateness"].add(second * NS_PER_S, second * US)
     assert size(figures) == after_a_minute
 
 

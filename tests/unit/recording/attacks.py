@@ -16,7 +16,7 @@ import sys
 
 from acsard.core.robot import Robot
 from acsard.recording.state import PROTOCOL, StateError, thaw
-from acsard.recording.unpickling import HASHED, MOST_BYTES, MOST_OPCODES
+from acsard.recording.unpickling import MAX_BYTES, MAX_KEY, MAX_OPCODES
 
 EXTENSION = 201
 
@@ -56,7 +56,7 @@ def of_one_hash(keys: int) -> bytes:
 
     Python must compare each key with all others.
     """
-    pairs = (pickle.LONG1 + b"\x0c" + (key * HASHED).to_bytes(12, "little") for key in range(keys))
+    pairs = (pickle.LONG1 + b"\x0c" + (key * MAX_KEY).to_bytes(12, "little") for key in range(keys))
     return pickle.EMPTY_DICT + pickle.MARK + ONE.join(pairs) + ONE + pickle.SETITEMS
 
 
@@ -88,8 +88,8 @@ BODIES: dict[str, bytes] = {
     "an element that doubles": pickle.EMPTY_SET + b"(" + doubled(48) + pickle.ADDITEMS,
     "elements that double": b"(" + doubled(48) + pickle.FROZENSET,
     "a mode that doubles": MODE + doubled(48) + pickle.TUPLE1 + pickle.REDUCE,
-    "parts without end": pickle.NONE * MOST_OPCODES + NOTHING,
-    "bytes without end": pickle.BINBYTES + struct.pack("<I", MOST_BYTES) + bytes(MOST_BYTES),
+    "parts without end": pickle.NONE * MAX_OPCODES + NOTHING,
+    "bytes without end": pickle.BINBYTES + struct.pack("<I", MAX_BYTES) + bytes(MAX_BYTES),
     "a number of 200 bytes": pickle.LONG1 + b"\xc8" + bytes(199) + b"\x7f",
     "a number of 100 000 bytes": pickle.LONG4 + struct.pack("<i", 100_000) + b"\x7f" * 100_000,
     "a number in 4000 figures": pickle.INT + b"9" * 4000 + b"\n",

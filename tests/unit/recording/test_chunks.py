@@ -14,15 +14,15 @@ from mcap.records import Chunk
 from mcap.stream_reader import breakup_chunk
 
 from acsard.recording.chunks import (
-    GROWING,
+    GROWING_HEAD,
     LAST_BLOCK,
-    MOST_IN_MESSAGE,
+    MAX_MESSAGE_BYTES,
     PARAMETERS,
     ZSTD,
-    Growing,
+    GrowingChunk,
     Message,
-    content,
-    places,
+    chunk_places,
+    read_chunk,
 )
 from acsard.recording.mcap_records import MAGIC, walk
 from tests.each import each
@@ -40,7 +40,7 @@ ALL = [message for second in SECONDS for message in second]
 
 def grown(seconds: list[list[Message]]) -> tuple[bytes, list[int], bytes]:
     """Return the chunk that still grows, where each second ends in it, and the complete chunk."""
-    chunk, data, ends = Growing(), GROWING, []
+    chunk, data, ends = GrowingChunk(), GROWING_HEAD, []
     for second in seconds:
         for message in second:
             chunk.add(message)
@@ -55,7 +55,7 @@ GROWS, ENDS, COMPLETE = grown(SECONDS)
 
 def test_a_chunk_that_grows_has_all_seconds_so_far() -> None:
     for number, end in enumerate(ENDS, start=1):
-        got = content(GROWS[:end], 0)
+        got = read_chunk(GROWS[:end], 0)
         assert got is not None
         assert got.messages == [message for second in SECONDS[:number] for message in second]
         assert (got.end, got.complete) == (end, False)
@@ -63,9 +63,9 @@ def test_a_chunk_that_grows_has_all_seconds_so_far() -> None:
 
 @pytest.mark.parametrize("torn", [b"", bytes(700), DICE.randbytes(64)])
 def test_a_cut_anywhere_costs_the_second_that_it_is_in(torn: bytes) -> None:
-    for cut in range(len(GROWING), len(GROWS), 7):
+    for cut in range(len(GROWING_HEAD), len(GROWS), 7):
         whole = sum(end <= cut for end in ENDS)
-        got = content(GROWS[:cut] + torn, 0)
+        got = read_chunk(GROWS[:cut] + torn, 0)
         assert got is not None
         assert got.messages[: 3 * whole] == ALL[: 3 * whole]
         assert got.messages == ALL[: len(got.messages)]
@@ -73,11 +73,11 @@ def test_a_cut_anywhere_costs_the_second_that_it_is_in(torn: bytes) -> None:
 
 
 def test_the_formats_own_reader_reads_a_complete_chunk_and_one_that_was_cut_and_ended() -> None:
-    cut = content(GROWS[: ENDS[6] + 9], 0)
+    cut = read_chunk(GROWS[: ENDS[6] + 9], 0)
     assert cut is not None
-    ended = cut.head(GROWS) + GROWS[len(GROWING) : cut.end] + LAST_BLOCK
+    ended = cut.head(GROWS) + GROWS[len(GROWING_HEAD) : cut.end] + LAST_BLOCK
     for data, messages in ((COMPLETE, ALL), (ended, ALL[:21])):
-        got = content(data, 0)
+        got = read_chunk(data, 0)
         assert got is not None
         assert (got.messages, got.end, got.complete) == (messages, len(data), True)
         chunk = Chunk.read(ReadDataStream(io.BytesIO(data[9:])))
@@ -91,8 +91,8 @@ def test_no_damage_changes_a_message_and_none_in_the_head_costs_one() -> None:
     for at in range(len(COMPLETE)):
         bad = bytearray(COMPLETE)
         bad[at] ^= 1 << DICE.randrange(8)
-        got = content(bytes(bad), 0)
-        if at < len(GROWING):
+        got = read_chunk(bytes(bad), 0)
+        if at < len(GROWING_HEAD):
             assert got is None or got.messages == ALL
             continue
         assert got is not None
@@ -102,20 +102,20 @@ def test_no_damage_changes_a_message_and_none_in_the_head_costs_one() -> None:
 
 
 def test_a_chunk_may_begin_wherever_the_name_of_its_compression_is() -> None:
-    assert list(places(bytes(100) + COMPLETE + COMPLETE, 0)) == [100, 100 + len(COMPLETE)]
-    assert content(bytes(100), 0) is None
-    assert content(ZSTD, 0) is None
+    assert list(chunk_places(bytes(100) + COMPLETE + COMPLETE, 0)) == [100, 100 + len(COMPLETE)]
+    assert read_chunk(bytes(100), 0) is None
+    assert read_chunk(ZSTD, 0) is None
 
 
 def test_a_chunk_of_very_many_blocks_takes_a_time_in_proportion() -> None:
-    chunk, data, message = Growing(), GROWING, Message(1, 5, b"")
+    chunk, data, message = GrowingChunk(), GROWING_HEAD, Message(1, 5, b"")
     parts = []
     for _ in range(20_000):
         chunk.add(message)
         parts.append(chunk.take())
     data += b"".join(parts)
     began = time.process_time()
-    got = content(data, 0)
+    got = read_chunk(data, 0)
     assert got is not None
     assert got.messages == [message] * 20_000
     assert time.process_time() - began < 2.0
@@ -123,23 +123,23 @@ def test_a_chunk_of_very_many_blocks_takes_a_time_in_proportion() -> None:
 
 def test_many_chunks_that_ask_for_megabytes_take_a_time_in_proportion() -> None:
     """Each claims a message of 4 MB that does not end, so each must be decompressed."""
-    inside = struct.pack("<BQ", 5, MOST_IN_MESSAGE - 100) + bytes(MOST_IN_MESSAGE - 200)
+    inside = struct.pack("<BQ", 5, MAX_MESSAGE_BYTES - 100) + bytes(MAX_MESSAGE_BYTES - 200)
     packed = zstandard.ZstdCompressor(compression_params=PARAMETERS).compress(inside)
-    data = MAGIC + (GROWING + packed[:-20]) * 1000
+    data = MAGIC + (GROWING_HEAD + packed[:-20]) * 1000
     began = time.process_time()
     assert [found.messages for found in walk(data)] == [[]]
     assert time.process_time() - began < 3.0
 
 
-FRAME_HEAD = GROWS[len(GROWING) :][: zstandard.frame_header_size(GROWS[len(GROWING) :])]
+FRAME_HEAD = GROWS[len(GROWING_HEAD) :][: zstandard.frame_header_size(GROWS[len(GROWING_HEAD) :])]
 
-LONG = struct.pack("<BQ", 5, MOST_IN_MESSAGE - 100)
+LONG = struct.pack("<BQ", 5, MAX_MESSAGE_BYTES - 100)
 """Beginning of a message of 4 MB."""
 
-EACH = len(GROWING + FRAME_HEAD + LONG) + 3
+EACH = len(GROWING_HEAD + FRAME_HEAD + LONG) + 3
 
 
-def with_a_shared_tail(count: int, tail: bytes, head: bytes = GROWING) -> bytes:
+def with_a_shared_tail(count: int, tail: bytes, head: bytes = GROWING_HEAD) -> bytes:
     """Return chunks that each have all later ones, as one raw block, and the same tail behind."""
     parts = []
     for number in range(count):
@@ -157,24 +157,24 @@ def raw(data: bytes) -> bytes:
     return (len(data) << 3).to_bytes(3, "little") + data
 
 
-@each("first", [b"\0", struct.pack("<BQ", 5, 1 << 28), struct.pack("<BQ", 5, MOST_IN_MESSAGE)])
+@each("first", [b"\0", struct.pack("<BQ", 5, 1 << 28), struct.pack("<BQ", 5, MAX_MESSAGE_BYTES)])
 def test_a_few_bytes_that_ask_for_gigabytes_get_nothing(first: bytes) -> None:
     """The first byte of a message is its type, the next eight are its length."""
-    data = GROWING + FRAME_HEAD + raw(first) + REPEATED * 30_000
+    data = GROWING_HEAD + FRAME_HEAD + raw(first) + REPEATED * 30_000
     began = time.process_time()
-    got = content(data, 0)
+    got = read_chunk(data, 0)
     assert got is not None
     assert (got.messages, got.complete) == ([], False)
     assert time.process_time() - began < 0.5
 
 
-NEXT = GROWING[:1] + struct.pack("<Q", EACH - 9) + GROWING[9:]
+NEXT = GROWING_HEAD[:1] + struct.pack("<Q", EACH - 9) + GROWING_HEAD[9:]
 """Head of a chunk whose record ends at the next chunk."""
 
 
 @each(
     ("tail", "head"),
-    [(REPEATED * 62, GROWING), (REPEATED * 62, NEXT), (b"\x0a\0\0x" * 4000, GROWING)],
+    [(REPEATED * 62, GROWING_HEAD), (REPEATED * 62, NEXT), (b"\x0a\0\0x" * 4000, GROWING_HEAD)],
 )
 def test_many_chunks_that_share_their_end_take_a_time_in_proportion(
     tail: bytes, head: bytes

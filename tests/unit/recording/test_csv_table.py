@@ -10,8 +10,15 @@ from acsard.calibration.log_table import read
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
 from acsard.core.values import GyroSample, Instant
-from acsard.recording.csv_table import HEADER, MEASURED_HEADER, measured, rolled, rows, turned
-from acsard.recording.replay import lived
+from acsard.recording.csv_table import (
+    HEADER,
+    MEASURED_HEADER,
+    gyro_columns,
+    measured,
+    rows,
+    wheel_columns,
+)
+from acsard.recording.replay import replay_step
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -30,7 +37,7 @@ def test_a_line_for_each_feedback_and_each_report_of_the_gyro(tape: Tape) -> Non
     robot = Robot(GYRO)
     lines: list[str] = []
     for step in tape.steps():
-        lines += rows(step, lived(robot, step))
+        lines += rows(step, replay_step(robot, step))
     estimates = [e for t in tape.taken for e in t.outputs.estimates]
     reports = [one for t in tape.taken for one in t.inputs.gyro]
     cells = [line.split(",") for line in lines]
@@ -44,8 +51,8 @@ def test_calibration_reads_the_whole_table_and_what_is_measured_alike(tape: Tape
     robot, twin = Robot(GYRO), Robot(GYRO)
     whole, part = [HEADER], [MEASURED_HEADER]
     for step in tape.steps():
-        whole += rows(step, lived(robot, step))
-        part += measured(step, lived(twin, step))
+        whole += rows(step, replay_step(robot, step))
+        part += measured(step, replay_step(twin, step))
     tables = [read("\n".join(lines).encode()) for lines in (whole, part)]
     assert list(tables[0].columns) == ["t", "fr", "fl", "rl", "rr", "yaw_rate"]
     for name, values in tables[0].columns.items():
@@ -58,8 +65,8 @@ def test_calibration_reads_the_whole_table_and_what_is_measured_alike(tape: Tape
 def test_times_are_those_of_the_samples(tape: Tape) -> None:
     estimate = tape.taken[-1].outputs.estimates or tape.taken[-2].outputs.estimates
     wall_ns = estimate[0].at.wall_ns
-    assert rolled(estimate[0]).startswith(f"{wall_ns // 10**9}.{wall_ns % 10**9 // 1000:06}")
+    assert wheel_columns(estimate[0]).startswith(f"{wall_ns // 10**9}.{wall_ns % 10**9 // 1000:06}")
     now = Instant(START.mono_ns + 50, START.wall_ns + 50)
     arrived = GyroSample(START.mono_ns + 2_000_050, None, 0.25)
-    assert turned(arrived, now) == "1800000000.002000,,,,,0.25"
-    assert turned(replace(arrived, stamp_ns=1_500_000), now) == "0.001500,,,,,0.25"
+    assert gyro_columns(arrived, now) == "1800000000.002000,,,,,0.25"
+    assert gyro_columns(replace(arrived, stamp_ns=1_500_000), now) == "0.001500,,,,,0.25"

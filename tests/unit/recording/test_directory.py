@@ -22,7 +22,7 @@ from acsard.recording.directory import (
     Run,
     listed,
 )
-from acsard.recording.end_record import closing
+from acsard.recording.end_record import read_end
 from acsard.recording.file import About, Recording, Writing
 from acsard.recording.retention import KEPT_FILES, STEADY_NS, Kind
 
@@ -268,11 +268,11 @@ def test_what_is_being_written_and_what_is_not_ours_stays(tmp_path: Path) -> Non
 def test_a_file_becomes_a_kept_one_later(tmp_path: Path) -> None:
     one = ring(tmp_path)
     path = record(one)
-    one.keep(path)
+    one.retain(path)
     (near,) = listed(tmp_path)
     assert near.name == path.name.replace(".mcap", NEAR)
     for _ in range(2):
-        one.keep(near)
+        one.retain(near)
     assert listed(tmp_path) == [near]
 
 
@@ -292,7 +292,7 @@ def test_what_a_crash_has_cut_is_made_whole_and_kept(tmp_path: Path) -> None:
     recording = Recording(path)
     assert [data for _, _, data in recording.messages()] == [b"whole"]
     assert recording.whole
-    last = closing(path)
+    last = read_end(path)
     assert last is not None
     assert last.cut == "crash"
     again.close()
@@ -308,7 +308,7 @@ def test_what_a_disk_has_cut_is_made_whole_like_any_other(tmp_path: Path) -> Non
     Ring(RecordConfig(str(tmp_path)), Run(cut={writing.path.name: "plain"}))
     (path,) = listed(tmp_path)
     assert path.name == writing.path.name.removesuffix(".part")
-    last = closing(path)
+    last = read_end(path)
     assert last is not None
     assert last.cut == "disk"
 
@@ -350,7 +350,7 @@ def test_what_was_cut_and_cannot_be_read_here_stays_and_is_told(
     (path,) = listed(tmp_path)
     assert path.read_bytes() == before
     assert path.name.endswith(KEPT)
-    (said,) = one.said
+    (said,) = one.messages
     assert path.name in said
     assert ("acsard/99" if not event else "an event that cannot be read") in said
 

@@ -12,7 +12,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Metadata, MetadataIndex
 
 from acsard.core.config.settings import Config
-from acsard.recording.end_record import END, TAIL_BYTES, EndRecord, closing, fields
+from acsard.recording.end_record import END, TAIL_BYTES, EndRecord, as_metadata, read_end
 from acsard.recording.mcap_records import MAGIC
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
@@ -40,7 +40,7 @@ def encoded(*records: McapRecord) -> bytes:
 
 
 FRONT = MAGIC + encoded(Header("", ""))
-BACK = encoded(Metadata(END, fields(LAST)), DataEnd(0))
+BACK = encoded(Metadata(END, as_metadata(LAST)), DataEnd(0))
 
 
 def footer(summary_at: int) -> bytes:
@@ -57,7 +57,7 @@ def test_a_chunk_that_unpacks_to_megabytes_is_not_unpacked(case: str, tmp_path: 
     path.write_bytes(data)
     tracemalloc.start()
     try:
-        assert closing(path) == LAST
+        assert read_end(path) == LAST
         assert tracemalloc.get_traced_memory()[1] < len(ZEROS) / 8
     finally:
         tracemalloc.stop()
@@ -70,7 +70,7 @@ def test_a_recording_of_the_daemon_ends_within_a_fraction_of_the_bytes_that_are_
     World(recorder=tape).drive(0.5, 0.2, seconds=1.0)
     tape.write(path, Config())
     data = path.read_bytes()
-    assert closing(path) is not None
+    assert read_end(path) is not None
     # The summary has the record's name as well, behind the record itself.
     name = struct.pack("<I", len(END)) + END.encode()
     assert len(data) - data.index(name) < TAIL_BYTES / 16
@@ -92,11 +92,11 @@ def test_a_recording_of_the_daemon_ends_within_a_fraction_of_the_bytes_that_are_
 def test_a_file_without_a_valid_end_has_none(data: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(data)
-    assert closing(path) is None
+    assert read_end(path) is None
 
 
 def test_many_names_of_the_record_take_a_time_in_proportion(tmp_path: Path) -> None:
     """Only the last one that has the form of the record is decoded."""
     path, name = tmp_path / "a.mcap", struct.pack("<I", len(END)) + END.encode()
     path.write_bytes(FRONT + BACK + name * 4000 + footer(0))
-    assert closing(path) == LAST
+    assert read_end(path) == LAST

@@ -24,9 +24,10 @@ from rosbags.typesys import Stores, get_typestore
 from acsard.core.config.settings import Config
 from acsard.core.ros.channels import CHANNELS
 from acsard.host.errors import RecordingError
-from acsard.recording.atomic_output import beside
-from acsard.recording.export import Kind, Span, export, measured
+from acsard.recording.atomic_output import replacing
+from acsard.recording.export import Kind, export, measured
 from acsard.recording.file import Recording
+from acsard.recording.time_span import Span
 from tests.scenarios.taped import Tape, chunks
 from tests.scenarios.world import START, World
 
@@ -168,7 +169,7 @@ def test_a_directory_that_is_no_bag_never_goes(path: Path, tmp_path: Path) -> No
     new.mkdir()
     (new / "chapter").write_text("1")
     for kind in ("mcap", "rosbag2"):
-        with pytest.raises(FileExistsError, match="not a bag"):
+        with pytest.raises(FileExistsError, match="not a ROS bag"):
             export(Recording(path), new, kind, force=True)
     assert (new / "chapter").read_text() == "1"
     assert [*tmp_path.iterdir()] == [new]
@@ -207,7 +208,7 @@ def test_a_bag_stays_until_the_new_one_can_take_its_place(tmp_path: Path) -> Non
     bag.mkdir()
     for name in ("metadata.yaml", "bag_0.db3"):
         (bag / name).write_text("1")
-    with pytest.raises(FileNotFoundError), beside(bag, force=True):
+    with pytest.raises(FileNotFoundError), replacing(bag, force=True):
         pass  # the block writes no file that could replace it
     assert {one.name for one in bag.iterdir()} == {"metadata.yaml", "bag_0.db3"}
     assert [*tmp_path.iterdir()] == [bag]

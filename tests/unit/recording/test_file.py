@@ -18,10 +18,10 @@ from acsard.core.config.settings import Config
 from acsard.core.config.writing import document
 from acsard.core.values import NS_PER_S, Instant
 from acsard.host.errors import RecordingError
-from acsard.recording.end_record import EndRecord, closing
+from acsard.recording.end_record import EndRecord, read_end
 from acsard.recording.file import CHUNK_BYTES, MODE, About, Recording, Writing, rewrite
+from acsard.recording.file_replay import config_of, replay_file, steps
 from acsard.recording.recorded_steps import status_of
-from acsard.recording.replayed import config_of, live, steps
 from acsard.recording.rows import encode
 from tests.scenarios.taped import BATCH, Tape, chunks
 from tests.scenarios.world import World
@@ -51,10 +51,10 @@ def test_all_comes_back(tape: Tape, whole: Path) -> None:
     recording = Recording(whole)
     read = list(steps(recording))
     assert [step.inputs for step in read] == [taken.inputs for taken in tape.taken]
-    assert [step.said.status for step in read] == [status_of(t.outputs) for t in tape.taken]
+    assert [step.recorded.status for step in read] == [status_of(t.outputs) for t in tape.taken]
     assert (recording.whole, recording.damaged) == (True, 0)
     assert config_of(recording) == Config()
-    assert live(recording).tally.same
+    assert replay_file(recording).comparison.same
 
 
 def test_the_formats_own_reader_reads_it(tape: Tape, whole: Path) -> None:
@@ -221,7 +221,7 @@ def test_a_file_that_was_cut_before_its_first_chunk_is_refused_in_words(
         tail = dice.choice([b"", bytes(512), dice.randbytes(64)])
         path.write_bytes(data[:size] + tail)
         with pytest.raises(RecordingError) as refused:
-            live(Recording(path))
+            replay_file(Recording(path))
         told = str(refused.value)
         assert (str(path) in told, told.isprintable()) == (True, True)
         if not tail:
@@ -314,7 +314,7 @@ def test_random_bytes_anywhere_raise_nothing_but_what_says_so(whole: Path, tmp_p
             bad[dice.randrange(len(bad))] = dice.randrange(256)
         path.write_bytes(bad)
         try:
-            live(Recording(path))
+            replay_file(Recording(path))
         except RecordingError as error:
             said.append(str(error))
     assert said
@@ -368,9 +368,9 @@ def test_steps_that_are_missing_end_a_replay_and_it_says_so(whole: Path, tmp_pat
     data, path = whole.read_bytes(), tmp_path / "gap.mcap"
     start, _ = chunks(data)[2]
     path.write_bytes(data[: start + 70] + bytes(20) + data[start + 90 :])
-    tally, trouble, _ = live(Recording(path))
-    assert tally.steps == 2 * BATCH
-    assert tally.same
+    comparison, trouble, _ = replay_file(Recording(path))
+    assert comparison.steps == 2 * BATCH
+    assert comparison.same
     assert trouble == f"{BATCH} steps are missing after step {2 * BATCH - 1}"
 
 
@@ -378,7 +378,7 @@ def test_a_finished_file_says_at_its_end_what_happened(
     tape: Tape, whole: Path, tmp_path: Path
 ) -> None:
     first, last = tape.taken[0].inputs.now, tape.taken[-1].inputs.now
-    said = closing(whole)
+    said = read_end(whole)
     assert said is not None
     assert (said.wall_ns, said.said) == (
         first.wall_ns,
@@ -387,10 +387,10 @@ def test_a_finished_file_says_at_its_end_what_happened(
     assert 0 <= last.wall_ns - said.last_ns < 2e9
     cut, new = tmp_path / "cut.mcap", tmp_path / "new.mcap"
     cut.write_bytes(whole.read_bytes()[:-100])
-    assert closing(cut) is None
+    assert read_end(cut) is None
     rewrite(Recording(cut), new)
-    assert closing(new) == replace(said, cut="open")
+    assert read_end(new) == replace(said, cut="open")
     assert said == EndRecord(said.wall_ns, said.last_ns, said.said)
     rewrite(Recording(new), tmp_path / "again.mcap", "crash")
-    assert closing(tmp_path / "again.mcap") == closing(new), "it was finished before"
-    assert closing(tmp_path / "none") is None
+    assert read_end(tmp_path / "again.mcap") == read_end(new), "it was finished before"
+    assert read_end(tmp_path / "none") is None

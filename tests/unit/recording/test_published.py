@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from acsard.core.config.settings import Config
 from acsard.core.robot import Robot
 from acsard.recording.published import MEASURED, Published, Publisher
-from acsard.recording.replay import lived
+from acsard.recording.replay import replay_step
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -18,7 +18,7 @@ from tests.scenarios.world import START, World
 def said(tape: Tape, config: Config) -> list[Published]:
     robot = Robot(config)
     publisher = Publisher(robot, START.wall_ns)
-    return [m for step in tape.steps() for m in publisher.step(step, lived(robot, step))]
+    return [m for step in tape.steps() for m in publisher.step(step, replay_step(robot, step))]
 
 
 def names(published: list[Published]) -> set[str]:

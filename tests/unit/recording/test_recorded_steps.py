@@ -48,5 +48,7 @@ def test_what_came_into_a_step_that_did_not_end_comes_back_whole() -> None:
         step = Unfinished(number, taken.inputs)
         assert unfinished(step.encode()) == step
     for data in (b"", b"none", Unfinished(1, taken.inputs).encode()[:-1]):
-        with pytest.raises(UnfinishedError, match="not an unfinished step"):
+        with pytest.raises(
+            UnfinishedError, match="the step in which the daemon failed cannot be read"
+        ):
             unfinished(data)

@@ -23,15 +23,15 @@ from acsard.core.incoming.commands import Arrival
 from acsard.core.link.serial_output import Offered
 from acsard.core.robot import Robot
 from acsard.core.values import Event, Inputs, Instant, Latch, Latches, Outputs
-from acsard.recording import disk, retention
 from acsard.recording import recorder as module
+from acsard.recording import retention, step_writer
 from acsard.recording.directory import KEPT, Ring, listed
-from acsard.recording.end_record import closing, how_it_ends
+from acsard.recording.end_record import how_it_ends, read_end
 from acsard.recording.export import export
 from acsard.recording.file import About, Recording, Writing, rewrite
+from acsard.recording.file_replay import replay_file, steps
 from acsard.recording.recorded_steps import unfinished
 from acsard.recording.recorder import Recorder
-from acsard.recording.replayed import live, steps
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import START, World
 
@@ -61,7 +61,7 @@ class Bench:
 
     def write(self) -> None:
         """Do the work that the thread does each second."""
-        self.recorder._disk.round(self.recorder._taken(), False)
+        self.recorder._writer.write(self.recorder._taken(), False)
 
     def drive(self, seconds: float) -> None:
         """Drive on, and write each second."""
@@ -83,9 +83,9 @@ def test_a_drive_is_recorded_and_lives_again(bench: Bench) -> None:
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(2.0)
     (path,) = bench.end()
-    lived = live(Recording(path))
-    assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
-    assert lived.tally.steps == bench.world.steps
+    result = replay_file(Recording(path))
+    assert (result.comparison.same, result.comparison.exact, result.trouble) == (True, True, "")
+    assert result.comparison.steps == bench.world.steps
     assert [event.text for event in bench.said] == [f"to {bench.where}"]
     assert bench.recorder.status.missing == 0
 
@@ -101,15 +101,15 @@ def test_a_drive_that_begins_with_kept_latches_replays_bit_by_bit(
     bench.world.drive(0.5, 0.2, seconds=1.0)
     assert bench.world.state.mode == "driving"
     (path,) = bench.end()
-    lived = live(Recording(path))
-    assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
-    assert lived.tally.steps == bench.world.steps
+    result = replay_file(Recording(path))
+    assert (result.comparison.same, result.comparison.exact, result.trouble) == (True, True, "")
+    assert result.comparison.steps == bench.world.steps
 
 
 def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "LONGEST_NS", 3_000_000_000)
+    monkeypatch.setattr(step_writer, "MAX_FILE_NS", 3_000_000_000)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(10.0)
@@ -117,16 +117,16 @@ def test_a_new_file_begins_with_the_state_and_lives_again_by_itself(
     assert len(paths) > 2
     count = 0
     for path in paths:
-        lived = live(Recording(path))
-        assert (lived.tally.same, lived.tally.exact, lived.trouble) == (True, True, "")
-        count += lived.tally.steps
+        result = replay_file(Recording(path))
+        assert (result.comparison.same, result.comparison.exact, result.trouble) == (True, True, "")
+        count += result.comparison.steps
     assert count == bench.world.steps
 
 
 def test_a_loop_that_is_not_heard_loses_steps_counts_them_and_never_waits(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "MOST", most := 1000)
+    monkeypatch.setattr(module, "MAX_QUEUED_STEPS", most := 1000)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     while bench.recorder.status.missing == 0:
         bench.world.hold(0.5, 0.2, seconds=1.0)
@@ -142,7 +142,7 @@ def test_a_loop_that_is_not_heard_loses_steps_counts_them_and_never_waits(
     numbers = [step.number for path in (before, after) for step in steps(Recording(path))]
     assert len(numbers) == bench.world.steps - missing
     for path in (before, after):
-        assert live(Recording(path)).tally.same
+        assert replay_file(Recording(path)).comparison.same
     assert after.name.endswith(KEPT) == before.name.endswith(KEPT)
 
 
@@ -163,7 +163,7 @@ def test_a_disk_that_takes_nothing_is_said_tried_again_and_costs_only_records(
     levels = [event.level for event in bench.said]
     assert levels == ["warning", "info"]
     (path,) = bench.end()
-    assert live(Recording(path)).tally.same
+    assert replay_file(Recording(path)).comparison.same
     assert next(steps(Recording(path))).number > 100
 
 
@@ -197,7 +197,7 @@ def test_the_minute_before_and_after_what_happened_is_kept(
     happen: Callable[[World], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minute = 6  # one tenth of a minute in s, to save time
-    monkeypatch.setattr(disk, "LONGEST_NS", minute * 10**9 // 3)
+    monkeypatch.setattr(step_writer, "MAX_FILE_NS", minute * 10**9 // 3)
     monkeypatch.setattr(retention, "AROUND_NS", minute * 10**9)
     bench = Bench(tmp_path, monkeypatch)
 
@@ -225,7 +225,7 @@ def test_the_minute_before_and_after_what_happened_is_kept(
 
 def die(bench: Bench) -> None:
     """Close the open files and nothing else, as the kernel does for a killed process."""
-    side = bench.recorder._disk
+    side = bench.recorder._writer
     assert side._writing is not None
     assert side._ring is not None
     side._writing.close()
@@ -237,7 +237,7 @@ def die(bench: Bench) -> None:
 def test_the_minute_before_and_after_a_crash_is_kept(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     bench = Bench(tmp_path, monkeypatch)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(14.0)
@@ -325,34 +325,34 @@ def test_a_fault_of_our_own_is_told_and_kept_with_what_came_into_the_step_that_i
         with pytest.raises(ZeroDivisionError) as raised:
             bench.world.call("stop")
         (path,) = ends_by(bench, raised.value)
-        ended = live(Recording(path)).again
-    last, number = closing(path), bench.world.steps
+        ended = replay_file(Recording(path)).failed_step
+    last, number = read_end(path), bench.world.steps
     why = f"in step {number}, ZeroDivisionError: {BUG}"
     assert path.name.endswith(KEPT)
     assert last is not None
     assert (last.cut, last.why) == ("bug", why)
     assert how_it_ends(last.cut, last.why) == f"cut: an internal error ended the daemon: {why}"
     recording = Recording(path)
-    lived = live(recording)
-    assert (lived.tally.same, lived.tally.steps, lived.trouble) == (True, number, "")
+    result = replay_file(recording)
+    assert (result.comparison.same, result.comparison.steps, result.trouble) == (True, number, "")
     assert (recording.whole, recording.cut, recording.why) == (True, "bug", why)
     assert recording.unfinished is not None
     step = unfinished(recording.unfinished)
     assert step.number == number
     assert [one.verb for one in step.inputs.requests] == ["stop"]
     assert step.inputs.now.mono_ns <= bench.world.now_ns
-    assert "does not end the robot of this version" in lived.again
+    assert "does not end the robot of this version" in result.failed_step
     assert ("ends this version too, by ZeroDivisionError" in ended) is (broken == "robot")
     rewrite(recording, new := path.with_name("new.mcap"))
-    assert closing(new) == last
-    assert live(Recording(new)) == lived
+    assert read_end(new) == last
+    assert replay_file(Recording(new)) == result
 
 
 def test_what_is_said_of_a_fault_of_our_own_harms_nobody(bench: Bench) -> None:
     bench.world.run(1.0)
     bench.write()
     (path,) = ends_by(bench, ValueError("\x1b[2J" + "x" * 1000))
-    last = closing(path)
+    last = read_end(path)
     assert last is not None
     told = how_it_ends(last.cut, last.why)
     assert told.startswith("cut: an internal error ended the daemon: ValueError: ")
@@ -366,7 +366,7 @@ def test_a_fault_of_our_own_that_cannot_be_told_is_one_all_the_same(bench: Bench
 
     bench.world.run(1.0)
     (path,) = ends_by(bench, MuteError())
-    last = closing(path)
+    last = read_end(path)
     assert last is not None
     assert (last.cut, last.why) == ("bug", "MuteError")
 
@@ -377,12 +377,12 @@ def test_what_came_into_the_step_is_left_out_where_no_file_takes_it(bench: Bench
     World(recorder=tape).run(0.1)
     bench.recorder.died(replace(tape.taken[0].inputs, missed=1 << 80))
     (path,) = ends_by(bench, OverflowError("a name that is none: \udc80"))
-    last, recording = closing(path), Recording(path)
+    last, recording = read_end(path), Recording(path)
     assert last is not None
     told = f"in step {bench.world.steps}, OverflowError: a name that is none: "
     assert (last.cut, last.why.startswith(told)) == ("bug", True)
     assert [topic for topic, _, _ in recording.messages()].count("unfinished") == 0
-    assert (live(recording).tally.same, recording.whole) == (True, True)
+    assert (replay_file(recording).comparison.same, recording.whole) == (True, True)
 
 
 @pytest.mark.parametrize("error", [None, asyncio.CancelledError()])
@@ -403,7 +403,7 @@ def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.Monk
     recording = Recording(path)
     ((topic, _, data),) = recording.messages()
     assert (topic, unfinished(data).number, recording.cut) == ("unfinished", 0, "bug")
-    last = closing(path)
+    last = read_end(path)
     assert last is not None
     assert last.said == "start"
 
@@ -411,7 +411,7 @@ def test_the_very_first_step_is_in_it_too(bench: Bench, monkeypatch: pytest.Monk
 def test_the_minute_before_a_fault_of_our_own_is_kept(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     bench.world.drive(0.5, 0.2, seconds=1.0)
     bench.drive(6.0)
     told = cuts(ends_by(bench, ValueError(BUG)))
@@ -428,7 +428,7 @@ def test_a_clock_that_is_set_costs_no_recording(
 
     It gets the time only while it drives.
     """
-    monkeypatch.setattr(disk, "LONGEST_NS", 2_000_000_000)
+    monkeypatch.setattr(step_writer, "MAX_FILE_NS", 2_000_000_000)
     monkeypatch.setattr(retention, "AROUND_NS", 0)
     seen = set[str]()
 
@@ -453,14 +453,14 @@ def test_a_file_that_the_disk_cut_is_kept_like_any_other(bench: Bench) -> None:
     bench.world.call("stop")
     bench.world.run(1.0)
     bench.write()
-    bench.recorder._disk._fail(OSError(errno.ENOSPC, "No space left on device"))
-    bench.drive(disk.RETRY_ROUNDS + 3.0)
+    bench.recorder._writer._fail(OSError(errno.ENOSPC, "No space left on device"))
+    bench.drive(step_writer.RETRY_ROUNDS + 3.0)
     first, second = bench.end()
     assert first.name.endswith(KEPT)
-    last = closing(first)
+    last = read_end(first)
     assert last is not None
     assert last.cut == "disk"
-    assert live(Recording(second)).tally.same
+    assert replay_file(Recording(second)).comparison.same
 
 
 def no_copies(handle: int) -> None:
@@ -477,7 +477,7 @@ def full(handle: int) -> None:
 @pytest.fixture
 def eager(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> Bench:
     """Return a bench that drives and retries a failed disk in the next round."""
-    monkeypatch.setattr(disk, "RETRY_ROUNDS", 0)
+    monkeypatch.setattr(step_writer, "RETRY_ROUNDS", 0)
     bench.world.drive(0.5, 0.2, seconds=0.5)
     rounds(bench)
     return bench
@@ -492,7 +492,7 @@ def rounds(bench: Bench, count: int = 3) -> None:
 
 def refuse(bench: Bench) -> None:
     """Make the disk refuse a write, then let the retry succeed."""
-    bench.recorder._disk._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
+    bench.recorder._writer._fail(OSError(errno.EIO, os.strerror(errno.EIO)))
     rounds(bench)
 
 
@@ -574,7 +574,7 @@ def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
     (part,) = listed(eager.where)
     synced = part.stat().st_size
     if over:
-        eager.recorder._ask()
+        eager.recorder._request_state()
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
         rounds(eager, 1)
@@ -587,7 +587,7 @@ def test_what_a_disk_did_not_sync_any_more_is_counted_to_the_step(
 
 def cuts(paths: list[Path]) -> list[tuple[str, str]]:
     """Return the suffix of each file and the reason why it was finished late."""
-    return [(p.name.partition(".")[2], last.cut) for p in paths if (last := closing(p))]
+    return [(p.name.partition(".")[2], last.cut) for p in paths if (last := read_end(p))]
 
 
 def test_what_a_crash_has_cut_stays_a_crash_s_however_late_it_is_made_whole(
@@ -619,7 +619,7 @@ def test_each_file_that_the_disk_cut_stays_what_it_was(
 def test_a_file_whose_end_the_disk_does_not_take_is_one_that_the_disk_cut(
     eager: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    eager.recorder._ask()
+    eager.recorder._request_state()
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
         rounds(eager, 1)
@@ -671,7 +671,7 @@ def test_a_disk_that_hangs_holds_up_the_end_of_the_daemon_for_a_moment_only(
     monkeypatch.setattr(module, "CLOSE_S", 0.01)
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", hangs)
-        patched.setattr(disk, "leave", hangs)
+        patched.setattr(step_writer, "mark_cut", hangs)
         eager.recorder.close()
         assert eager.recorder._thread.is_alive()
     goes.set()
@@ -717,13 +717,13 @@ def test_a_directory_that_somebody_removes_is_said_and_made_anew(bench: Bench) -
     shutil.rmtree(bench.where)
     bench.drive(1.0)
     assert "has been removed" in bench.recorder.status.trouble
-    bench.drive(disk.RETRY_ROUNDS + 3.0)
+    bench.drive(step_writer.RETRY_ROUNDS + 3.0)
     status = bench.recorder.status
     assert status.trouble == ""
     assert status.missing > 0
     (path,) = bench.end()
-    lived = live(Recording(path))
-    assert (lived.tally.same, lived.trouble) == (True, "")
+    result = replay_file(Recording(path))
+    assert (result.comparison.same, result.trouble) == (True, "")
 
 
 def test_the_loop_only_appends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from acsard.core.config.settings import Config
-from acsard.recording.chunks import GROWING, LAST_BLOCK
-from acsard.recording.end_record import END, closing
+from acsard.recording.chunks import GROWING_HEAD, LAST_BLOCK
+from acsard.recording.end_record import END, read_end
 from acsard.recording.file import CHUNK_BYTES, About, Recording, Writing
 from acsard.recording.recovery import NOTHING_BYTES, recover
 from tests.scenarios.taped import Tape, chunks
@@ -40,7 +40,7 @@ def growing(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     tape.write(path, Config(), apart=False)
     data = path.read_bytes()
     ((begin, end),) = chunks(data)
-    return data[:begin] + GROWING + data[begin + len(GROWING) : end - len(LAST_BLOCK)]
+    return data[:begin] + GROWING_HEAD + data[begin + len(GROWING_HEAD) : end - len(LAST_BLOCK)]
 
 
 def messages(path: Path) -> list[tuple[str, int, bytes]]:
@@ -72,7 +72,7 @@ def test_all_that_is_whole_of_it_stays_and_it_says_that_it_was_cut(
         assert len(list(recording.messages())) == len(before) > 0
         assert (recording.whole, part.exists()) == (True, False)
         assert whole.stat().st_mtime == 1e9
-        last = closing(whole)
+        last = read_end(whole)
         assert last is not None
         assert recording.cut == last.cut
         assert last.last_ns == max(wall_ns for _, wall_ns, _ in before)
@@ -96,7 +96,7 @@ def test_a_disk_that_takes_no_end_costs_no_chunk_and_that_is_told(
     monkeypatch.setattr(os, "fsync", full)
     told = recover(part, whole, "crash", room=False)
     assert whole.read_bytes() == cut
-    assert "a.mcap was cut and gets no end record, because the disk is full" in told
+    assert "a.mcap was cut off and gets no end record, because the disk is full" in told
     assert (part.exists(), whole.stat().st_mtime) == (False, 1e9)
 
 
@@ -106,7 +106,7 @@ def test_in_its_place_it_says_by_what_it_was_cut_and_what_happened(
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     part.write_bytes(data[: chunks(data)[-1][1] + 3])
     recover(part, whole, "crash", room=False)
-    last = closing(whole)
+    last = read_end(whole)
     assert last is not None
     assert last.cut == "crash"
     assert last.said == "start, 1 change of commander, 1 stop (stopped by unnamed (native))"
@@ -162,7 +162,7 @@ def test_chunks_whose_beginning_is_damaged_are_not_thrown_away(data: bytes, tmp_
     (begin, end), *_ = chunks(data)
     part.write_bytes(data[:8] + bytes(begin - 8) + data[begin:end])
     assert part.stat().st_size < NOTHING_BYTES
-    assert "stays cut" in recover(part, whole, "crash", room=True)
+    assert "cannot be finished" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]
 
 
@@ -171,7 +171,7 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
     growing: bytes, room: bool, tmp_path: Path
 ) -> None:
     part, whole, dice, counts = tmp_path / "a.part", tmp_path / "a.mcap", random.Random(6), set()
-    begin = growing.index(GROWING) + len(GROWING)
+    begin = growing.index(GROWING_HEAD) + len(GROWING_HEAD)
     for number in range(30):
         tail = dice.choice([b"", bytes(700), dice.randbytes(64)])
         size = dice.randrange(begin, len(growing)) if number else len(growing)
@@ -181,7 +181,7 @@ def test_a_chunk_that_still_grew_keeps_each_of_its_seconds(
         counts.add(len(before))
         assert bool(before) != ("no intact data" in said)
         if before:
-            recording, last = Recording(whole), closing(whole)
+            recording, last = Recording(whole), read_end(whole)
             assert list(recording.messages()) == before
             assert last is not None
             assert (recording.whole, recording.cut, last.cut) == (True, "crash", "crash")
@@ -199,11 +199,11 @@ def test_a_short_file_with_a_bad_sector_at_its_beginning_stays_and_is_reported(
 ) -> None:
     """The seconds behind the bad sector cannot be read by this version."""
     part, whole, bad = tmp_path / "a.part", tmp_path / "a.mcap", bytearray(growing)
-    begin = growing.index(GROWING) + len(GROWING) if at == "chunk" else 0
+    begin = growing.index(GROWING_HEAD) + len(GROWING_HEAD) if at == "chunk" else 0
     bad[begin : begin + 512] = bytes(512)
     assert len(bad) < NOTHING_BYTES
     part.write_bytes(bad)
-    assert "stays cut, as a.mcap" in recover(part, whole, "crash", room)
+    assert "it is now a.mcap" in recover(part, whole, "crash", room)
     assert whole.read_bytes() == bad
     assert not part.exists()
 
@@ -226,7 +226,7 @@ def test_a_power_cut_before_the_heads_of_several_chunks_leaves_a_file_that_any_r
     part.write_bytes(data)
     before = messages(part)
     for begin, _ in chunks(data):
-        bad[begin : begin + len(GROWING)] = GROWING
+        bad[begin : begin + len(GROWING_HEAD)] = GROWING_HEAD
     part.write_bytes(bad[: chunks(data)[-1][1]])
     assert recover(part, whole, "crash", room=False) == ""
     assert read_by_the_library(whole) == before == messages(whole)
@@ -240,8 +240,10 @@ def test_a_recovery_in_place_that_a_power_cut_interrupted_is_completed(
     part, whole = tmp_path / "a.part", tmp_path / "a.mcap"
     part.write_bytes(growing)
     recover(part, whole, "crash", room=False)
-    recovered, begin = whole.read_bytes(), growing.index(GROWING)
-    part.write_bytes(recovered[:begin] + GROWING + recovered[begin + len(GROWING) :] + tail)
+    recovered, begin = whole.read_bytes(), growing.index(GROWING_HEAD)
+    part.write_bytes(
+        recovered[:begin] + GROWING_HEAD + recovered[begin + len(GROWING_HEAD) :] + tail
+    )
     whole.unlink()
     assert recover(part, whole, "open", room=False) == ""
     assert whole.read_bytes() == recovered
@@ -304,5 +306,5 @@ def test_what_has_nothing_in_it_goes_and_what_nobody_can_read_is_told(tmp_path: 
         assert bool(said) == bool(told)
         assert list(tmp_path.iterdir()) == []
     part.write_bytes(b"\x89MC" + bytes(NOTHING_BYTES))
-    assert "stays cut" in recover(part, whole, "crash", room=True)
+    assert "cannot be finished" in recover(part, whole, "crash", room=True)
     assert list(tmp_path.iterdir()) == [whole]

@@ -19,14 +19,22 @@ def test_it_counts_lines_poses_and_modes_and_knows_the_end() -> None:
     replay = Replay(Config())
     for step in decode(encode(0, tape.taken)):
         assert replay.step(step) is None
-    tally = replay.tally
-    assert tally.same
-    assert tally.steps == tally.modes_same == len(tape.taken)
-    assert tally.lines == tally.lines_same == sum(t.outputs.line is not None for t in tape.taken)
-    assert tally.poses == tally.poses_same == sum(len(t.outputs.estimates) for t in tape.taken)
-    assert tally.fastest == (1000, 1000)
-    assert tally.end is not None
-    then, now = tally.end
+    comparison = replay.comparison
+    assert comparison.same
+    assert comparison.steps == comparison.modes_same == len(tape.taken)
+    assert (
+        comparison.lines
+        == comparison.lines_same
+        == sum(t.outputs.line is not None for t in tape.taken)
+    )
+    assert (
+        comparison.poses
+        == comparison.poses_same
+        == sum(len(t.outputs.estimates) for t in tape.taken)
+    )
+    assert comparison.fastest == (1000, 1000)
+    assert comparison.end is not None
+    then, now = comparison.end
     assert then == now
     assert 0.5 < then[0] / 1e6 < 1.0
-    assert tally.apart == 0.0
+    assert comparison.apart == 0.0

@@ -13,12 +13,12 @@ from acsard.recording.retention import (
     LEAST_BYTES,
     STEADY_NS,
     Bounds,
+    ClockWatch,
     Disk,
     Ended,
     Kind,
-    Steady,
     share,
-    too_much,
+    to_delete,
 )
 
 WIDE = Disk(10**12, 10**12)
@@ -26,64 +26,64 @@ BOUNDS = Bounds(10**10, -math.inf)
 DAY_NS = 86_400 * NS_PER_S
 
 
-def files(*kinds: Kind, size: int = 1000, here: bool = False) -> list[Ended]:
+def files(*kinds: Kind, size: int = 1000, this_run: bool = False) -> list[Ended]:
     return [
-        Ended(str(number), number, kind, size, 100.0 * number, here)
+        Ended(str(number), number, kind, size, 100.0 * number, this_run)
         for number, kind in enumerate(kinds, 1)
     ]
 
 
 def test_nothing_goes_where_there_is_room() -> None:
-    assert too_much(files("plain", "kept", "near"), BOUNDS, WIDE) == set()
+    assert to_delete(files("plain", "kept", "near"), BOUNDS, WIDE) == set()
 
 
 def test_the_oldest_go_first_and_what_is_kept_last() -> None:
     ended = files("kept", "near", "plain", "plain", "plain")
     bounds = Bounds(3000 + LEAST_BYTES, -math.inf)
-    assert too_much(ended, bounds, WIDE) == {"3", "4"}
-    assert too_much(ended, bounds._replace(size=1000 + LEAST_BYTES), WIDE) == {"1", "3", "4", "5"}
+    assert to_delete(ended, bounds, WIDE) == {"3", "4"}
+    assert to_delete(ended, bounds._replace(size=1000 + LEAST_BYTES), WIDE) == {"1", "3", "4", "5"}
 
 
 def test_what_is_near_goes_with_what_happened() -> None:
     turns: list[Kind] = ["plain", "kept"]
     ended = files("near", "kept", "near", *turns * KEPT_FILES)
     old = Bounds(10**10, math.inf)
-    assert too_much(ended, old, WIDE) == {one.name for one in ended if one.kind != "kept"} | {"2"}
-    assert {"1", "3"} & too_much(ended[:-1], old, WIDE) == set()
+    assert to_delete(ended, old, WIDE) == {one.name for one in ended if one.kind != "kept"} | {"2"}
+    assert {"1", "3"} & to_delete(ended[:-1], old, WIDE) == set()
 
 
 def test_too_old_is_what_no_run_of_now_has_ended() -> None:
     bounds = BOUNDS._replace(oldest_s=250.0)
-    assert too_much(files("plain", "plain", "plain"), bounds, WIDE) == {"1", "2"}
-    assert too_much(files("plain", "plain", "plain", here=True), bounds, WIDE) == set()
+    assert to_delete(files("plain", "plain", "plain"), bounds, WIDE) == {"1", "2"}
+    assert to_delete(files("plain", "plain", "plain", this_run=True), bounds, WIDE) == set()
 
 
 def test_a_part_of_the_disk_is_left_to_others_but_not_for_what_is_kept_or_the_newest() -> None:
     ended = files("kept", "plain", "plain", "plain", "plain")
     disk = Disk(100_000, 5000)
-    assert too_much(ended, BOUNDS, disk) == set()
-    assert too_much(ended, BOUNDS, disk._replace(free=3500)) == {"2", "3"}
-    assert too_much(ended, BOUNDS, disk._replace(free=1000)) == {"2", "3", "4"}
+    assert to_delete(ended, BOUNDS, disk) == set()
+    assert to_delete(ended, BOUNDS, disk._replace(free=3500)) == {"2", "3"}
+    assert to_delete(ended, BOUNDS, disk._replace(free=1000)) == {"2", "3", "4"}
 
 
 def test_where_no_room_is_left_at_all_everything_gives_way_to_what_comes() -> None:
     ended = files("kept", "plain", "near", size=400)
-    assert too_much(ended, BOUNDS, Disk(100_000, 0)) == {"1", "2", "3"}
-    assert too_much(ended, BOUNDS, Disk(100_000, 300)) == {"2", "3"}
+    assert to_delete(ended, BOUNDS, Disk(100_000, 0)) == {"1", "2", "3"}
+    assert to_delete(ended, BOUNDS, Disk(100_000, 300)) == {"2", "3"}
 
 
 def test_a_disk_that_refuses_whatever_it_says_gets_one_back() -> None:
-    assert too_much(files("kept", "plain", "plain"), BOUNDS, WIDE, given=0) == {"2"}
-    assert too_much(files("kept"), BOUNDS, WIDE, given=0) == {"1"}
-    assert too_much([], BOUNDS, WIDE, given=0) == set()
+    assert to_delete(files("kept", "plain", "plain"), BOUNDS, WIDE, freed=0) == {"2"}
+    assert to_delete(files("kept"), BOUNDS, WIDE, freed=0) == {"1"}
+    assert to_delete([], BOUNDS, WIDE, freed=0) == set()
 
 
 def test_a_disk_that_refuses_all_the_same_gets_none_that_is_kept_and_no_more_than_a_file() -> None:
-    assert too_much(files("kept", "plain", "plain"), BOUNDS, WIDE, given=1) == {"2"}
-    assert too_much(files("kept", "near"), BOUNDS, WIDE, given=1) == set()
-    assert too_much(files("kept", "plain"), BOUNDS, WIDE, given=LEAST_BYTES) == set()
+    assert to_delete(files("kept", "plain", "plain"), BOUNDS, WIDE, freed=1) == {"2"}
+    assert to_delete(files("kept", "near"), BOUNDS, WIDE, freed=1) == set()
+    assert to_delete(files("kept", "plain"), BOUNDS, WIDE, freed=LEAST_BYTES) == set()
     low = Disk(100_000, 300)
-    assert too_much(files("kept", "near", size=400), BOUNDS, low, given=1) == {"1", "2"}
+    assert to_delete(files("kept", "near", size=400), BOUNDS, low, freed=1) == {"1", "2"}
 
 
 def test_a_file_has_a_hundredth_of_what_all_may_have_on_this_disk() -> None:
@@ -99,11 +99,11 @@ def test_of_a_large_disk_others_have_a_gigabyte() -> None:
 
 
 def test_a_clock_is_believed_that_was_not_set_for_a_while() -> None:
-    clock = Steady()
-    assert not clock.believed(Instant(STEADY_NS, 0))
-    assert clock.look(Instant(0, DAY_NS)) == 0
-    assert not clock.believed(Instant(STEADY_NS - 1, DAY_NS))
-    assert clock.look(Instant(STEADY_NS, DAY_NS + STEADY_NS + NS_PER_S)) == 0  # the clock drifts
-    assert clock.believed(Instant(STEADY_NS, DAY_NS))
-    assert clock.look(Instant(STEADY_NS, 3 * DAY_NS + STEADY_NS + NS_PER_S)) == 2 * DAY_NS
-    assert not clock.believed(Instant(STEADY_NS + 1, 3 * DAY_NS))
+    clock = ClockWatch()
+    assert not clock.trusted(Instant(STEADY_NS, 0))
+    assert clock.jump_ns(Instant(0, DAY_NS)) == 0
+    assert not clock.trusted(Instant(STEADY_NS - 1, DAY_NS))
+    assert clock.jump_ns(Instant(STEADY_NS, DAY_NS + STEADY_NS + NS_PER_S)) == 0  # the clock drifts
+    assert clock.trusted(Instant(STEADY_NS, DAY_NS))
+    assert clock.jump_ns(Instant(STEADY_NS, 3 * DAY_NS + STEADY_NS + NS_PER_S)) == 2 * DAY_NS
+    assert not clock.trusted(Instant(STEADY_NS + 1, 3 * DAY_NS))

@@ -18,7 +18,7 @@ from acsard.core.values import NS_PER_S, REST, Command, Instant
 from acsard.host.errors import RecordingError
 from acsard.recording.export import export
 from acsard.recording.file import Recording
-from acsard.recording.replayed import Onlooker, live
+from acsard.recording.file_replay import DisplayReplay, replay_file
 from acsard.recording.state import StateError, freeze, thaw
 from acsard.report.course import Course
 from tests.each import each
@@ -97,10 +97,10 @@ def test_what_a_part_of_an_older_robot_lacks_begins_as_in_a_new_one(tmp_path: Pa
             del wheel.suspected
 
     recording = of_older_code(tmp_path / "old.mcap", forget)
-    looked = Onlooker(recording)
-    assert len([*looked.steps()]) == looked.replay.tally.steps > 100
-    assert looked.replay.tally.same
-    assert live(recording).tally.same
+    looked = DisplayReplay(recording)
+    assert len([*looked.steps()]) == looked.replay.comparison.steps > 100
+    assert looked.replay.comparison.same
+    assert replay_file(recording).comparison.same
 
 
 SPOILERS: dict[str, Callable[[Robot], None]] = {
@@ -130,7 +130,7 @@ def test_a_robot_with_something_else_in_place_of_a_part_is_a_sentence(
     recording = Recording(path)
     words = r"spoilt\.mcap: this version cannot read the state at its start: "
     with pytest.raises(RecordingError, match=words):
-        live(recording)
+        replay_file(recording)
     with pytest.raises(RecordingError, match=words):
         drawn(recording)
 
@@ -144,9 +144,9 @@ def replace_state(tape: Tape, state: bytes) -> Tape:
 
 def drawn(recording: Recording) -> None:
     """Replay a recording as a report does."""
-    looked = Onlooker(recording)
+    looked = DisplayReplay(recording)
     course = Course(looked.config)
-    with looked.living():
+    with looked.state_errors():
         for step, outputs, robot in looked.steps():
             course.step(step, outputs, robot)
     if looked.notes:
@@ -169,9 +169,9 @@ def test_what_no_new_robot_has_is_a_sentence_and_no_traceback(tmp_path: Path) ->
         r"old\.mcap: this version cannot read the state at its start: .*'arrived_ns'.* by acsard"
     )
     with pytest.raises(RecordingError, match=words):
-        live(recording)
+        replay_file(recording)
     with pytest.raises(RecordingError, match=words):
-        list(Onlooker(recording).steps())
+        list(DisplayReplay(recording).steps())
     with pytest.raises(RecordingError, match=words):
         export(recording, tmp_path / "new.mcap", "mcap")
     assert [*tmp_path.iterdir()] == [recording.path]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from acsard.core.config.settings import Config, McuConfig
 from acsard.recording.rows import decode, encode
-from acsard.recording.timeline import TimelineEntry, TimelineWriter, summary
-from acsard.recording.timeline import told as once
+from acsard.recording.timeline import TimelineEntry, TimelineWriter, entry_of, summary
 from tests.scenarios.taped import Tape
 from tests.scenarios.world import World
 
@@ -70,7 +69,7 @@ def test_what_is_heard_in_a_silence_is_no_other_silence() -> None:
         "link_stale", "link_heard"
     ]  # fmt: skip
     said = [one for _, outputs, _ in tape.taken for one in outputs.events]
-    assert summary([once(one, 1) for one in said]) == "1 board silence"
+    assert summary([entry_of(one, 1) for one in said]) == "1 board silence"
 
 
 def test_steps_that_are_missing_are_said() -> None:

@@ -16,8 +16,8 @@ import pytest
 from acsard.core.guard import Memory
 from acsard.core.motion.modes import Mode
 from acsard.core.values import Twist
-from acsard.recording.state import TABLE, freeze, part, thaw
-from acsard.recording.unpickling import DEEPEST, MOST_BYTES, MOST_OPCODES, MOST_PARTS, unpickled
+from acsard.recording.state import TABLE, freeze, part_class, thaw
+from acsard.recording.unpickling import MAX_BYTES, MAX_DEPTH, MAX_OPCODES, MAX_PARTS, unpickle
 from tests.each import each
 from tests.recordings.__main__ import CHECKED
 from tests.scenarios.taped import Tape, drive_through_faults
@@ -64,7 +64,7 @@ def test_an_attack_is_refused_in_words_and_does_nothing(name: str, said: dict[st
     ],
 )  # fmt: skip
 def test_a_value_comes_back_as_it_was(value: object) -> None:
-    again = unpickled(pickled(value), part)
+    again = unpickle(pickled(value), part_class)
     assert again == value
     assert type(again) is type(value)
     assert getattr(again, "maxlen", None) == getattr(value, "maxlen", None)
@@ -81,7 +81,7 @@ def pickled(value: object) -> bytes:
 
 def test_what_is_there_twice_is_one_thing() -> None:
     inner = [1]
-    again = unpickled(pickled((inner, [inner])), part)
+    again = unpickle(pickled((inner, [inner])), part_class)
     assert isinstance(again, tuple)
     assert again[0] is again[1][0]
 
@@ -90,13 +90,13 @@ def test_what_is_nested_is_read_down_to_a_depth_and_what_doubles_up_to_a_size() 
     def nested(times: int) -> bytes:
         return whole(pickle.EMPTY_TUPLE + pickle.TUPLE1 * times)
 
-    unpickled(nested(DEEPEST), part)
+    unpickle(nested(MAX_DEPTH), part_class)
     with pytest.raises(ValueError, match="deep"):
-        unpickled(nested(DEEPEST + 1), part)
-    most = MOST_PARTS.bit_length() - 2
-    unpickled(whole(doubled(most)), part)
+        unpickle(nested(MAX_DEPTH + 1), part_class)
+    most = MAX_PARTS.bit_length() - 2
+    unpickle(whole(doubled(most)), part_class)
     with pytest.raises(ValueError, match="more parts"):
-        unpickled(whole(doubled(most + 1)), part)
+        unpickle(whole(doubled(most + 1)), part_class)
 
 
 def test_a_robot_with_all_there_is_has_room() -> None:
@@ -108,7 +108,7 @@ def test_a_robot_with_all_there_is_has_room() -> None:
         world.run(0.02)
     states = [*tape.states.values(), freeze(world.loop.robot, Memory())]
     for data in states:
-        assert 8 * len(data) < MOST_BYTES
-        assert 8 * sum(1 for _ in pickletools.genops(data)) < MOST_OPCODES
+        assert 8 * len(data) < MAX_BYTES
+        assert 8 * sum(1 for _ in pickletools.genops(data)) < MAX_OPCODES
         state = thaw(data)
         assert freeze(*state) == freeze(*thaw(freeze(*state)))

@@ -19,7 +19,7 @@ def test_who_drives_is_who_the_recording_says_drives() -> None:
         drives = [(s.begin, s.end) for s in spans(name) if s.kind == "drives"]
         seconds = sum(end - begin for begin, end in drives)
         assert abs(seconds - course.driven[name].seconds) < 0.05
-    recorded = {step.said.status[3] for step in steps if step.said.status[0] == "driving"}
+    recorded = {step.recorded.status[3] for step in steps if step.recorded.status[0] == "driving"}
     drew = {n for n, b in course.sources.bands.items() for s in b.spans() if s.kind == "drives"}
     assert drew == recorded == {"nav", "teleop"}
 

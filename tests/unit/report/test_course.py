@@ -15,7 +15,7 @@ from tests.unit.report.driven import course_of, drive_of_two, followed
 
 def test_the_path_and_its_length_are_the_recorded_poses() -> None:
     course, steps = drive_of_two()
-    poses = [pose for step in steps for pose in step.said.poses]
+    poses = [pose for step in steps for pose in step.recorded.poses]
     way = sum(math.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(poses)) / MICRO
     assert course.metres == pytest.approx(way)
     last = course.path.places()[-1]
@@ -61,7 +61,7 @@ def test_what_no_line_says_is_no_value() -> None:
 def test_the_bands_of_the_mode_are_those_recorded() -> None:
     course, steps = drive_of_two()
     modes = [span.kind for span in course.modes.spans()]
-    recorded = [step.said.status[0] for step in steps]
+    recorded = [step.recorded.status[0] for step in steps]
     changes = [recorded[0], *[b for a, b in pairwise(recorded) if a != b]]
     assert [kind for at, kind in enumerate(modes) if not at or kind != modes[at - 1]] == changes
     assert "stopped by unnamed (native) at 2027-01-15 08:00" in next(
@@ -75,7 +75,7 @@ def test_who_drove_how_far_and_for_how_long() -> None:
     driving = sum(
         b.inputs.now.mono_ns - a.inputs.now.mono_ns
         for a, b in pairwise(steps)
-        if b.said.status[0] == "driving"
+        if b.recorded.status[0] == "driving"
     )
     assert sum(one.seconds for one in course.driven.values()) == pytest.approx(driving / 1e9)
     assert 0.0 < sum(one.metres for one in course.driven.values()) <= course.metres

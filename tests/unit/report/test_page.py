@@ -63,7 +63,7 @@ def evil_steps() -> list[Step]:
     _, steps = drive_of_two()
     found = []
     for n, step in enumerate(steps[:300]):
-        inputs, said = step.inputs, step.said
+        inputs, said = step.inputs, step.recorded
         if n == 150:
             now_ns = inputs.now.mono_ns
             command = Command(EVIL, Twist(), now_ns, sender=EVIL)
@@ -71,7 +71,7 @@ def evil_steps() -> list[Step]:
             inputs = replace(inputs, commands=(command,), refusals=(refusal,))
             event = Event("stop", EVIL, by=EVIL)
             said = replace(said, events=(event,), status=(EVIL, EVIL, EVIL, EVIL))
-        found.append(replace(step, inputs=inputs, said=said))
+        found.append(replace(step, inputs=inputs, recorded=said))
     return found
 
 

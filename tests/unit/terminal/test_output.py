@@ -8,8 +8,7 @@ import sys
 import pytest
 from rich.text import Text
 
-from acsard.terminal.output import plain, show, show_whole
-from acsard.terminal.tables import table
+from acsard.terminal.output import plain, show, show_whole, table
 
 COMMAND = "acsard set limits.linear_speed 0.8"
 

@@ -13,6 +13,7 @@ from acsard.client import Client, Subscription
 from acsard.client.follower import ASK_S, FIRST_S, SILENT_S
 from acsard.core.messages.encodings import DecodeError, encode, encoding_name
 from acsard.core.messages.schema import Info, RobotState, Time
+from acsard.daemon.bus.address import Address
 from acsard.host.errors import ReplyError
 from acsard.top import feed as top_feed
 from acsard.top.feed import Feed
@@ -23,6 +24,8 @@ KEY = "acsard/acsar/state"
 
 class Robot:
     """A client without a bus that gives states at times set by the test."""
+
+    where = Address("tcp/127.0.0.1:7448", "acsar", "")
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -70,7 +73,7 @@ def robot(monkeypatch: pytest.MonkeyPatch) -> Robot:
 
 
 def feed_of(robot: Robot) -> Feed:
-    return Feed(cast(Client, robot), "tcp/127.0.0.1:7448", "acsar")
+    return Feed(cast(Client, robot))
 
 
 def at(sec: int, lines: int = 1300) -> RobotState:

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from acsard.client.follower import FLEET_ASK_S
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import Info, Message, Time
+from acsard.daemon.bus.address import Address
 from acsard.top import fleet as fleets
 from acsard.top.fleet import Fleet
 from acsard.top.roster import table
@@ -61,7 +62,7 @@ def fleet_of(
     session: Session, ids: Sequence[str] = ("*",), answering: Collection[str] = ()
 ) -> Fleet:
     """Return a fleet in which the robots of `answering` answer queries."""
-    robot: Any = SimpleNamespace(session=session)
+    robot: Any = SimpleNamespace(session=session, where=Address("tcp/127.0.0.1:7448", "acsar", ""))
     stamps = count(2000)
     robot.like = lambda name: SimpleNamespace(ask=lambda key, take: answer(name, key, take))
 
@@ -70,7 +71,7 @@ def fleet_of(
             said = {"state": replace(STATE, stamp=Time(next(stamps))), "info": INFO}
             take(sample_of(name, key, said[key]))
 
-    return Fleet(robot, ids, "tcp/127.0.0.1:7448")
+    return Fleet(robot, ids)
 
 
 def sample_of(name: str, key: str, said: Message) -> Any:
@@ -156,6 +157,8 @@ class Remembers:
     The storage may receive a newer state.
     """
 
+    where = Address("tcp/127.0.0.1:7448", "acsar", "")
+
     def __init__(self, session: Session) -> None:
         self.session, self.stored = session, STATE
 
@@ -179,7 +182,7 @@ def test_a_robot_whose_state_only_a_storage_still_has_is_gone_and_not_heard(
     session: Session, clock: Clock
 ) -> None:
     robot: Any = Remembers(session)
-    line = told(Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448"), clock, 20.0)
+    line = told(Fleet(robot, ("robot1",)), clock, 20.0)
     assert "never" in line
     assert line.endswith("GONE, was: commanded by app")
 
@@ -188,7 +191,7 @@ def test_a_daemon_that_hangs_is_silent_though_a_storage_answers_for_it(
     session: Session, clock: Clock
 ) -> None:
     robot: Any = Remembers(session)
-    fleet = Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448")
+    fleet = Fleet(robot, ("robot1",))
     session.comes("robot1")
     assert told(fleet, clock, 0.5).endswith("waiting for its state")
     assert told(fleet, clock, 5.0).endswith("SILENT, was: commanded by app")
@@ -202,7 +205,7 @@ def test_a_robot_whose_clock_was_set_back_is_heard_by_its_answers(
     session: Session, clock: Clock
 ) -> None:
     robot: Any = Remembers(session)
-    fleet = Fleet(robot, ("robot1",), "tcp/127.0.0.1:7448")
+    fleet = Fleet(robot, ("robot1",))
     session.comes("robot1")
     told(fleet, clock, 0.5)
     for second in (2000, 1, 3, 5):  # a clock that has run for long, and one that restarts

@@ -16,6 +16,7 @@ from acsard.client.follower import ASK_S, SILENT_S
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.schema import RobotState, Time
 from acsard.core.values import REST, Twist
+from acsard.daemon.bus.address import Address
 from acsard.top import keyboard
 from acsard.top.keyboard import HOLD_S, Keyboard, Ride, split
 from tests.each import each
@@ -160,6 +161,7 @@ class Robot:
     """
 
     source, sender = "teleop", "joe/1/aa"
+    where = Address("tcp/127.0.0.1:7448", "acsar", "")
 
     def __init__(self, *said: RobotState) -> None:
         self.said = deque(map(sample_of, said))
@@ -188,7 +190,7 @@ class Drive:
     def __init__(self, robot: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
         monkeypatch.setattr(keyboard, "time", SimpleNamespace(monotonic=lambda: self.now))
-        self.ride = Ride(robot, Keyboard(0.5, 2.0), "acsar", "tcp/127.0.0.1:7448")
+        self.ride = Ride(robot, Keyboard(0.5, 2.0))
 
     def step(self, typed: str = "", times: int = 1) -> None:
         for _ in range(times):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from acsard.host.processes import Holder
-from acsard.host.serial_ports import SerialDevice
+from acsard.machine.serial_ports import SerialDevice
 from acsard.web.guide import boards
 
 MEGA = SerialDevice(

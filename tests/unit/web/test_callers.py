@@ -16,6 +16,7 @@ from acsard.web.callers import (
     cookie_name,
     host_name,
     is_loopback,
+    network_of,
     place,
     require_own_origin,
     tokens_in,
@@ -156,3 +157,11 @@ def test_of_cookies_without_end_a_few_are_looked_at_and_the_page_s_own_is_one() 
     shown = {cookie_name("robot1", port): str(port) for port in range(9000)}
     told = tokens_in(shown, "robot1", 8443)
     assert (len(told), told[0]) == (MOST_COOKIES, "8443")
+
+
+def test_an_ipv6_address_counts_by_its_network_and_an_ipv4_address_by_itself() -> None:
+    told = ("2001:db8:1:2:3::4", "2001:db8:1:2::ffff", "2001:db8:1:3::4", "192.168.1.7", "")
+    assert [network_of(one) for one in told] == [
+        "2001:db8:1:2::/64", "2001:db8:1:2::/64", "2001:db8:1:3::/64", "192.168.1.7", "",
+    ]  # fmt: skip
+    assert network_of("fe80::1%eth0") == "fe80::/64"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import Counter
+from itertools import pairwise
 
 import pytest
 import zenoh
@@ -16,11 +17,14 @@ from acsard.core.messages.schema import ServiceReply
 from acsard.web.callers import MAINTAINER, RefusedError
 from acsard.web.calls import (
     ELSEWHERE_AT_ONCE,
+    MERGE_S,
     STOPS_AT_ONCE,
     Calls,
     Ending,
+    Merged,
     Stops,
 )
+from acsard.web.limits import STOPS_ELSEWHERE
 from tests.unit.web.test_fleet import quiet, robots
 
 PATIENCE_S = 20.0
@@ -131,10 +135,10 @@ def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> 
     async def story(session: zenoh.Session) -> None:
         calls = Calls(robots(Client(session, "acsar", "teleop")))
 
-        async def stop(robot: str) -> ServiceReply:
-            return await calls.call(MAINTAINER, "stop", {}, robot)
+        async def stop(robot: str, client: int = 0) -> ServiceReply:
+            return await calls.call(replace(MAINTAINER, token=f"{client}"), "stop", {}, robot)
 
-        first = [asyncio.create_task(stop("r2")) for _ in range(ELSEWHERE_AT_ONCE)]
+        first = [asyncio.create_task(stop("r2", n)) for n in range(ELSEWHERE_AT_ONCE)]
         async with asyncio.timeout(PATIENCE_S):
             while len(held) < ELSEWHERE_AT_ONCE:
                 await asyncio.sleep(0.01)
@@ -156,4 +160,62 @@ def test_a_stop_of_another_robot_is_told_to_it_however_many_are_waited_for() -> 
         session.declare_subscriber(
             "acsard/*/stop", lambda sample: told.append(str(sample.key_expr))
         )
+        asyncio.run(story(session))
+
+
+def test_stops_of_one_client_to_one_robot_share_the_next_one_and_none_is_lost() -> None:
+    async def story() -> None:
+        merged, loop = Merged(), asyncio.get_running_loop()
+        sent: list[float] = []
+
+        async def stop() -> ServiceReply:
+            sent.append(loop.time())
+            return ServiceReply(True, str(len(sent)))
+
+        async def asked() -> None:
+            begun = loop.time()
+            reply = await merged.ask(("viewer", "r2"), stop)
+            assert sent[int(reply.message) - 1] >= begun
+
+        for _ in range(3):
+            await asyncio.gather(*(asked() for _ in range(100)))
+        assert len(sent) == 4
+        assert all(later - sooner >= MERGE_S for sooner, later in pairwise(sent))
+        await asyncio.gather(*(merged.ask((f"viewer {n}", "r2"), stop) for n in range(9)))
+        assert len(sent) == 13
+        await asyncio.sleep(2 * MERGE_S)
+        assert not merged._rests
+
+    asyncio.run(story())
+
+
+def test_stops_of_robots_that_do_not_answer_are_few_and_a_robot_that_answers_is_stopped() -> None:
+    told: Counter[str] = Counter()
+
+    def served(query: zenoh.Query) -> None:
+        with query:
+            told["r2"] += 1
+            answer = encode(ServiceReply(True, "stopped"), "msgpack")
+            kind = encoding_name("msgpack", "ServiceReply")
+            query.reply(query.key_expr, answer, encoding=kind)
+
+    async def story(session: zenoh.Session) -> None:
+        calls = Calls(robots(Client(session, "acsar", "teleop")))
+
+        async def stop(robot: str) -> bool:
+            return (await calls.call(MAINTAINER, "stop", {}, robot)).success
+
+        assert await stop("r2")
+        refused = 0
+        for n in range(100):
+            try:
+                await stop(f"x{n}")
+            except RefusedError:
+                refused += 1
+        assert refused > 100 - 2 * STOPS_ELSEWHERE.most
+        assert await stop("r2")
+        assert told["r2"] == 2
+
+    with zenoh.open(quiet()) as session:
+        session.declare_queryable("acsard/r2/srv/stop", served)
         asyncio.run(story(session))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from acsard.calibration.guided.equipment import NEEDS, SIMULATED
 from acsard.calibration.guided.methods import METHODS
-from acsard.cli import calibrate, mcu
+from acsard.cli import parser
 from acsard.web.frames import Begin, FrameError
 from acsard.web.jobs import KEY, Reach, words
 from tests.each import each
@@ -21,11 +21,7 @@ PORTS = ("/dev/acsar", "sim")
 
 def parsed(given: list[str]) -> argparse.Namespace:
     """Return the arguments as the command line parses them."""
-    parser = argparse.ArgumentParser()
-    verbs = parser.add_subparsers()
-    calibrate.add(verbs)
-    mcu.add(verbs)
-    return parser.parse_args(given)
+    return parser(["calibrate", "mcu"]).parse_args(given)
 
 
 def test_a_check_has_the_port_and_the_file_and_asks() -> None:

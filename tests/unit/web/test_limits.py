@@ -17,8 +17,15 @@ from acsard.web.limits import (
     GUESSES,
     GUESSES_OF_ONE,
     REQUESTS,
+    SOCKETS,
+    SOCKETS_HERE,
+    SOCKETS_LEAST,
+    SOCKETS_OF_ONE,
+    SOCKETS_OF_TOKEN,
     Seats,
     Shares,
+    Sockets,
+    sockets_for,
 )
 
 
@@ -95,11 +102,17 @@ def test_the_page_tells_the_places_that_there_are() -> None:
     page = Path(__file__).parents[3] / "deploy" / "web" / "README.md"
     told = " ".join(page.read_text(encoding="utf-8").split())
     assert (
-        f"room for {CONNECTIONS} connections from other machines: at most {CONNECTIONS_OF_ONE} of "
+        f"There are {CONNECTIONS} WebSockets for other machines: at most {CONNECTIONS_OF_ONE} of "
         f"one address (with any tokens), {CONNECTIONS_OF_TOKEN} with one token (from all its "
         f"addresses), and {CONNECTIONS_ALIKE} with one token from one address"
     ) in told
-    assert f"room for another {CONNECTIONS_HERE} connections from the machine itself" in told
+    assert f"another {CONNECTIONS_HERE} WebSockets for the machine itself" in told
+    assert f"room for {SOCKETS} TCP connections from other machines" in told
+    assert f"for another {SOCKETS_HERE} from the machine itself" in told
+    fewest = next(files for files in range(4096) if sockets_for(files) == SOCKETS)
+    assert f"fewer than {fewest} files" in told
+    assert f"A network with {SOCKETS_OF_ONE} such connections" in told
+    assert f"A token keeps {SOCKETS_OF_TOKEN} connections" in told
     most, hz = GUESSES_OF_ONE.most, GUESSES_OF_ONE.hz
     assert f"may try {most:g} wrong tokens at once, then one every {1 / hz:g} s" in told
     assert (GUESSES.most / most, GUESSES.hz / hz) == pytest.approx((10, 10))
@@ -111,3 +124,63 @@ def test_each_token_has_a_pace_of_its_own() -> None:
     assert taken == [True] * most + [False]
     assert paces.take("another", 0)
     assert paces.take("one", NS_PER_S)
+
+
+def _filled(*networks: str) -> Sockets[str]:
+    """Return places that are all taken by strangers from these networks, in turn."""
+    sockets = Sockets[str](SOCKETS)
+    for n in range(SOCKETS):
+        assert sockets.enter(networks[n % len(networks)], f"stranger {n}") is None
+    return sockets
+
+
+def test_a_full_network_displaces_its_own_oldest_connection_without_a_token() -> None:
+    sockets = Sockets[int](SOCKETS)
+    for n in range(SOCKETS_OF_ONE):
+        assert sockets.enter("10.0.0.1", n) is None
+    sockets.prove(0, "token")
+    assert sockets.enter("10.0.0.1", 100) is None  # the known one takes no stranger's place
+    assert sockets.enter("10.0.0.1", 101) == 1
+    assert sockets.enter("10.0.0.2", 102) is None
+
+
+def test_if_all_places_are_taken_a_phone_displaces_a_connection_of_the_largest_crowd() -> None:
+    sockets = _filled("a", "b", "c", "d", "e")
+    assert sockets.enter("phone", "phone") == "stranger 0"
+    for n in range(1000):
+        assert sockets.enter("abcde"[n % 5], f"more {n}") != "phone"
+
+
+def test_a_connection_with_a_valid_token_is_never_displaced() -> None:
+    sockets = _filled("a", "b", "c", "d", "e")
+    sockets.prove("stranger 0", "token")
+    gone = [sockets.enter("abcde"[n % 5], f"more {n}") for n in range(1000)]
+    assert None not in gone
+    assert "stranger 0" not in gone
+
+
+def test_a_token_keeps_a_share_of_the_places_only() -> None:
+    sockets = _filled("a", "b", "c", "d", "e")
+    for n in range(SOCKETS):
+        sockets.prove(f"stranger {n}", "greedy")
+    gone = {sockets.enter(f"phone {n}", f"phone {n}") for n in range(100)}
+    assert len(gone) == 100
+    assert gone < {f"stranger {n}" for n in range(SOCKETS_OF_TOKEN, SOCKETS)}
+
+
+def test_if_all_connections_have_shown_a_token_the_next_one_finds_no_place() -> None:
+    sockets = _filled("a", "b", "c", "d", "e")
+    for n in range(SOCKETS):
+        sockets.prove(f"stranger {n}", f"token {n // SOCKETS_OF_TOKEN}")
+    assert sockets.enter("phone", "phone") == "phone"
+    sockets.leave("phone")  # it has no place to give back
+    sockets.leave("stranger 9")
+    assert sockets.enter("phone", "phone") is None
+
+
+def test_connections_stay_below_the_limit_of_open_files() -> None:
+    assert sockets_for(65536) == sockets_for(2048) == sockets_for(1024) == SOCKETS
+    for files in (384, 512, 768):
+        assert SOCKETS_LEAST <= sockets_for(files) < SOCKETS
+        assert sockets_for(files) + SOCKETS_HERE < files
+    assert sockets_for(64) == SOCKETS_LEAST

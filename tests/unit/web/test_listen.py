@@ -5,16 +5,15 @@ That address has a certificate, or there is no invitation.
 
 from __future__ import annotations
 
-import argparse
 import socket
 from pathlib import Path
 
 import pytest
 
-from acsard.certificates.authority import Authority
-from acsard.cli import web
+from acsard.cli import parser, web
 from acsard.host.errors import CertificateError, InUseError, UsageError
 from acsard.host.own_identity import own_addresses
+from acsard.machine.authority import Authority
 from acsard.web.listen import (
     Listen,
     bound,
@@ -127,9 +126,7 @@ def test_nobody_is_invited_to_where_the_server_could_not_start(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    parser = argparse.ArgumentParser()
-    web.add(parser.add_subparsers())
     words = ["web", *tls, "--address", "https://0.0.0.0:8443", "--invite", "viewer"]
     with pytest.raises(CertificateError, match="tls init"):
-        web.main(parser.parse_args(words))
+        web.main(parser(["web"]).parse_args(words))
     assert list(tmp_path.iterdir()) == []

@@ -13,7 +13,7 @@ from acsard.core.config.settings import Config
 from acsard.core.messages.encodings import encode
 from acsard.core.messages.report import Report
 from acsard.core.values import Role
-from acsard.prompts import json_messages
+from acsard.terminal import json_messages
 from acsard.web import socket_messages
 from acsard.web.last_minute import Minute
 from acsard.web.openapi import KEYS, LINES, SENT, VALUE

@@ -18,8 +18,8 @@ from acsard.calibration.log_table import Table
 from acsard.calibration.runs import Run, runs
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config
-from acsard.prompts.prompt import Ask
-from acsard.prompts.terminal_prompt import NoPrompt
+from acsard.terminal.prompt import Ask
+from acsard.terminal.terminal_prompt import NoPrompt
 from tests.unit.calibration.robots import Drive, Floats, Plan, Robot, drive
 
 LENGTH, WIDTH = 0.25, 0.30

@@ -20,7 +20,7 @@ from acsard.calibration.log_table import LogError
 from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.solve import Calibration
 from acsard.core.config.settings import Config, DriveConfig
-from acsard.prompts.prompt import Ask
+from acsard.terminal.prompt import Ask
 from tests.unit.calibration.cut import IDEAL
 from tests.unit.calibration.guided.played import Asked, Player, anyone, leg, play, usual_setup
 from tests.unit.calibration.robots import SEPARATION, Drive, Robot, drive, wander

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives import serialization
 
-from acsard.certificates.authority import Authority
 from acsard.core.values import NS_PER_S
 from acsard.daemon.bus.tls import common_name, ends_ns, require_usable, trouble
 from acsard.host.errors import CertificateError, NotPermittedError
+from acsard.machine.authority import Authority
 
 DAY_NS = 86400 * NS_PER_S
 

@@ -101,7 +101,7 @@ def on(where: Path, endpoint: str) -> Router:
 def test_an_address_that_is_taken_may_be_free_later(tmp_path: Path) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as other,
-        pytest.raises(InUseError, match="are the addresses free"),
+        pytest.raises(InUseError, match="end the program that uses the address"),
     ):
         on(tmp_path, f"tcp/127.0.0.1:{other.getsockname()[1]}").open()
 

@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 from serial import SerialException
 
-from acsard.cli.exits import code_of
 from acsard.daemon.serial.device import close, draining, open_raw, refusal, require, unsent
 from acsard.host import clock
 from acsard.host.errors import Exit, InUseError, NoPortError
@@ -45,7 +44,7 @@ def path() -> Iterator[str]:
 )
 def test_each_error_has_its_code_and_its_words(number: int, code: Exit, words: str) -> None:
     refused = refusal("/dev/acsar_that_is_not", OSError(number, "the driver did not answer"))
-    assert code_of(refused) is code
+    assert refused.code is code
     assert str(refused).count("/dev/acsar_that_is_not") == 1
     assert words in str(refused)
 
@@ -113,7 +112,7 @@ def test_a_device_that_vanishes_inside_any_call_of_the_opening_is_a_lost_device(
         with pytest.raises(OSError, match="Input/output error") as lost:
             open_raw(path, 115200)
     assert lost.value.errno == errno.EIO
-    assert code_of(refusal(path, lost.value)) is Exit.FAILURE
+    assert refusal(path, lost.value).code is Exit.FAILURE
     close(open_raw(path, 115200), wait_s=5.0)  # the failed attempt left nothing open or locked
 
 

@@ -1,0 +1,125 @@
+"""Shared by the verbs that use the bus: their options, the connection, and checks of keys."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from acsard.cli.common import add_config, load
+from acsard.client import Client, connect
+from acsard.core.formatting import printable
+from acsard.core.messages.topics import key_hint, row_of, unknown
+from acsard.daemon.bus.address import Address, address_of
+from acsard.daemon.bus.robot_discovery import named
+from acsard.host.errors import UsageError
+
+MANY = "; several ids separated by commas, or '*' for all robots"
+
+
+def add_bus(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """Add the options of the tools that talk to a running daemon.
+
+    Args:
+        parser: the parser of the verb.
+        more: text that is appended to the help of `--id`.
+    """
+    add_config(parser)
+    parser.add_argument(
+        "--connect", metavar="ENDPOINT", help="address of the daemon, e.g. tcp/127.0.0.1:7448"
+    )
+    parser.add_argument(
+        "--tls",
+        metavar="DIRECTORY",
+        help="directory with your certificate, for a tls/ endpoint (default: $ACSARD_TLS, or "
+        "bus.tls)",
+    )
+    parser.add_argument("--id", metavar="ID", help="the robot's id (default: robot.id)" + more)
+
+
+@contextmanager
+def connected(args: argparse.Namespace, source: str = "app") -> Iterator[Client]:
+    """Connect to the one robot that the options name, to command as `source`."""
+    endpoint, robot_id, tls = robot_address(args)
+    with connect(endpoint, robot_id=robot_id, source=source, tls=tls) as robot:
+        yield robot
+
+
+def robot_address(args: argparse.Namespace) -> Address:
+    """Return the address of one robot from the options, or else from the configuration.
+
+    Raises `UsageError` if `--id` names several robots.
+    """
+    require_one(args)
+    _, config = load(args.config)
+    return address_of(config, args.connect, args.id, args.tls)
+
+
+def require_one(args: argparse.Namespace) -> None:
+    """Raise `UsageError` if `--id` names several robots."""
+    if named(args.id or ""):
+        raise UsageError(
+            f"--id '{args.id}' names several robots, but `acsard {args.verb}` takes one: "
+            "`acsard fleet` lists the robots; only echo, get and call stop take several"
+        )
+
+
+@contextmanager
+def connected_to_many(args: argparse.Namespace) -> Iterator[tuple[Client, tuple[str, ...]]]:
+    """Connect as `connected` does; yield also the ids if `--id` names several robots.
+
+    The ids are `("*",)` for all robots and `()` for a single robot.
+    """
+    many = named(args.id or "")
+    _, config = load(args.config)
+    where = address_of(config, args.connect, None if many else args.id, args.tls)
+    with connect(where.endpoint, robot_id=where.robot_id, tls=where.tls) as robot:
+        yield robot, many
+
+
+def require_followed(key: str) -> None:
+    """Raise `UsageError`, with the command to type instead, if a key never has messages.
+
+    Warn if the key is not in the table, because waiting on a misspelt key looks like a dead robot.
+    """
+    if unknown(key):
+        words = f"{key} is not in the topic table ({key_hint(key)}); waiting for it all the same"
+        print(f"acsard: {printable(words)}", file=sys.stderr)
+    row = row_of(key)
+    if row is None:
+        return
+    instead = {
+        "query": f"answers a query: acsard get {key}",
+        "service": f"is a service: acsard call {key.removeprefix('srv/')}",
+    }.get(row.direction)
+    if row.key == "alive":
+        instead = "is a token without messages: acsard fleet lists the robots that are present"
+    if instead is not None:
+        raise UsageError(f"nothing is published on {key}: it {instead}")
+
+
+def require_asked(key: str) -> None:
+    """Raise `UsageError` if `acsard get` cannot ask this key.
+
+    These are keys that do not answer, services, which would act, and wildcards: `get` prints one
+    answer.
+    """
+    if set(key.partition("?")[0]) & set("*$"):
+        raise UsageError(
+            f"{key} stands for several keys, but get asks one; `acsard topics` lists them"
+        )
+    row = row_of(key)
+    if row is None:
+        return
+    if row.direction == "service":
+        raise UsageError(f"{key} is a service: acsard call {key.removeprefix('srv/')}")
+    if row.direction == "in":
+        raise UsageError(
+            f"{key} is an input and does not answer queries: acsard echo {key} follows it"
+        )
+    if row.key == "alive":
+        raise UsageError(
+            "alive is a token and does not answer queries: acsard fleet lists the robots that "
+            "are present"
+        )

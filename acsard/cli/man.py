@@ -1,0 +1,27 @@
+"""Print a man page of every verb and option, for example into ~/.local/share/man/man1/acsard.1.
+Needs the library argparse-manpage; if it is missing, a message gives the command that installs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from acsard import __version__
+from acsard.cli import parser
+from acsard.host.extras import missing
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.set_defaults(main=main)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Print the man page."""
+    try:
+        from argparse_manpage.manpage import Manpage
+    except ImportError:
+        raise missing("argparse-manpage", "shell") from None
+    about = {"project_name": "acsard", "version": __version__, "manual_title": "ACSAR robot"}
+    print(Manpage(parser(), about))
+    return 0

@@ -1,1 +1,0 @@
-"""`acsard doctor`: diagnoses this machine and suggests fixes. The package does I/O."""

@@ -1,0 +1,1 @@
+"""What an administrator does with the computer: doctor, certificates, serial ports, the service."""

@@ -1,0 +1,289 @@
+"""Examines the daemon: whether it can be reached, whether it runs, and its own reports.
+
+Two states of the daemon tell how well the link to the microcontroller works.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from acsard.core.config.settings import Config
+from acsard.core.formatting import many
+from acsard.core.link.link_diagnosis import BUSY, is_ours
+from acsard.core.messages.diagnostics import NO_ROUTER
+from acsard.core.messages.schema import DiagnosticStatus
+from acsard.core.motion.gyro import WORDS
+from acsard.core.values import NS_PER_S, AcsardError
+from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.zenoh_sessions import reachable
+from acsard.host.errors import NoAnswerError
+from acsard.machine.finding import LEVELS, Finding, Level
+from acsard.machine.running import Running, answers, asked
+
+LOST = 0.02
+"""Largest fraction of lines that may be lost. A sound link loses none."""
+
+DAY_S = 86400.0
+
+ENOUGH = 40
+"""Number of lines sent between both states from which on the fraction of losses is meaningful."""
+
+
+def link(running: Running) -> Iterator[Finding]:
+    """Yield findings about the link, by the counters and reports of the daemon."""
+    config, state = running.config, running.state
+    mend = check(running)
+    if state.link != "up":
+        if state.link == "down":
+            mend = (
+                "see the port above"
+                if running.here
+                else "run `acsard doctor` on that machine, which checks its port"
+            )
+        if config.mcu.simulated or is_ours(state.reason):
+            mend = BUSY
+        text = f"{state.link}: {state.reason}" if state.mode == "waiting" else state.link
+        yield Finding("link", "failure", text, mend)
+        return
+    passed = {
+        key: count - running.before.counters.get(key, 0) for key, count in state.counters.items()
+    }
+    # A fault that occurs at most once a day on average is history. One that is more frequent is a
+    # warning.
+    often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
+    # The built-in simulator is late whenever the daemon is, and it is never unplugged.
+    if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
+        late_times = many(late, "time")
+        text = f"lost {late_times} since the daemon's start because this computer did not run"
+        yield Finding("link", "warning" if late > often else "ok", text, BUSY)
+    problems = [*lost(passed, config), *(refused(passed) or refused(state.counters))]
+    for text in problems:
+        yield Finding("link", "warning", text, mend)
+    went = [] if config.mcu.simulated else gone(state.counters)
+    for times, text in went:
+        yield Finding("link", "warning" if times > often else "ok", text, mend)
+    if not problems and not late and not went:
+        yield Finding("link", "ok", "up, and no line is lost")
+    if state.wheel_fault:
+        yield Finding("wheels", "warning", state.wheel_fault, mend)
+
+
+def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
+    """Yield a warning if too few of the lines sent between the two states were answered."""
+    sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
+    if config.mcu.reply_period or sent < ENOUGH or came >= (1 - LOST) * sent - 1:
+        return
+    yield (
+        f"only {came} of {sent} lines that were sent in a second were answered: the others are "
+        "lost on the way there or back, or the board reports by its own clock"
+    )
+
+
+def refused(counters: Mapping[str, int]) -> list[str]:
+    """Return a warning about refused lines if there are too many of them."""
+    kinds = {
+        name.removeprefix("line_"): count
+        for name, count in counters.items()
+        if name.startswith("line_") and count
+    }
+    if sum(kinds.values()) <= LOST * max(1, counters.get("lines", 0)):
+        return []
+    told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in kinds.items())
+    return [f"lines of the microcontroller that were rejected: {told}"]
+
+
+def gone(counters: Mapping[str, int]) -> list[tuple[int, str]]:
+    """Return the number of lost links that this computer did not cause, with a description."""
+    times = counters.get("link_lost", 0) - counters.get("link_lost_host_stall", 0)
+    text = (
+        f"it was lost {many(times, 'time')} since the daemon's start: the board restarts, is "
+        "silent at times or was unplugged; the log says when (link_stale, link_down)"
+    )
+    return [(times, text)] if times > 0 else []
+
+
+def check(running: Running) -> str:
+    """Return the command that examines the board more closely, and its preconditions."""
+    port = running.config.mcu.port
+    return (
+        f"`acsard mcu check --port {port}` finds the cause, with the wheels lifted; stop the "
+        f"daemon first: systemctl stop acsard, or kill {running.info.pid}"
+    )
+
+
+APART_S = 0.4
+"""Clock difference that is reported, s.
+
+From 0.5 s on, Zenoh replaces the stamps of the clock that is ahead.
+"""
+
+GYRO_MENDS = {
+    "used": "",
+    "waiting for rest": "",
+    "silent": "is its driver running, and does it send to the key imu (ROS: imu/data)?",
+    "disagrees": "turn more slowly, or drive on other ground; if that does not help, check that "
+    "its z axis points up and that it sends rad/s",
+    "not believed": "check that its z axis points up and that it sends rad/s; then `acsard "
+    "calibrate` measures the track width",
+}
+"""Remedy for each gyro status in `state`; "" if the status is good."""
+
+START = (
+    "see systemctl status acsard; or start the daemon: acsard run; if it was started with "
+    "--listen, name that address with --connect"
+)
+
+ANOTHER = (
+    "select a daemon with another id with --id (`acsard fleet` lists the robots); or does "
+    "another program use that port?"
+)
+
+ROUTER = "acsard: router"
+LOOP = "acsard: control loop"
+"""Names of rows in the daemon's diagnostics."""
+
+SIGN = "commands signed as the README describes need no common clock"
+
+
+START_ROUTER = "start it there (rmw_zenohd, zenohd, `acsard router`): the daemon connects by itself"
+
+
+PUT_ROUTER = (
+    "daemons that are connected directly forward no messages: `acsard fleet` and `acsard call "
+    "stop --id '*'` miss the others; a router between all of them solves that "
+    "(deploy/zenoh/README.md)"
+)
+
+
+def routers(config: Config) -> Iterator[Finding]:
+    """Yield findings about the routers: whether they listen, and which rights they pass on."""
+    for endpoint in config.bus.connect:
+        if not answers(endpoint):
+            yield Finding("router", "warning", f"no program listens at {endpoint}", START_ROUTER)
+        if endpoint.startswith("tls/"):
+            continue
+        text = (
+            f"connects to {endpoint}: every program behind that router has the rights of this "
+            "machine"
+        )
+        yield Finding("bus", "warning", text, "keep the router on loopback, or behind TLS")
+
+
+def found(config: Config, address: Address) -> Running | Finding:
+    """Return the daemon that was reached and asked, or the finding that explains the failure.
+
+    Raises `UsageError` if the address is not an endpoint.
+    """
+    endpoint = address.endpoint
+    if not answers(endpoint):
+        if config.bus.mode == "client" and endpoint in map(reachable, config.bus.connect):
+            text = (
+                f"cannot be asked: the router at {endpoint} is missing, and the daemon is "
+                "reached through it"
+            )
+            mend = "start the router first; see `systemctl status acsard`"
+            return Finding("daemon", "warning", text, mend)
+        return Finding("daemon", "warning", f"no program listens at {endpoint}", START)
+    try:
+        return asked(config, address)
+    except NoAnswerError as error:
+        return Finding("daemon", "failure", str(error), ANOTHER)
+    except AcsardError as error:
+        return Finding("daemon", "failure", str(error), "does another program use that port?")
+
+
+def daemon(running: Running) -> Iterator[Finding]:
+    """Yield the findings of the daemon's reports."""
+    state = running.state
+    level: Level = "failure" if state.mode == "fault" else "ok"
+    mend = f"see the reason; `acsard call clear` releases it; {check(running)}"
+    mend = mend if level == "failure" else ""
+    yield Finding("daemon", level, f"{state.mode}: {state.reason}", mend)
+    yield from link(running)
+    yield from clocks(running)
+    yield from gyro(state.gyro, state.counters)
+    yield from linked({row.name: row for row in running.rows})
+    if state.counters.get("gateway_full"):
+        text = "clients from the network took all connections at times: the log names them"
+        yield Finding(
+            "gateway",
+            "warning",
+            text,
+            "remove the client's certificate from [access], or end its program",
+        )
+    yield from latch_file(state.latch_file_error)
+    yield from late(running)
+
+
+def latch_file(trouble: str) -> Iterator[Finding]:
+    """Report that a stop would be lost at a restart, if it would."""
+    if trouble:
+        mend = "free disk space, or name a writable directory: control.state_directory"
+        yield Finding("latch file", "warning", trouble, mend)
+
+
+def late(running: Running) -> Iterator[Finding]:
+    """Yield a warning if the daemon misses control periods, over its whole run or recently.
+
+    Its counters show the whole run, and its diagnostics the recent time.
+    """
+    counters = running.state.counters
+    missed, lines = counters.get("missed_periods", 0), counters.get("lines_sent", 0)
+    told = [row.message for row in running.rows if row.name == LOOP and row.level]
+    if missed > 0.01 * max(1, lines):
+        told = [f"missed {missed} control periods"]
+    for text in told:
+        mend = "which other program uses the processor? `top` shows it; the service runs real-time"
+        yield Finding("daemon", "warning", text, mend)
+
+
+def clocks(running: Running) -> Iterator[Finding]:
+    """Yield warnings if clocks differ, or if stamps were replaced.
+
+    The daemon's time was taken at some moment of the round trip. A daemon on this machine shares
+    our clock.
+    """
+    its_ns, counters = running.state.stamp.to_ns(), running.state.counters
+    apart = (its_ns - running.looked_ns) / NS_PER_S
+    if not running.here and abs(apart) > APART_S + running.trip_ns / 2 / NS_PER_S:
+        way = "ahead of" if apart > 0 else "behind"
+        text = f"the daemon's clock is {abs(apart):.1f} s {way} this machine's"
+        yield Finding("clock", "warning", text, f"let NTP set both (timedatectl); {SIGN}")
+    replaced = counters.get("stamps_replaced", 0)
+    if replaced:
+        text = f"{replaced} commands came from clocks over 0.5 s ahead: their stamps were replaced"
+        yield Finding("clock", "warning", text, f"let NTP set both clocks; {SIGN}")
+
+
+def gyro(does: str, counters: Mapping[str, int]) -> Iterator[Finding]:
+    """Yield findings about the gyro's status in `state` and about refused samples."""
+    words = next((text for name, text in WORDS.items() if name == does), does)
+    if does != "off":
+        mend = GYRO_MENDS.get(does, "is the daemon of another version?")
+        yield Finding("gyro", "warning" if mend else "ok", words, mend)
+    refused = {n.removeprefix("imu_"): c for n, c in counters.items() if n.startswith("imu_") and c}
+    if refused:
+        most = sorted(refused.items(), key=lambda one: -one[1])
+        told = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in most)
+        mend = "the log names the sender (imu_refused); send finite rad/s of one gyro, z up"
+        yield Finding("gyro", "warning", f"samples on imu that were rejected: {told}", mend)
+
+
+def linked(rows: Mapping[str, DiagnosticStatus]) -> Iterator[Finding]:
+    """Yield a finding about the daemon's connection to its routers, if any are configured."""
+    row = rows.get(ROUTER)
+    if row is not None:
+        mend = START_ROUTER if row.level else ""
+        if any(one.value == NO_ROUTER for one in row.values):
+            mend = PUT_ROUTER
+        yield Finding("router", LEVELS[min(row.level, 2)], f"the daemon is {row.message}", mend)
+
+
+def gateway(config: Config) -> Iterator[Finding]:
+    """Yield a finding for each endpoint of the TLS gateway."""
+    for endpoint in config.bus.outside:
+        if answers(endpoint):
+            yield Finding("gateway", "ok", f"open at {endpoint}")
+        else:
+            mend = "see systemctl status acsard-gateway; `acsard run` starts one by itself"
+            yield Finding("gateway", "warning", f"no program listens at {endpoint}", mend)

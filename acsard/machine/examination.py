@@ -1,0 +1,234 @@
+"""All examinations in their order, from the configuration to a moving robot.
+
+This module itself examines the configuration, the certificates, the machine and the serial port;
+`daemon_findings.py` examines the daemon and its link. The doctor opens no port and sends nothing to
+a robot. If a daemon runs, its own configuration is examined, because the file may have changed
+since and options may override it. For a daemon on another machine, only its own reports are
+examined: its port, files and gateway are there.
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+import stat
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from acsard.core.config.contradictions import warnings
+from acsard.core.config.parsing import ConfigError, parse
+from acsard.core.config.settings import Config
+from acsard.core.messages.expiry import expiry
+from acsard.core.values import NS_PER_S
+from acsard.daemon.bus.address import Address, address_of
+from acsard.daemon.bus.tls import CA, CERTIFICATE, KEY, ends_ns, require_usable
+from acsard.host import clock, real_time
+from acsard.host.clock import now
+from acsard.host.errors import MendableError
+from acsard.host.extras import install
+from acsard.host.processes import holders, running
+from acsard.machine.daemon_findings import daemon, found, gateway, routers
+from acsard.machine.finding import LEVELS, Finding, Level
+from acsard.machine.running import Running, compared
+from acsard.machine.serial_ports import BOARDS, serial_devices
+
+
+def certificates(tls: str) -> Iterator[Finding]:
+    """Yield findings about these files: whether they exist, are private and have not expired.
+
+    Yields nothing if `tls` is "".
+    """
+    if not tls:
+        return
+    directory = Path(tls)
+    for name in (CA, CERTIFICATE, KEY):
+        file = directory / name
+        if not os.access(file, os.R_OK):
+            text = f"{file} is missing, or you may not read it"
+            yield Finding(
+                "certificates",
+                "failure",
+                text,
+                "run `sudo acsard tls init`, or this command with sudo",
+            )
+        elif name == KEY and file.stat().st_mode & 0o077:
+            yield Finding(
+                "certificates", "failure", f"other users may read {file}", f"chmod 600 {file}"
+            )
+    try:
+        require_usable(tls)
+    except MendableError as error:
+        yield Finding("certificates", "failure", str(error), "see `acsard tls init --help`")
+        return
+    ends = ends_ns(tls)
+    level, words = expiry(ends, now().wall_ns)
+    mend = "run `acsard tls renew`, or in a fleet `tls add`, where ca-key.pem is"
+    if ends is None:
+        mend = f"run {install('tls')}, to read the certificate"
+    yield Finding("certificates", LEVELS[level], words, mend if level else "")
+
+
+REAL = (
+    "run the daemon as the service (deploy/systemd), which has it; without it, load makes "
+    "the daemon late"
+)
+
+LEAST_YEAR = 2026
+"""Year before which a clock was never set. Boards without a battery start in the past."""
+
+
+def meddlers() -> Iterator[Finding]:
+    """Yield findings about programs that take or disturb serial ports."""
+    if running("brltty"):
+        mend = (
+            "sudo apt remove brltty, unless you use a Braille display: it takes CH340 and "
+            "FTDI ports"
+        )
+        yield Finding("brltty", "failure", "runs", mend)
+    if running("ModemManager") and not Path("/etc/udev/rules.d/70-acsar.rules").is_file():
+        mend = "install deploy/udev/70-acsar.rules (`acsard service install` does that)"
+        yield Finding("ModemManager", "warning", "runs, and sends data to new serial ports", mend)
+
+
+def clock_set() -> Iterator[Finding]:
+    """Yield a finding about the wall clock, which the stamps depend on."""
+    year = time.gmtime(clock.now().wall_ns / NS_PER_S).tm_year
+    if year < LEAST_YEAR:
+        mend = "set it (timedatectl), or let chrony set it; odometry stamps are wall-clock times"
+        yield Finding("clock", "warning", f"stands in {year}", mend)
+    else:
+        yield Finding("clock", "ok", f"stands in {year}")
+
+
+def scheduling(wanted: bool, pid: int | None) -> Iterator[Finding]:
+    """Yield a finding about real-time scheduling.
+
+    Args:
+        wanted: the setting control.real_time.
+        pid: the process of the daemon on this machine; without one, the rights of this process
+            count.
+    """
+    has = None if pid is None else real_time.has(pid)
+    if not wanted:
+        yield Finding("real time", "ok", "is not requested (control.real_time = false)")
+    elif has:
+        yield Finding("real time", "ok", f"the daemon that runs (pid {pid}) has it")
+    elif has is False:
+        yield Finding("real time", "warning", f"the daemon that runs (pid {pid}) has none", REAL)
+    elif real_time.allowed():
+        yield Finding("real time", "ok", "is permitted")
+    else:
+        yield Finding("real time", "warning", "is not permitted for this user", REAL)
+
+
+def serial_port(config: Config) -> Iterator[Finding]:
+    """Yield findings about the port: existence, permissions, and other programs that use it."""
+    path = config.mcu.port
+    if path == "sim":
+        mend = '`acsard ports` lists the ports; write mcu.port = "/dev/acsar", say'
+        yield Finding("port", "warning", "the built-in simulator: no robot will move", mend)
+        return
+    if not os.path.exists(path):
+        seen = ", ".join(port.device for port in serial_devices()) or "none"
+        mend = (
+            "plug it in; names in by-id stay the same when it is plugged in again (`acsard ports`)"
+        )
+        yield Finding("port", "failure", f"{path} does not exist; the ports are: {seen}", mend)
+        return
+    if not stat.S_ISCHR(os.stat(path).st_mode):
+        yield Finding("port", "failure", f"{path} is not a serial device", "see `acsard ports`")
+        return
+    yield _permission(path)
+    for holder in holders(path):
+        level: Level = "ok" if holder.name == "acsard" else "failure"
+        mend = "" if level == "ok" else f"end it: kill {holder.pid}; or make it use another port"
+        text = f"{path} is in use by {holder.name} (pid {holder.pid})"
+        yield Finding("port", level, text, mend)
+    yield from _hardware(Path(os.path.realpath(path)).name)
+
+
+def _hardware(name: str) -> Iterator[Finding]:
+    """Yield warnings about an unknown board, and about a USB chip that delays bytes."""
+    usb = [port for port in serial_devices() if port.device == f"/dev/{name}"]
+    if usb and usb[0].usb_id and not usb[0].board:
+        known = ", ".join(sorted(BOARDS))
+        text = f"{usb[0].usb_id} is not one of the common boards ({known})"
+        yield Finding("port", "warning", text, "add it to 70-acsar.rules if it is your MCU")
+    timer = Path(f"/sys/class/tty/{name}/device/latency_timer")
+    if timer.is_file() and timer.read_text().strip() != "1":
+        text = f"its FTDI chip delays bytes by {timer.read_text().strip()} ms"
+        yield Finding("port", "warning", text, f"install 70-acsar.rules, or: echo 1 > {timer}")
+
+
+def _permission(path: str) -> Finding:
+    if os.access(path, os.R_OK | os.W_OK):
+        return Finding("port", "ok", f"{path} may be read and written")
+    group = _group_of(os.stat(path).st_gid)
+    mend = f"sudo usermod -aG {group} $USER, then log in again (the service has the group itself)"
+    return Finding(
+        "port", "failure", f"{path} belongs to group {group}, but you are not in it", mend
+    )
+
+
+def _group_of(number: int) -> str:
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
+def examine(
+    where: str,
+    text: bytes,
+    given: dict[str, dict[str, object]],
+    told: Callable[[Config], Address] = address_of,
+) -> Iterator[Finding]:
+    """Yield all findings.
+
+    Args:
+        where: the path of the configuration, for messages.
+        text: the content of the configuration file.
+        given: values that override the file.
+        told: returns the daemon's address for a configuration.
+
+    Raises `UsageError` if that address is not an endpoint.
+    """
+    try:
+        config = parse(text, given)
+    except ConfigError as error:
+        for problem in error.problems:
+            yield Finding("configuration", "failure", f"{where}: {problem}", "see acsard.toml")
+        return
+    yield Finding("configuration", "ok", where)
+    address, written = told(config), ""
+    running = found(config, address)
+    if isinstance(running, Running) and not running.here:
+        elsewhere = (
+            f"runs on another machine (its pid {running.info.pid} is not an acsard process here)"
+        )
+        yield Finding("daemon", "ok", f"{elsewhere}: check its port, files and TLS gateway there")
+        yield from certificates(address.tls)
+        yield from daemon(running)
+        return
+    if isinstance(running, Running):
+        yield from compared(running, config)
+        config, written = running.config, config.bus.tls
+    for warning in warnings(config):
+        yield Finding("configuration", "warning", warning, "see acsard.toml")
+    yield from serial_port(config)
+    yield from meddlers()
+    yield from clock_set()
+    yield from scheduling(
+        config.control.real_time, running.info.pid if isinstance(running, Running) else None
+    )
+    # The service has copies of the certificates from its start. A file that has since been deleted
+    # is reported at its original place.
+    for directory in dict.fromkeys((config.bus.tls, address.tls, written)):
+        yield from certificates(directory)
+    yield from routers(config)
+    if isinstance(running, Running):
+        yield from daemon(running)
+    else:
+        yield running
+    yield from gateway(config)

@@ -1,0 +1,283 @@
+"""acsard as a system service: its files, its commands, and the steps that install or remove it.
+
+The files are those of `deploy/`, with the path of this installation in the units. A file that
+somebody else has written is neither overwritten nor removed without force. A service cannot run
+from every place: `misplaced` says why it cannot run from this one.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import acsard
+from acsard.host.errors import Exit, ExitError
+from acsard.host.processes import called
+from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
+
+HOME = "/opt/acsard/venv"
+"""Path of the venv in the unit files of `deploy/`."""
+
+OUT_OF_SIGHT = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")
+"""Directories that a service cannot see."""
+
+
+def misplaced(
+    prefix: str = sys.prefix,
+    base: str = sys.base_prefix,
+    executable: str = sys.executable,
+    hidden: Sequence[str] = OUT_OF_SIGHT,
+) -> str:
+    """Return why a service cannot run this installation, or "" if it can."""
+    if prefix == base or _hidden(Path(prefix), hidden):
+        return (
+            f"a service cannot run from {prefix}, because it cannot see homes and /tmp; install "
+            f"acsard in a venv at {HOME} (deploy/systemd/README.md)"
+        )
+    # A venv borrows its Python: its bin/python is a link to the one that it was made with.
+    interpreter = Path(os.path.realpath(executable))
+    for path in (Path(base), interpreter):
+        if _hidden(path, hidden):
+            return (
+                f"the venv {prefix} uses the Python in {path}, which a service cannot see; "
+                f"{_anew(prefix)}"
+            )
+    for path in (Path(prefix), interpreter):
+        closed = _closed(path)
+        if closed:
+            return (
+                f"the service's user may not enter {closed}, but needs {path}; run `chmod o+rx "
+                f"{closed}`, or {_anew(prefix)}"
+            )
+    return ""
+
+
+def _anew(prefix: str) -> str:
+    return (
+        f"make the venv again with the system's Python: /usr/bin/python3 -m venv --clear {prefix}"
+    )
+
+
+def _hidden(path: Path, hidden: Sequence[str]) -> bool:
+    real = Path(os.path.realpath(path))
+    return any(real.is_relative_to(place) for place in hidden)
+
+
+def _closed(path: Path) -> Path | None:
+    """Return the first part of `path` that other users may not enter, or None."""
+    for place in (*reversed(path.parents), path):
+        try:
+            mode = place.stat().st_mode
+        except PermissionError:
+            return place
+        except OSError:
+            # The path does not exist, so nothing keeps the service out.
+            return None
+        if not mode & stat.S_IXOTH:
+            return place
+    return None
+
+
+UNIT, GATEWAY, PAGE = "acsard.service", "acsard-gateway.service", "acsard-web.service"
+ALL = (UNIT, GATEWAY, PAGE)
+STOP = "acsard-stop"
+UNITS = Path("/etc/systemd/system")
+ETC = Path("/etc/acsard")
+LAN = "lan.conf"
+TLS = "/etc/acsard/tls"
+"""Directory in which `lan.conf` expects the certificates."""
+STATES = {
+    UNIT: (Path("/var/lib/acsard"), "its recordings, and the stop that survives a restart"),
+    PAGE: (Path("/var/lib/acsard-web"), "invitations to the page"),
+}
+"""State directories of the units, each with a description of its content."""
+
+Found = Mapping[Path, bytes | None]
+"""Present content of each file's path; None if it does not exist."""
+
+ASK_S = 10.0
+"""Time limit for a call of systemd, s: it answers at once, or it hangs."""
+
+RELOAD = (
+    Run(("systemctl", "daemon-reload")),
+    Run(("udevadm", "control", "--reload"), may_fail=True),
+)
+AGAIN = ("tty", "usb-serial", "misc")
+"""Subsystems of the devices that the udev rules cover; udev applies the rules to them again."""
+
+INSTALLED = (
+    *RELOAD,
+    Run(("udevadm", "trigger", *(f"--subsystem-match={one}" for one in AGAIN)), may_fail=True),
+    # Start the daemon first, and ignore a failure: the page's unit mounts the directory that
+    # systemd creates for the daemon.
+    Run(("systemctl", "start", UNIT), may_fail=True),
+    Run(("systemctl", "enable", "--now", *ALL)),
+)
+GONE = (*RELOAD, Run(("systemctl", "reset-failed", *ALL), may_fail=True))
+
+
+def files() -> list[File]:
+    """Return every file of the service, as this installation writes it."""
+    reference = _reference().read_text(encoding="utf-8")
+    return [
+        *(_unit(name) for name in ALL),
+        File(Path("/opt/acsard/bin") / STOP, (source() / "systemd" / STOP).read_bytes(), 0o755),
+        File(
+            Path("/etc/udev/rules.d/70-acsar.rules"),
+            (source() / "udev" / "70-acsar.rules").read_bytes(),
+        ),
+        File(
+            ETC / "acsard.toml",
+            reference.replace('port = "sim"', 'port = "/dev/acsar"').encode(),
+            kept=True,
+        ),
+    ]
+
+
+def _unit(name: str) -> File:
+    text = (source() / "systemd" / name).read_text(encoding="utf-8")
+    return File(UNITS / name, text.replace(HOME, sys.prefix).encode())
+
+
+def lan_drop_in(unit: str) -> File:
+    """Return the drop-in that gives a unit access to the local network and to the certificates."""
+    return File(UNITS / f"{unit}.d" / LAN, (source() / "systemd" / LAN).read_bytes())
+
+
+def admitting(directory: Path) -> Write | Keep | None:
+    """Return the step that gives the TLS gateway of the service these certificates, or None.
+
+    None means that the service is not installed, or the user is not root. The unit itself may use
+    loopback only and reads none of root's files. A drop-in that exists keeps its networks, which an
+    administrator may have narrowed.
+    """
+    if os.geteuid() != 0 or not (UNITS / GATEWAY).exists():
+        return None
+    file = lan_drop_in(GATEWAY)
+    return admitted(file, file.found(), directory)
+
+
+def admitted(file: File, found: bytes | None, directory: Path) -> Write | Keep:
+    """Return the step that puts the certificates of `directory` into the drop-in.
+
+    `found` is the drop-in's present content, or None; then the delivered content is the base.
+    """
+    place = str(directory).encode()
+    text = re.sub(
+        rb"(?m)^(LoadCredential=[\w.-]+:).*/",
+        lambda match: match[1] + place + b"/",
+        file.content if found is None else found,
+    )
+    if text == found:
+        return Keep(file.path, "it names these certificates")
+    return Write(File(file.path, text))
+
+
+def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
+    """Return the present content of each file's path."""
+    return {file.path: file.found() for file in wanted}
+
+
+def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
+    """Return the installation steps; raise `ExitError` if they would overwrite a changed file."""
+    steps: list[Step] = []
+    changed: list[str] = []
+    for file in wanted:
+        there = found[file.path]
+        if there == file.content or (file.kept and there is not None):
+            steps.append(Keep(file.path))
+            continue
+        if there is not None:
+            changed.append(str(file.path))
+        steps.append(Write(file))
+    if changed and not force:
+        paths = ", ".join(changed)
+        raise ExitError(Exit.FAILURE, f"would overwrite {paths}; look at them, or use --force")
+    return [*steps, *INSTALLED]
+
+
+def own_places() -> list[Path]:
+    """Return the directories that may hold files of the service that were not installed."""
+    return [*(UNITS / f"{unit}.d" for unit in reversed(ALL)), ETC]
+
+
+def strangers(files: Iterable[File], places: Iterable[Path]) -> list[Path]:
+    """Return the other files in these places, such as certificates and further drop-ins."""
+    ours = {file.path for file in files}
+    inside = (path for place in places if place.is_dir() for path in sorted(place.iterdir()))
+    return [path for path in inside if path not in ours]
+
+
+def uninstalling(
+    wanted: Iterable[File],
+    found: Found,
+    others: Iterable[Path] = (),
+    *,
+    force: bool,
+    purge: bool = False,
+    stateful: Iterable[str] = (),
+) -> list[Step]:
+    """Return the steps that remove the service, with a reason for each file that stays.
+
+    A changed file stays unless `force` or `purge` is set; for a `kept` file only `purge` counts.
+    `others` and the `STATES` of the `stateful` units stay unless `purge` is set.
+    """
+    there = [file for file in wanted if found[file.path] is not None]
+    why: dict[Path, str] = {}
+    for file in there:
+        if found[file.path] == file.content or purge:
+            continue
+        if file.kept:
+            why[file.path] = "your configuration; --purge removes it"
+        elif not force:
+            why[file.path] = "it has been edited; --force removes it"
+    if any(path.name == UNIT for path in why):
+        # A unit that may start again needs the program that sends zeros after it.
+        why |= {f.path: f"{UNIT} stays and needs it" for f in there if f.path.name == STOP}
+    steps: list[Step] = [
+        Keep(file.path, why[file.path]) if file.path in why else Remove(file.path) for file in there
+    ]
+    for path in others:
+        what = "certificates and their authority" if path == Path(TLS) else "not the service's own"
+        steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
+    for unit in stateful:
+        where, what = STATES[unit]
+        # systemd knows the real place of the state directory, as long as it knows the unit.
+        clean = Run(("systemctl", "clean", "--what=state", unit))
+        steps.insert(0, clean if purge else Keep(where, f"{what}; --purge removes it"))
+    units = [name for name in reversed(ALL) if any(file.path.name == name for file in there)]
+    leaving = [Run(("systemctl", "disable", "--now", *units))] if units else []
+    return [*leaving, *steps, *GONE]
+
+
+def state(unit: str) -> str:
+    """Return systemd's report about a unit; "" if systemd does not answer."""
+    about = "--property=ActiveState,SubState,StatusText,NRestarts"
+    try:
+        done = called(("systemctl", "show", unit, about), ASK_S)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() or done.stderr.strip()
+
+
+def source() -> Path:
+    """Return the directory `deploy/`, which is inside the package or beside it in a clone."""
+    package = Path(acsard.__file__).parent
+    inside = package / "deploy"
+    if inside.is_dir():
+        return inside
+    clone = package.parent / "deploy"
+    if not clone.is_dir():
+        raise ExitError(Exit.FAILURE, f"neither {inside} nor {clone} exists; install acsard again")
+    return clone
+
+
+def _reference() -> Path:
+    """Return the reference configuration, which is beside `deploy/` in a clone."""
+    inside = source() / "acsard.toml"
+    return inside if inside.is_file() else source().parent / "acsard.toml"

@@ -1,0 +1,132 @@
+"""Describes the result of a replay in lines for the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from acsard.core.config.live import flat
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.validation import show
+from acsard.core.formatting import listed, printable
+from acsard.recording.recorded_steps import MICRO
+from acsard.recording.replay import Comparison, Difference, Seen, fastest
+
+HUNDREDTHS = 100.0
+"""Divisor of the wheel speeds of a line, which are in hundredths of rad/s."""
+
+LINE_SETTINGS = ("limits.", "drive.", "mcu.wheels.")
+"""Prefixes of the settings that change which line a command produces."""
+
+MAX_KEYS = 8
+"""Largest number of changed settings that a line of text names."""
+
+
+def verdict(comparison: Comparison) -> str:
+    """Return the result of a replay in one line."""
+    lines = _share(comparison.lines_same, comparison.lines)
+    poses = _share(comparison.poses_same, comparison.poses)
+    modes = _share(comparison.modes_same, comparison.steps)
+    rounded = comparison.same and not comparison.exact
+    bits = " (poses agree to 1 um, but not to the last bit)" if rounded else ""
+    return f"{lines} lines are the same, {poses} poses, {modes} modes{bits}"
+
+
+def _share(same: int, total: int) -> str:
+    return f"{same:,} of {total:,}".replace(",", " ")
+
+
+def explain_verdict(other: bool) -> str:
+    """Explain the figures of `verdict`.
+
+    `other` is true if the replay used another configuration than the recorded one.
+    """
+    computed = "with that configuration" if other else "by this version"
+    return (
+        "(Each line to the board, each pose by odometry to the um, and the mode of each step is "
+        f"computed {computed} from the recorded inputs, and compared with the recorded one.)"
+    )
+
+
+def describe_difference(difference: Difference, began_ns: int) -> list[str]:
+    """Return lines of text that show the recorded and the replayed outputs of a step.
+
+    `began_ns` is the monotonic time at which the recording began, ns.
+    """
+    seconds = (difference.at.mono_ns - began_ns) / 1e9
+    what = ", ".join(difference.what)
+    return [
+        f"the first difference is in step {difference.number}, {seconds:.3f} s after the "
+        f"beginning: {what}",
+        *_side("recorded", difference.recorded),
+        *_side("replayed", difference.replayed),
+    ]
+
+
+def _side(name: str, seen: Seen) -> list[str]:
+    mode, reason, link, source = map(printable, seen.status)
+    line = "no line" if seen.line is None else printable(seen.line.decode(errors="replace").strip())
+    poses = [[f"{value / MICRO:.6f}" for value in pose] for pose in seen.poses]
+    rows = [
+        f"  {name:8}  {line}",
+        f"            mode {mode} ({reason}), link {link}, source {source or 'none'}",
+        *[f"            pose x {x} y {y} yaw {yaw}" for x, y, yaw in poses],
+    ]
+    return [*rows, f"            the guard: {seen.trip}"] if seen.trip else rows
+
+
+def explain_settings(
+    recorded: Config, other: Config, comparison: Comparison, began_ns: int
+) -> list[str]:
+    """Explain in lines of text why another configuration leads to other results.
+
+    The lines name the changed settings, the first line to the board that differs because of those
+    settings, and a new fault. They also warn that the recorded wheels did not obey the other
+    configuration. `began_ns` is the monotonic time at which the recording began, ns.
+    """
+    before, after = (dict(flat(effective(config))) for config in (recorded, other))
+    keys = [key for key in before | after if before.get(key) != after.get(key)]
+    changes = [f"{key} was {_value(key, before)}, is {_value(key, after)}" for key in keys]
+    rows = [f"changed settings: {listed(changes, MAX_KEYS, '; ') or 'none'}"]
+    first, fault = comparison.first, comparison.fault
+    if first is not None and "line" in first.what:
+        speeds = _speeds(fastest(first.recorded.line), fastest(first.replayed.line))
+        shaping = [key for key in keys if key.startswith(LINE_SETTINGS)]
+        because = f", because of {', '.join(shaping[:MAX_KEYS])}" if shaping else ""
+        rows.append(f"the fastest wheel of that line: {speeds}{because}")
+    if first is not None and fault is not None:
+        seconds = (fault.at.mono_ns - began_ns) / 1e9
+        rows.append(f"in fault from {seconds:.3f} s on: {printable(fault.replayed.status[1])}")
+        if first.number < fault.number:
+            rows.append(
+                "  the recorded wheels obeyed the recorded commands, not those of this replay: a "
+                "robot with this configuration need not have had that fault. Only the part before "
+                "it counts"
+            )
+    return rows
+
+
+def _value(key: str, settings: Mapping[str, object]) -> str:
+    return show(settings[key]) if key in settings else "absent"
+
+
+def _speeds(recorded: int, replayed: int) -> str:
+    return f"{recorded / HUNDREDTHS:.2f} rad/s recorded, {replayed / HUNDREDTHS:.2f} rad/s replayed"
+
+
+def describe_outcome(comparison: Comparison) -> list[str]:
+    """Describe in lines of text how the replayed robot moved, compared with the recorded one."""
+    rows = [
+        f"{comparison.lines - comparison.lines_same} of {comparison.lines} lines would differ, and "
+        f"{comparison.steps - comparison.modes_same} of {comparison.steps} steps would have "
+        "another mode",
+        f"the fastest wheel of all lines: {_speeds(*comparison.fastest)}",
+    ]
+    if comparison.end is not None:
+        (x, y, _), (new_x, new_y, _) = comparison.end
+        rows.append(
+            f"the last pose by odometry: x {x / MICRO:.3f} y {y / MICRO:.3f} recorded, "
+            f"x {new_x / MICRO:.3f} y {new_y / MICRO:.3f} replayed; "
+            f"at most {comparison.apart:.3f} m apart"
+        )
+    return rows

@@ -1,0 +1,266 @@
+"""The recorder's thread: writes steps to the current file, and reacts to errors of the disk.
+
+One thread calls `StepWriter.write` about once a second. That call writes and syncs the steps that
+have arrived, begins and ends files, and retains the files around an incident. If the disk refuses,
+the steps of that call are lost and counted. The writer then pauses for `RETRY_ROUNDS` calls and
+tries again with a new file, which begins with the robot's state.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from acsard import __version__
+from acsard.core.config.parsing import effective
+from acsard.core.config.settings import Config
+from acsard.core.config.writing import document
+from acsard.core.values import NS_PER_S, Event, Instant
+from acsard.recording.chunks import MAX_DATA_BYTES
+from acsard.recording.directory import Ring, Run, mark_cut
+from acsard.recording.file import About, Writing
+from acsard.recording.recorded_steps import Start, Taken, runs
+from acsard.recording.recovery import FULL
+from acsard.recording.retention import IncidentWindow
+from acsard.recording.rows import encode
+from acsard.recording.timeline import entry_of
+
+RETRY_ROUNDS = 5
+"""Number of calls of `write`, about one each second, to wait after the disk refused."""
+
+BATCH = 256
+"""Largest number of steps in one message. A second has fewer, unless many commands arrive."""
+
+MAX_FILE_NS = 3600 * NS_PER_S
+"""Longest time that one file may cover."""
+
+INCIDENTS = frozenset({"fault", "stop", "link_down", "link_stale", "port_lost"})
+"""Events because of which the files within a minute of the event are retained."""
+
+
+class Bug(NamedTuple):
+    """A failure of the daemon itself, which ends the daemon."""
+
+    why: str
+    at: Instant | None
+    """Instant of the step that failed; None if the daemon failed outside a step."""
+    unfinished: bytes
+    """Encoded inputs of that step; empty if they cannot be encoded."""
+
+
+class StepWriter:
+    """Writes steps to the directory of recordings, and starts again after an error of the disk."""
+
+    def __init__(
+        self,
+        config: Config,
+        report: Callable[[Event], None],
+        request_state: Callable[[], None],
+        started_ns: int,
+    ) -> None:
+        """Prepare the first file; nothing is opened before the first call of `write`.
+
+        Args:
+            config: the configuration at the daemon's start.
+            report: takes events for the log.
+            request_state: asks the control loop for a `Start`, which begins a new file.
+            started_ns: wall-clock time of the daemon's start, ns since 1970.
+        """
+        self._started_ns = started_ns
+        self.where = config.record.directory
+        self.trouble = ""
+        """Why the disk refuses, for the user; "" if it does not."""
+        self.lost = 0
+        """Number of steps lost because the disk refused to write."""
+        self._config, self._report, self._request_state = config, report, request_state
+        self._ring: Ring | None = None
+        self._writing: Writing | None = None
+        self._start: Start | None = Start(0, b"", config)
+        """Start of the next file. None if steps were lost, so that the robot's state is needed."""
+        self._incidents = IncidentWindow[Path]()
+        self._number = self._began_ns = 0
+        self._last = Instant(0, 0)
+        self._reported = False
+        """True once the log has the event that recording works."""
+        self._refused = False
+        """True if the last write failed because the disk was full."""
+        self._looked_back = False
+        """True once the files of the previous run of the daemon have been examined."""
+        self._run = Run()
+        self._cut_ns: int | None = None
+        """Wall-clock time at which a crash cut off the previous run's file, ns since 1970.
+
+        It is set when that file is finished, and used once.
+        """
+        self.bug: Bug | None = None
+        """The failure that ends the daemon; only the last call of `write` reads it."""
+        self._pause = 0
+        self._handed = self._safe = 0
+        """Steps of this call that were written to the file or counted as lost, and how many of
+        those are synced or counted. If the disk refuses, the other steps are lost.
+        """
+
+    def write(self, items: list[Taken | Start], over: bool) -> None:
+        """Write the items that have arrived, or count their steps as lost.
+
+        `over` is true for the last call, which finishes the file.
+        """
+        self._handed = self._safe = 0
+        try:
+            if self._pause == 0 or over:
+                ring = self._ring = self._ring or self._open_ring()
+                for start, steps in runs(items):
+                    self._write_group(ring, start, steps)
+                self._flush(ring, over)
+            else:
+                self._pause -= 1
+        except OSError as error:
+            self._fail(error)
+        lost = sum(isinstance(item, Taken) for item in items) - self._safe
+        if lost:
+            self.lost += lost
+            self._start = None
+        if self._start is None and self._writing is None and self._pause == 0:
+            self._request_state()
+
+    def mark_cut(self, cut: Literal["late", "disk"]) -> None:
+        """Mark the file that is being written, so that it does not pass for one that a crash cut.
+
+        Another thread may call this method while `write` waits for the disk.
+        """
+        writing = self._writing
+        if writing is not None:
+            # Without the marker, the next start treats the file as cut off by a crash.
+            with suppress(OSError):
+                mark_cut(writing.path, self._incidents.kind, cut)
+
+    def _open_ring(self) -> Ring:
+        """Open the directory, and report the files that could not be finished."""
+        ring = Ring(self._config.record, self._run, self._refused)
+        self._refused, self._cut_ns = False, ring.cut_ns or self._cut_ns
+        for text in ring.messages:
+            self._report(Event("recording", text, "warning"))
+        return ring
+
+    def _write_group(self, ring: Ring, start: Start | None, steps: list[Taken]) -> None:
+        """Write steps to a new file that begins with `start`, or to the current file if None."""
+        if start is not None:
+            self._finish(ring)
+            self._start, self._number = start, start.number
+        if self._writing is None:
+            if self._start is None or not steps:
+                self.lost += len(steps)
+                self._handed += len(steps)
+                self._safe = self._handed
+                return
+            self._begin(ring, self._start, steps[0].inputs.now)
+        assert self._writing is not None
+        for at in range(0, len(steps), BATCH):
+            self._add(ring, self._writing, steps[at : at + BATCH])
+
+    def _add(self, ring: Ring, writing: Writing, batch: list[Taken]) -> None:
+        """Write steps as one message, or as several if a reader would refuse such a large one."""
+        data = encode(self._number, batch)
+        if len(data) > MAX_DATA_BYTES and len(batch) > 1:
+            half = len(batch) // 2
+            self._add(ring, writing, batch[:half])
+            self._add(ring, writing, batch[half:])
+            return
+        writing.add("steps", batch[0].inputs.now.wall_ns, data)
+        self._number += len(batch)
+        self._handed += len(batch)
+        self._last = batch[-1].inputs.now
+        for _, outputs, _ in batch:
+            for event in outputs.events:
+                writing.event(entry_of(event, outputs.now.wall_ns))
+                if event.name in INCIDENTS:
+                    self._retain(ring, outputs.now)
+
+    def _begin(self, ring: Ring, start: Start, now: Instant) -> None:
+        ring.trim(now)
+        if not self._looked_back:
+            self._look_back(ring, now)
+        about = About(
+            robot=self._config.robot.id,
+            version=__version__,
+            python=platform.python_version(),
+            mono_ns=now.mono_ns,
+            wall_ns=now.wall_ns,
+            started_ns=self._started_ns,
+            config="\n".join(document(effective(start.config))) + "\n",
+        )
+        self._writing, self._start = ring.begin(about), None
+        self._began_ns = now.mono_ns
+        if self._cut_ns is not None:
+            since_ns, self._cut_ns = now.wall_ns - self._cut_ns, None
+            self._incidents.earlier_happened(now.mono_ns - max(0, since_ns))
+        self._incidents.begin(now.mono_ns)
+        if start.state:
+            self._writing.add("state", now.wall_ns, start.state)
+
+    def _look_back(self, ring: Ring, now: Instant) -> None:
+        """Register the files of the previous run, so that incidents count over a restart."""
+        for path, kind, ended_ns in ring.just_ended(now):
+            self._incidents.earlier(path, kind, ended_ns)
+        self._looked_back = True
+
+    def _retain(self, ring: Ring, now: Instant) -> None:
+        """Retain the current file, and the files that ended less than a minute ago."""
+        for path in self._incidents.happened(now.mono_ns):
+            ring.retain(path)
+
+    def _write_bug(self, ring: Ring, bug: Bug) -> None:
+        """Write the inputs of the step that failed, and retain the file as after a crash."""
+        if bug.at is not None and self._writing is None and self._start is not None:
+            self._begin(ring, self._start, bug.at)
+        if self._writing is None:
+            return
+        self._last = bug.at or self._last
+        if bug.unfinished:
+            self._writing.add("unfinished", self._last.wall_ns, bug.unfinished)
+        self._retain(ring, self._last)
+
+    def _flush(self, ring: Ring, over: bool) -> None:
+        if over:
+            if self.bug is not None:
+                self._write_bug(ring, self.bug)
+            self._finish(ring, *(("bug", self.bug.why) if self.bug else ()))
+            ring.close()
+        if self._writing is None:
+            return
+        self._writing.flush()
+        self._safe, self._run.freed = self._handed, 0
+        ring.tend(self._last)
+        if self.trouble or not self._reported:
+            self.trouble, self._reported = "", True
+            self._report(Event("recording", f"to {self.where}"))
+        too_long = self._last.mono_ns - self._began_ns > MAX_FILE_NS
+        if too_long or self._writing.size > ring.file_bytes:
+            self._request_state()
+
+    def _finish(self, ring: Ring, cut: str = "", why: str = "") -> None:
+        if self._writing is None:
+            return
+        path = ring.end(self._writing, self._incidents.kind, cut, why)
+        self._writing, self._safe = None, self._handed
+        self._incidents.end(path, self._last.mono_ns)
+
+    def _fail(self, error: OSError) -> None:
+        """Close the file and the directory after an error of the disk, and begin the pause."""
+        text = f"{self.where}: {error.strerror or error}"
+        if text != self.trouble:
+            self.trouble = text
+            self._report(Event("recording", f"{text}; driving goes on", "warning"))
+        if self._writing is not None:
+            self._run.cut[self._writing.path.name] = self._incidents.kind
+            if self.bug is None:
+                self.mark_cut("disk")
+        for resource in (self._writing, self._ring):
+            if resource is not None:
+                resource.close()
+        self._refused = error.errno in FULL
+        self._writing = self._ring = None
+        self._pause = RETRY_ROUNDS

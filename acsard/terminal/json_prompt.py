@@ -1,0 +1,272 @@
+"""`--json-lines`: a program, such as the robot's page, shows the prompts to a person.
+
+Texts and questions are written to standard output as JSON objects, one per line. Answers, key
+presses and signs of life are read from standard input. The end of the input interrupts the verb as
+Ctrl-C does. So does a silence of the program while something may move: the program sends as long as
+it is in contact with the person. deploy/web/README.md describes the fields.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from itertools import count
+from typing import Self, TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from acsard.checkup.findings import Finding
+from acsard.host.config_file import change, require_changeable, writable
+from acsard.host.errors import MendableError
+from acsard.terminal.json_messages import (
+    Doing,
+    Found,
+    JobMessage,
+    Progress,
+    Question,
+    Result,
+    Subject,
+)  # fmt: skip
+from acsard.terminal.prompt import Ask
+
+T = TypeVar("T")
+
+HEARD_S = 0.9
+"""Longest silence of the program while something may move, s. Zeros then follow within a second of
+its last line.
+
+The program sends a line every 0.1 s, if only `{}`. TCP resends a lost packet after 0.2 s, and again
+after another 0.4 s. A line that is lost twice therefore arrives in time, and a STOP that is lost
+three times would be as late. On a computer that is too busy for this, the leg has ended before,
+because the daemon was silent for 0.5 s (calibration/guided/leg_driver.py). When a person drives by
+hand, each command is a sign of life, and the source's timeout applies.
+"""
+
+LISTEN_S = 0.05
+
+LEAVING_S = 1.0
+"""Time to wait for the reader thread at the end, s, if the program does not read."""
+
+LINE_BYTES = 65536
+"""Largest length of an input line. A longer one interrupts the verb, because the program is
+faulty.
+"""
+
+CHECK_STEPS = 16
+"""Approximate number of findings in a complete check, for its progress."""
+
+KEY = " "
+
+
+class Line(Struct, frozen=True):
+    """An input line. Unknown fields are ignored."""
+
+    answer: int = 0
+    value: str | float | None = None
+    key: bool = False
+
+
+class JsonPrompt:
+    """Prompt over standard input and output. The conversation ends when the context is left."""
+
+    def __init__(self) -> None:
+        self._input, self._left = sys.stdin.fileno(), False
+        self._lines, self._numbers = msgspec.json.Decoder(Line), count(1)
+        self._news = threading.Condition()
+        self._open, self._answer = 0, Line()
+        self._pressed = False
+        self._found = 0
+        self._moves = False
+        """True while something may move that a person has started and must be able to stop."""
+        self._reader = threading.Thread(target=self._listen, name="standard input", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._reader.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._news:
+            self._left = True
+        self._reader.join(LEAVING_S)
+
+    # Output
+
+    def begin(self, subject: str, *, simulated: bool) -> None:
+        """Announce the subject; this is the first line."""
+        self._tell(Subject(subject, simulated))
+
+    def say(self, text: str) -> None:
+        """Send a text that stays visible."""
+        self._tell(JobMessage(text))
+
+    def doing(self, text: str) -> None:
+        """Send the present activity."""
+        self._tell(Doing(text))
+
+    def progress(self, share: float) -> None:
+        """Send the progress, 0 to 1."""
+        self._tell(Progress(round(share, 3)))
+
+    def found(self, finding: Finding) -> None:
+        """Send a finding as it is made, and the progress."""
+        self._found += 1
+        self._tell(Found(finding))
+        self.progress(min(0.99, self._found / CHECK_STEPS))
+
+    def result(self, text: str) -> None:
+        """Send the result as a terminal shows it. From now on nothing moves."""
+        self._moves = False
+        self.progress(1.0)
+        self._tell(Result(text.strip("\n")))
+
+    def ask(self, question: str, answers: Sequence[str]) -> str:
+        """Return one of the answers."""
+        return self._choose(question, answers)
+
+    def start(self, text: str, by_key: bool = False) -> None:
+        """Return when the leg may begin."""
+        self._choose(text, ("start",), leg=True, by_key=by_key)
+
+    def number(self, ask: Ask) -> float:
+        """Return the number that the person read off."""
+
+        def read(value: str | float | None) -> float:
+            return ask.number("" if value is None else str(value))
+
+        return self._ask(
+            read, words=ask.words, unit=ask.unit, least=ask.least, most=ask.most, usual=ask.usual
+        )
+
+    def keys(self, wait_s: float) -> str:
+        """Return a key if one was pressed since the last answer or call, else "".
+
+        Waits up to `wait_s` s for one.
+        """
+        with self._news:
+            self._news.wait_for(lambda: self._pressed, wait_s)
+            pressed, self._pressed = self._pressed, False
+            return KEY if pressed else ""
+
+    def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
+        """Offer to write these keys into the configuration file.
+
+        Returns whether it was done. The question is asked only if the file can be changed.
+        `trouble` is a reason not to write, or "".
+        """
+        try:
+            if trouble:
+                raise MendableError(trouble)
+            file = writable(config)
+            require_changeable(file, keys)
+        except MendableError as error:
+            self.say(f"The tool cannot write the file from here: {error}")
+            return False
+        wanted = self.ask(f"Write these lines into {file}? Its comments stay.", ("write", "leave"))
+        self._moves = False
+        if wanted == "write":
+            change(file, keys)
+            self.say(f"{file}: written")
+        return wanted == "write"
+
+    def _choose(self, words: str, answers: Sequence[str], **more: bool) -> str:
+        """Ask for one of the answers, and repeat the question after any other one."""
+
+        def chosen(value: str | float | None) -> str:
+            if value not in answers:
+                raise ValueError(f"one of: {', '.join(answers)}")
+            return str(value)
+
+        return self._ask(chosen, words=words, answers=answers, **more)
+
+    def _tell(self, message: Struct) -> None:
+        print(msgspec.json.encode(message).decode(), flush=True)
+
+    def _ask(self, read: Callable[[str | float | None], T], **about: object) -> T:
+        """Ask a question and return `read(answer)`.
+
+        `read` raises `ValueError` with a description of valid answers; then the question is
+        repeated.
+        """
+        self._moves, wrong = False, ""
+        while True:
+            question = msgspec.convert(
+                {"question": next(self._numbers), "wrong": wrong, **about}, Question
+            )
+            self._open = question.question
+            # Do not take the lock here: a program that does not read its output must still be able
+            # to send.
+            self._tell(question)
+            with self._news:
+                while self._open:
+                    # Wait with a limit: a signal just before the wait begins would not wake it.
+                    self._news.wait(LISTEN_S)
+            try:
+                got = read(self._answer.value)
+            except ValueError as error:
+                wrong = str(error)
+                continue
+            self._moves = True
+            return got
+
+    # Input
+
+    def _listen(self) -> None:
+        """Read the input until the conversation ends; any other end interrupts the verb."""
+        try:
+            self._end(self._heard_out())
+        except BaseException as error:
+            self._end(f"the input cannot be read: {error}")
+            raise
+
+    def _heard_out(self) -> str:
+        """Read the input. Return why it ended, or "" if the conversation is over."""
+        held, heard_s = b"", time.monotonic()
+        while not self._left:
+            if self._readable(LISTEN_S):
+                read = os.read(self._input, 4096)
+                *whole, held = (held + read).split(b"\n")
+                if not read or len(held) > LINE_BYTES:
+                    return "the program that passes on the questions has ended"
+                for line in whole:
+                    self._take(line)
+                heard_s = time.monotonic()
+            elif self._moves and time.monotonic() - heard_s > HEARD_S and not self._readable(0.0):
+                return f"no sign of life of the operator arrived for {HEARD_S:g} s"
+        return ""
+
+    def _readable(self, wait_s: float) -> bool:
+        """Return whether input is available, or arrives within `wait_s` s."""
+        return bool(select.select([self._input], [], [], wait_s)[0])
+
+    def _take(self, line: bytes) -> None:
+        try:
+            said = self._lines.decode(line)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            # The question stays open.
+            return
+        with self._news:
+            if said.key:
+                self._pressed = True
+            elif said.answer and said.answer == self._open:
+                # Forget a key that was pressed before the answer. A later key stops the leg.
+                self._open, self._answer, self._pressed = 0, said, False
+            self._news.notify_all()
+
+    def _end(self, why: str) -> None:
+        main = threading.main_thread().ident
+        assert main is not None
+        with self._news:
+            if self._left:
+                return
+            # Interrupt the main thread first, because that stops the wheels. The message may find
+            # no reader.
+            signal.pthread_kill(main, signal.SIGINT)
+        with suppress(OSError):
+            print(f"acsard: {why}", file=sys.stderr, flush=True)

@@ -1,0 +1,135 @@
+"""The protocol of a prompt, and the signals that end a verb that asks.
+
+Change its three forms together: `TerminalPrompt`, `NoPrompt` and `JsonPrompt`.
+"""
+
+from __future__ import annotations
+
+import select
+import signal
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import Protocol
+
+from msgspec import Struct
+
+from acsard.checkup.findings import Finding
+from acsard.core.values import AcsardError
+
+
+class NobodyError(AcsardError):
+    """Nobody is there to answer a question."""
+
+
+class Ask(Struct, frozen=True):
+    """A number within bounds that the person reads off."""
+
+    words: str
+    unit: str
+    least: float
+    most: float
+    usual: float | None = None
+    """The number that Enter alone stands for, or None."""
+    name: str = ""
+    """The name by which a measurement refers to the answer."""
+
+    def number(self, text: str) -> float:
+        """Return the number that was typed.
+
+        Raises `ValueError` with a description of valid numbers.
+        """
+        try:
+            number = self.usual if not text else float(text.replace(",", "."))
+        except ValueError:
+            number = None
+        if number is None or not self.least <= number <= self.most:
+            raise ValueError(f"a number of {self.unit} from {self.least:g} to {self.most:g}")
+        return number
+
+
+class Prompt(Protocol):
+    """Interface of a prompt.
+
+    Every question raises `KeyboardInterrupt` if the person leaves.
+    """
+
+    def begin(self, subject: str, *, simulated: bool) -> None:
+        """Show which robot or board the verb is about."""
+
+    def say(self, text: str) -> None:
+        """Show a text that stays visible."""
+
+    def doing(self, text: str) -> None:
+        """Show the present activity until the next one."""
+
+    def progress(self, share: float) -> None:
+        """Show which share of the leg or of the check is done, 0 to 1."""
+
+    def found(self, finding: Finding) -> None:
+        """Show a finding as it is made."""
+
+    def result(self, text: str) -> None:
+        """Show the result. From now on nothing moves."""
+
+    def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
+        """Offer to write these keys into the configuration file; return whether it was done.
+
+        `trouble` is a reason not to write, or "".
+        """
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        """Return one of the answers, or None if no person watches the robot."""
+
+    def start(self, text: str, by_key: bool = False) -> None:
+        """Return when the leg may begin.
+
+        `by_key` says that a key press is the intended end of the leg.
+        """
+
+    def number(self, ask: Ask) -> float:
+        """Return the number that the person read off.
+
+        Raises `NobodyError` if nobody can measure.
+        """
+
+    def keys(self, wait_s: float) -> str:
+        """Return the keys that were pressed; wait up to `wait_s` s for the first one."""
+
+
+SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP
+"""The signals that end a verb that moves something.
+
+Ctrl-Z is included because a suspended program would leave a wheel turning.
+"""
+
+
+@contextmanager
+def ended_by_signals(says: str = "", *, exits: bool = False) -> Iterator[None]:
+    """End the block on a signal as on Ctrl-C, so that zeros are sent; ignore further signals.
+
+    Print `says` if the block ends so. With `exits`, a signal other than Ctrl-C raises `SystemExit`
+    with its exit code.
+    """
+    before = [signal.getsignal(number) for number in SIGNALS]
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for each in SIGNALS:
+            signal.signal(each, signal.SIG_IGN)
+        # The program that started this one may be gone, or it may not read. The zeros must not
+        # wait.
+        with suppress(OSError, ValueError):
+            if says and select.select([], [sys.stderr], [], 0.0)[1]:
+                print(f"\n{says}", file=sys.stderr)
+        if exits and number != signal.SIGINT:
+            raise SystemExit(128 + number)
+        raise KeyboardInterrupt
+
+    for number in SIGNALS:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in zip(SIGNALS, before, strict=True):
+            signal.signal(number, handler)

@@ -1,0 +1,213 @@
+"""The prompt at a terminal, and the one without a person.
+
+Questions and texts go to standard error, so that the findings and the result on standard output can
+be redirected.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import termios
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Self
+
+from rich.table import Table
+from rich.text import Text
+
+from acsard.checkup.findings import Finding
+from acsard.terminal.output import SENTENCES, show, table
+from acsard.terminal.prompt import Ask, NobodyError
+
+COLUMNS = 88
+BAR = 30
+
+LEAVES = "q"
+
+
+COLOURS = {"PASS": "green", "WARN": "yellow", "FAIL": "red", "SKIPPED": "bright_black"}
+
+
+class Screen:
+    """Output of a verb that asks.
+
+    The present activity is a line on the terminal that the next output overwrites. It is left out
+    if standard error is a pipe. With `as_json`, the verb prints one JSON object at its end, so that
+    only texts and questions are shown.
+    """
+
+    def __init__(self, as_json: bool = False) -> None:
+        self._as_json = as_json
+        self._on = sys.stderr.isatty() and not as_json
+        self._shown = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._clear()
+
+    def begin(self, subject: str, *, simulated: bool) -> None:
+        """Print the subject."""
+        if not self._as_json:
+            print(subject, flush=True)
+
+    def say(self, text: str) -> None:
+        """Print a text."""
+        self._print(f"\n{_wrapped(text)}\n")
+
+    def doing(self, text: str) -> None:
+        """Show the present activity."""
+        if self._on:
+            # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
+            room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
+            self._print(f"\r\033[K{f'   ... {text}'[:room]}")
+            self._shown = True
+
+    def found(self, finding: Finding) -> None:
+        """Print a finding."""
+        if not self._as_json:
+            self._clear()
+            show(row(finding), most=SENTENCES)
+
+    def result(self, text: str) -> None:
+        """Print the result."""
+        self._clear()
+        print(text)
+
+    def offer(self, config: str | None, keys: Mapping[str, object], trouble: str = "") -> bool:
+        """Return False: at a terminal the option --write changes the file."""
+        return False
+
+    def _clear(self) -> None:
+        """Erase the activity line before other output."""
+        if self._shown:
+            self._print("\r\033[K")
+            self._shown = False
+
+    def _print(self, text: str) -> None:
+        print(text, end="", file=sys.stderr, flush=True)
+
+
+class NoPrompt(Screen):
+    """Prompt without a person.
+
+    It confirms what the command line allows, starts every leg, sees nothing and measures nothing.
+    """
+
+    def ask(self, question: str, answers: Sequence[str]) -> str | None:
+        """Return the only answer as a confirmation, or None if the question needs an observer."""
+        return answers[0] if len(answers) == 1 else None
+
+    def start(self, text: str, by_key: bool = False) -> None:
+        """Print the text."""
+        self.say(text)
+
+    def number(self, ask: Ask) -> float:
+        """Return the default."""
+        if ask.usual is None:
+            raise NobodyError("this method needs a person who measures: leave --yes out")
+        return ask.usual
+
+    def keys(self, wait_s: float) -> str:
+        """Wait, and return no key."""
+        select.select([], [], [], wait_s)
+        return ""
+
+    def progress(self, share: float) -> None:
+        """Show nothing."""
+
+
+class TerminalPrompt(Screen):
+    """Prompt on standard input.
+
+    Legs need a terminal that delivers single keys (`host.terminal_modes.one_by_one`).
+    """
+
+    def ask(self, question: str, answers: Sequence[str]) -> str:
+        """Return one of the answers; q, or the end of the input, ends the verb."""
+        self._clear()
+        choice = f" [{'/'.join((*answers, LEAVES))}]" if len(answers) > 1 else ""
+        while True:
+            self._print(f"\n{question}{choice} ")
+            line = sys.stdin.readline()
+            word = line.strip().lower()
+            if not line or word == LEAVES:
+                raise KeyboardInterrupt
+            if word in answers:
+                return word
+            self._print(f"   please type {' or '.join(answers)}; {LEAVES} quits\n")
+
+    def start(self, text: str, by_key: bool = False) -> None:
+        """Return when Enter is pressed."""
+        self.say(text)
+        # Keys that were pressed before the text appeared must not start anything.
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+        self.say("Enter starts it, then any key stops it; q quits.")
+        while True:
+            pressed = _read()
+            if not pressed.strip("\r\n"):
+                return
+            if LEAVES in pressed:
+                raise KeyboardInterrupt
+
+    def number(self, ask: Ask) -> float:
+        """Return the typed number."""
+        with _lines():
+            termios.tcflush(sys.stdin, termios.TCIFLUSH)
+            while True:
+                self._print(f"\n{_wrapped(ask.words)}\n{ask.unit}: ")
+                line = _read().strip()
+                if line == LEAVES:
+                    raise KeyboardInterrupt
+                try:
+                    return ask.number(line)
+                except ValueError as error:
+                    self.say(f"{error} (q quits)")
+
+    def keys(self, wait_s: float) -> str:
+        """Return the keys that were pressed."""
+        return _read() if select.select([sys.stdin], [], [], wait_s)[0] else ""
+
+    def progress(self, share: float) -> None:
+        """Show a bar on a terminal."""
+        if sys.stderr.isatty():
+            done = round(BAR * share)
+            bar = "#" * done + "." * (BAR - done)
+            self._print(f"\r[{bar}] any key stops {'' if share < 1.0 else chr(10)}")
+
+
+def row(finding: Finding) -> Table:
+    """Return the verdict with name and figure, then the meaning and the remedy."""
+    verdict = Text(f"{finding.verdict:<7}", COLOURS[finding.verdict])
+    below = [finding.text, f"-> {finding.mend}" if finding.mend else ""]
+    head = f"{finding.name:<22} {finding.figure}"
+    return table([(verdict, head), *(("", text) for text in below if text)], gap=1)
+
+
+def _read() -> str:
+    read = os.read(sys.stdin.fileno(), 256)
+    # The terminal has been closed.
+    if not read:
+        raise KeyboardInterrupt
+    return read.decode(errors="replace")
+
+
+@contextmanager
+def _lines() -> Iterator[None]:
+    """Read whole lines from the terminal, and echo them while they are typed."""
+    before = termios.tcgetattr(sys.stdin)
+    cooked = termios.tcgetattr(sys.stdin)
+    cooked[3] |= termios.ICANON | termios.ECHO
+    termios.tcsetattr(sys.stdin, termios.TCSANOW, cooked)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSANOW, before)
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, COLUMNS))

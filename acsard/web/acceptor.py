@@ -1,0 +1,341 @@
+"""Accepts TCP connections, and limits them before they cost memory.
+
+No other module counts them. A connection goes through these states:
+
+1. silent: only a socket and a place in `Sockets`. TLS starts with the first byte, so a silent
+   connection costs a file and no memory;
+2. waiting, if `HANDSHAKES` others are in the TLS handshake;
+3. starting: in the TLS handshake, for at most `HANDSHAKE_S`;
+4. open: aiohttp reads its requests.
+
+If there is no room, `Sockets` names the connection that must go. The first request must arrive
+within `REQUEST_S`. aiohttp answers bytes that are not an HTTP request with a bare line, and logs a
+traceback for each; `Reader` answers them with words, and counts them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import resource
+import socket
+import ssl
+from asyncio import sslproto
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from aiohttp import web
+from aiohttp.web_protocol import RequestHandler
+
+from acsard.web.answers import HEADERS, problem
+from acsard.web.callers import Who, is_loopback, network_of, unmapped
+from acsard.web.counts import Counts
+from acsard.web.limits import SOCKETS_HERE, Sockets, sockets_for
+
+HANDSHAKE_S, HANDSHAKES = 3.0, 32
+"""Time limit for a TLS handshake, and maximum number of handshakes at once."""
+
+REQUEST_S = 10.0
+"""Time limit from the accept to the head of the first request; the connection is cut after that."""
+
+UNREAD_S = 5.0
+"""Time limit for a client that does not read its answers, or whose network is lost. The kernel ends
+the connection when sent data have not been acknowledged, or the client's window has been closed,
+for so long."""
+
+CLOSE_S = 1.0
+"""Time limit for the client's answer to the end of TLS."""
+
+READ_BYTES = 16384
+"""Size of asyncio's read buffer per TLS connection: one TLS record. Its default of 256 KiB is the
+larger part of the memory of an idle connection."""
+
+ACCEPTS = 32
+"""Connections that are accepted before other work of the event loop has its turn."""
+
+PAUSE_S = 0.05
+"""Pause of one listening address when the process has no file left."""
+
+NO_HOST = "the request has no `Host`, the name of the robot"
+
+NO_REQUEST = "that is not an HTTP request"
+
+MISSING = "Missing 'Host'"
+"""Start of aiohttp's message for a missing `Host` header."""
+
+Factory = Callable[[], asyncio.Protocol]
+
+
+class Acceptor:
+    """The listening addresses and their connections.
+
+    Clients on the robot itself have places of their own, so clients from the network can never lock
+    out a browser on the robot.
+    """
+
+    def __init__(self, counts: Counts) -> None:
+        self._counts = counts
+        files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        self._here = Sockets["_Connection"](SOCKETS_HERE)
+        self._away = Sockets["_Connection"](sockets_for(files))
+        self._listeners: list[socket.socket] = []
+        self._waiting: dict[_Connection, None] = {}
+        self._starting: Counter[str] = Counter()
+        """Number of TLS handshakes per network."""
+
+    def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
+        """Accept connections at a listening socket; `make` creates their protocol.
+
+        `secure` is None for plain HTTP.
+        """
+        sslproto.SSLProtocol.max_size = READ_BYTES
+        self._listeners.append(opened)
+        self._resume(opened, secure, make)
+
+    def close(self) -> None:
+        """Accept no more connections, and cut those that have not sent a request."""
+        loop = asyncio.get_running_loop()
+        for opened in self._listeners:
+            loop.remove_reader(opened)
+            opened.close()
+        self._listeners.clear()
+        for pool in (self._here, self._away):
+            for one in pool.strangers():
+                one.cut()
+
+    def spoke(self, transport: asyncio.BaseTransport | None) -> None:
+        """Cancel the time limit of this connection, because a request has arrived."""
+        if (one := _connection(transport)) is not None:
+            one.spoke()
+
+    def admitted(self, transport: asyncio.BaseTransport | None, who: Who) -> None:
+        """Keep this connection when others have to go, because its client is known."""
+        if (one := _connection(transport)) is not None:
+            one.pool.prove(one, who.token)
+
+    def _resume(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
+        if opened in self._listeners:
+            loop = asyncio.get_running_loop()
+            loop.add_reader(opened, self._accept, opened, secure, make)
+
+    def _accept(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
+        for _ in range(ACCEPTS):
+            try:
+                accepted, place = opened.accept()
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                if error.errno in (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM):
+                    self._no_file(opened, secure, make)
+                    return
+                continue  # the client has gone already
+            peer = unmapped(str(place[0]))
+            pool = self._here if is_loopback(peer) else self._away
+            _Connection(self, pool, accepted, peer, secure, make).enter()
+
+    def _no_file(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
+        """Give up the oldest stranger's file, and accept again after a moment."""
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(opened)
+        loop.call_later(PAUSE_S, self._resume, opened, secure, make)
+        if (gone := self._away.displaced()) is not None:
+            self.crowded(gone)
+
+    # The connections call the methods below.
+
+    def crowded(self, one: _Connection) -> None:
+        """Count and cut a connection that has lost its place."""
+        self._counts.refuse("crowded", one.peer)
+        one.cut()
+
+    def slow(self, one: _Connection) -> None:
+        """Count and cut a connection whose time is up."""
+        self._counts.refuse("slow", one.peer)
+        one.cut()
+
+    def wait(self, one: _Connection) -> None:
+        """Start the TLS handshake of a connection when there is room."""
+        self._waiting[one] = None
+        self._next()
+
+    def give_up(self, one: _Connection) -> None:
+        """Forget a connection that waits for its handshake."""
+        self._waiting.pop(one, None)
+
+    def started(self, one: _Connection) -> None:
+        """Note the end of a handshake, and start the next one."""
+        self._starting[one.network] -= 1
+        if not self._starting[one.network]:
+            del self._starting[one.network]
+        self._next()
+
+    def _next(self) -> None:
+        while self._waiting and self._starting.total() < HANDSHAKES:
+            # A network with many slow handshakes must not delay those of the others.
+            one = min(self._waiting, key=lambda one: self._starting[one.network])
+            del self._waiting[one]
+            self._starting[one.network] += 1
+            one.start()
+
+
+class _Connection(asyncio.Protocol):
+    """One connection, which passes its data on to the inner protocol once it is open."""
+
+    def __init__(
+        self,
+        acceptor: Acceptor,
+        pool: Sockets[_Connection],
+        accepted: socket.socket,
+        peer: str,
+        secure: ssl.SSLContext | None,
+        make: Factory,
+    ) -> None:
+        self.pool, self.peer, self.network = pool, peer, network_of(peer)
+        self._acceptor, self._socket, self._secure, self._make = acceptor, accepted, secure, make
+        self._loop = asyncio.get_running_loop()
+        self._timer: asyncio.TimerHandle | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._transport: asyncio.BaseTransport | None = None
+        self._inner: asyncio.Protocol | None = None
+
+    def enter(self) -> None:
+        """Take a place, and wait for the first byte."""
+        gone = self.pool.enter(self.network, self)
+        if gone is self:
+            self._acceptor.crowded(self)
+            return
+        if gone is not None:
+            self._acceptor.crowded(gone)
+        self._socket.setblocking(False)
+        option, unread_ms = socket.TCP_USER_TIMEOUT, round(1000 * UNREAD_S)
+        self._socket.setsockopt(socket.IPPROTO_TCP, option, unread_ms)
+        self._timer = self._loop.call_later(REQUEST_S, self._acceptor.slow, self)
+        self._loop.add_reader(self._socket, self._first_byte)
+
+    def _first_byte(self) -> None:
+        try:
+            first = self._socket.recv(1, socket.MSG_PEEK)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:
+            first = b""
+        if not first:
+            self.cut()
+            return
+        self._loop.remove_reader(self._socket)
+        if self._secure is None:
+            self.start()
+        else:
+            self._acceptor.wait(self)
+
+    def start(self) -> None:
+        """Start the TLS handshake, or HTTP at once."""
+        self._task = self._loop.create_task(self._open())
+
+    async def _open(self) -> None:
+        secure = self._secure
+        try:
+            await self._loop.connect_accepted_socket(
+                lambda: self,
+                self._socket,
+                ssl=secure,
+                ssl_handshake_timeout=HANDSHAKE_S if secure else None,
+                ssl_shutdown_timeout=CLOSE_S if secure else None,
+            )
+        except ConnectionAbortedError:
+            self._acceptor.slow(self)
+        except OSError:
+            pass  # the client does not speak TLS, does not trust the certificate, or has gone
+        finally:
+            if secure is not None:
+                self._acceptor.started(self)
+            if self._transport is None:
+                self._leave()
+
+    def cut(self) -> None:
+        """Close the connection at once."""
+        self._leave()
+        if self._transport is not None:
+            self._transport.abort()  # type: ignore[attr-defined]
+        elif self._task is None:
+            self._acceptor.give_up(self)
+            self._loop.remove_reader(self._socket)
+            self._socket.close()
+        else:
+            # The handshake ends with an error, and its transport closes the socket.
+            with suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
+
+    def spoke(self) -> None:
+        """Cancel the time limit for the first request."""
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def _leave(self) -> None:
+        """Give back the place."""
+        self.spoke()
+        self.pool.leave(self)
+
+    # The transport calls the methods below.
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = transport
+        self._inner = self._make()
+        self._inner.connection_made(transport)
+
+    def data_received(self, data: bytes) -> None:
+        if self._inner is not None:
+            self._inner.data_received(data)
+
+    def eof_received(self) -> bool | None:
+        return None if self._inner is None else self._inner.eof_received()
+
+    def pause_writing(self) -> None:
+        if self._inner is not None:
+            self._inner.pause_writing()
+
+    def resume_writing(self) -> None:
+        if self._inner is not None:
+            self._inner.resume_writing()
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self._leave()
+        if self._inner is not None:
+            self._inner.connection_lost(error)
+
+
+def _connection(transport: asyncio.BaseTransport | None) -> _Connection | None:
+    protocol = None if transport is None else transport.get_protocol()
+    return protocol if isinstance(protocol, _Connection) else None
+
+
+class Reader(RequestHandler):
+    """Protocol handler of one connection."""
+
+    def __init__(self, counts: Counts, server: Any) -> None:
+        """Create a handler for `server`, which is the server of the application's runner."""
+        super().__init__(server, loop=server._loop, **server._kwargs)
+        self._counted = counts
+
+    def handle_error(
+        self,
+        request: web.BaseRequest,
+        status: int = 500,
+        exc: BaseException | None = None,
+        message: str | None = None,
+    ) -> web.StreamResponse:
+        """Answer unreadable bytes.
+
+        Errors of the application (status 500 and above) stay with aiohttp.
+        """
+        if status >= 500:
+            return super().handle_error(request, status, exc, message)
+        nameless = (message or "").startswith(MISSING)
+        peer = unmapped(request.remote or "")
+        self._counted.refuse("host" if nameless else "malformed", peer)
+        response = problem(status, NO_HOST if nameless else NO_REQUEST)
+        response.headers.update(HEADERS)
+        response.force_close()
+        return response

@@ -1,0 +1,100 @@
+"""Tests of the judgement of the gateway's own Zenoh session.
+
+The judgement logs incidents and gives the reasons to restart the gateway.
+"""
+
+from __future__ import annotations
+
+from acsard.daemon.gateway.session_health import (
+    ALONE_NS,
+    FIRST_NS,
+    MAX_UNANSWERED,
+    STUCK_NS,
+    Observation,
+    SessionHealth,
+    connection_counts,
+)
+
+S = 10**9
+MOST = 4
+
+
+def look(at_ns: int, *holders: str, linked: bool = True) -> Observation:
+    return Observation(at_ns, holders, linked)
+
+
+def test_a_gateway_with_room_has_nothing_to_tell() -> None:
+    health = SessionHealth(MOST, 0)
+    assert health.full_event(look(S, "ann", "ben", "ben")) is None
+    assert health.restart_event(look(S), S // 4) is None
+    assert health.full == 0
+
+
+def test_a_gateway_without_room_tells_who_has_it_once_a_minute_and_counts_every_look() -> None:
+    health, told = SessionHealth(MOST, 0), []
+    for number in range(2 * 60 * 4 + 1):
+        event = health.full_event(look(number * S // 4, "ben", "ann", "ben", ""))
+        if event is not None:
+            told.append((number * S // 4, event))
+    assert [at for at, _ in told] == [0, 60 * S, 120 * S]
+    _, event = told[0]
+    assert (event.name, event.level) == ("gateway_full", "warning")
+    assert event.text.startswith("all 4 connections are taken, 2 by ben, 1 by ann, 1 by an unnamed")
+    assert health.full == 2 * 60 * 4 + 1
+
+
+def test_only_those_who_have_most_are_named() -> None:
+    holders = [name for name in "abcdefgh" for _ in range(ord(name))]
+    assert connection_counts(holders) == "104 by h, 103 by g, 102 by f, 101 by e, 100 by d"
+
+
+MOMENT = S // 4
+
+
+def test_a_look_that_takes_too_long_ends_it() -> None:
+    health, stuck = SessionHealth(MOST, 0), look(S)
+    assert [health.restart_event(stuck, MOMENT) for _ in range(STUCK_NS // MOMENT + 1)][-1] is None
+    over = health.restart_event(stuck, MOMENT)
+    assert over is not None
+    assert (over.name, over.level) == ("gateway_stuck", "error")
+
+
+def test_a_machine_that_stands_still_as_a_whole_is_nobody_s_fault() -> None:
+    health = SessionHealth(MOST, 0)
+    assert health.restart_event(look(S), MOMENT) is None
+    assert health.restart_event(look(S), 60 * S) is None
+    assert health.restart_event(look(61 * S), MOMENT) is None
+
+
+def test_a_daemon_that_is_connected_and_answers_nothing_is_none() -> None:
+    health = SessionHealth(MOST, 0)
+    for number in range(MAX_UNANSWERED):
+        assert health.restart_event(Observation(S, linked=True, unanswered=number), 0) is None
+    over = health.restart_event(Observation(S, linked=True, unanswered=MAX_UNANSWERED), 0)
+    assert over is not None
+    assert (over.name, over.level) == ("gateway_lost_daemon", "warning")
+    assert "4 queries unanswered" in over.text
+
+
+def test_without_the_daemon_it_closes() -> None:
+    health = SessionHealth(MOST, 0)
+    assert health.restart_event(look(S), MOMENT) is None
+    assert health.restart_event(look(S + ALONE_NS, linked=False), MOMENT) is None, (
+        "it may come back"
+    )
+    over = health.restart_event(look(S + ALONE_NS + 1, linked=False), MOMENT)
+    assert over is not None
+    assert over.name == "gateway_lost_daemon"
+
+
+def test_while_others_come_in_too_the_daemon_has_more_time() -> None:
+    health = SessionHealth(MOST, S)
+    assert health.restart_event(look(S + FIRST_NS, linked=False), MOMENT) is None
+    assert health.restart_event(look(S + FIRST_NS + 1, linked=False), MOMENT) is not None
+
+
+def test_a_daemon_that_is_back_in_time_keeps_it_open() -> None:
+    health = SessionHealth(MOST, 0)
+    for half_seconds in range(20):
+        now = look(half_seconds * S // 2, linked=half_seconds % 2 == 0)
+        assert health.restart_event(now, MOMENT) is None

@@ -1,0 +1,230 @@
+"""Tests of the latch file's content: no damage by a disk can make a stop disappear."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from acsard.core.values import NS_PER_S, Event, Instant, Latch, Latches
+from acsard.daemon.latch_rules import (
+    ANSWER_NS,
+    MAX_BYTES,
+    Handover,
+    LatchFileError,
+    decode,
+    encode,
+    stopped,
+)
+from tests.each import each
+
+NOW = Instant(7_000_000_000, 1_800_000_000_000_000_000)
+
+STOP = Latch(
+    1_800_000_000_000, NOW.wall_ns, "joe@laptop (native)", "stopped by joe@laptop (native)"
+)
+FAULT = Latch(1_800_000_000_001, NOW.wall_ns, "", "front_left turns by itself")
+INACTIVE = Latch(1_800_000_000_002, NOW.wall_ns, "page", "switched off by page")
+ALL = Latches(STOP, FAULT, INACTIVE, {"limits.linear_speed": 0.4})
+
+texts = st.text(st.characters(codec=None), max_size=600)
+latch = st.builds(Latch, st.integers(0, 2**53), st.integers(0, 2**63), texts, texts, st.booleans())
+several = st.builds(
+    Latches,
+    st.none() | latch,
+    st.none() | latch,
+    st.none() | latch,
+    st.dictionaries(texts, st.floats(allow_nan=False, allow_infinity=False)),
+)
+
+
+def test_the_file_is_json_that_a_person_can_read() -> None:
+    text = encode("acsar", Latches(stop=STOP)).decode()
+    assert '"why": "stopped by joe@laptop (native)"' in text
+    assert len(text.splitlines()) > 10
+    assert '\n  "latches"' in text
+    assert text.endswith("\n}\n")
+
+
+def test_a_text_of_a_stranger_is_kept_up_to_500_characters() -> None:
+    for length in (499, 500, 501):
+        latches = Latches(stop=replace(STOP, by="j" * length))
+        stop = decode("acsar", encode("acsar", latches)).stop
+        assert stop
+        assert len(stop.by) == min(length, 500)
+
+
+def test_all_latches_come_back_marked_as_kept() -> None:
+    assert decode("acsar", encode("acsar", ALL)) == ALL.after_restart()
+    assert decode("acsar", encode("acsar", Latches())) == Latches()
+
+
+@given(several)
+def test_no_text_of_a_stranger_loses_a_latch(latches: Latches) -> None:
+    data = encode("acsar", Latches(latches.stop, latches.fault, latches.inactive))
+    after = decode("acsar", data)
+    assert len(data) < MAX_BYTES
+    before = latches.stop, latches.fault, latches.inactive
+    now = after.stop, after.fault, after.inactive
+    assert [one and one.number for one in now] == [one and one.number for one in before]
+
+
+def test_half_a_file_is_refused_at_every_length() -> None:
+    whole = encode("acsar", ALL)
+    for length in range(len(whole) - 1):  # the last byte only ends the last line
+        for half in (whole[:length], whole[:length].ljust(len(whole), b"\0")):
+            with pytest.raises(LatchFileError):
+                decode("acsar", half)
+
+
+def test_one_flipped_bit_never_makes_a_latch_disappear() -> None:
+    whole = encode("acsar", ALL)
+    for place in range(len(whole) * 8):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        try:
+            after = decode("acsar", bytes(flipped))
+        except LatchFileError:
+            continue
+        assert after.stop
+        assert after.fault
+        assert after.inactive
+        assert len(after.lowered) == 1
+
+
+@given(st.binary(max_size=300))
+def test_garbage_is_refused(data: bytes) -> None:
+    with pytest.raises(LatchFileError):
+        decode("acsar", data)
+
+
+def test_a_file_without_one_of_its_names_is_refused() -> None:
+    raw = msgspec.json.decode(encode("acsar", ALL))
+    for name in raw["latches"]:
+        less = raw | {
+            "latches": {key: raw["latches"][key] for key in raw["latches"] if key != name}
+        }
+        with pytest.raises(LatchFileError, match="missing"):
+            decode("acsar", msgspec.json.encode(less))
+
+
+@each(
+    ("data", "reason"),
+    [
+        (b"", "it is empty"),
+        (b"\0" * 512, "it is empty"),
+        (b"[" * 5000, "it is damaged"),
+        (b"[1, 2]", "it is damaged"),
+        (b'{"format": "2"}', "it is damaged"),
+        (encode("acsar", ALL).replace(b'"format": 1', b'"format": 2'), "of another version"),
+        (b'{"format": 2, "all": "new"}', "of another version"),
+        (encode("other", ALL), "belongs to the robot 'other'"),
+    ],
+)
+def test_the_reason_says_how_the_file_is_wrong(data: bytes, reason: str) -> None:
+    with pytest.raises(LatchFileError, match=reason):
+        decode("acsar", data)
+
+
+def test_a_stop_by_the_daemon_is_newer_than_the_latches_beside_it() -> None:
+    late = replace(FAULT, number=1_900_000_000_000)
+    made = stopped(Latches(fault=late), "the file cannot be read", NOW)
+    assert made.fault == late
+    assert made.stop == Latch(late.number + 1, NOW.wall_ns, "acsard", "the file cannot be read")
+
+
+def test_the_number_of_a_stop_by_the_daemon_is_the_wall_time_in_ms() -> None:
+    made = stopped(Latches(), "the file cannot be read", NOW)
+    assert made.stop is not None
+    assert made.stop.number == 1_800_000_000_000
+
+
+@pytest.mark.parametrize("wall_ns", [0, -NS_PER_S])
+def test_a_wall_clock_that_was_never_set_gives_a_stop_the_number_0(wall_ns: int) -> None:
+    latches = stopped(Latches(), "stopped", Instant(1, wall_ns))
+    assert latches.stop
+    assert latches.stop.number == 0
+
+
+def test_a_stop_that_is_latched_already_stays() -> None:
+    assert stopped(ALL, "the file cannot be read", NOW) is ALL
+
+
+class Keeper:
+    """A store of latches that holds its latches only when the test tells it to."""
+
+    def __init__(self) -> None:
+        self.given: list[Latches] = []
+        self.waits: list[tuple[Latches, float]] = []
+        self.held: Latches | None = None
+        self.trouble = "the disk is full"
+
+    def keep(self, latches: Latches) -> None:
+        self.given.append(latches)
+
+    def holds(self, latches: Latches) -> bool:
+        return self.held is latches
+
+    def wait(self, latches: Latches, seconds: float) -> None:
+        self.waits.append((latches, seconds))
+
+    def news(self) -> list[Event]:
+        return [Event("latch_file", "the disk is full", "warning")]
+
+
+def test_only_latches_that_changed_are_handed_over() -> None:
+    keeper, first = Keeper(), Latches()
+    handover = Handover(first, keeper)
+    handover.take(first)
+    assert keeper.given == []
+    handover.take(ALL)
+    handover.take(ALL)
+    assert keeper.given == [ALL]
+    assert handover.latches is ALL
+
+
+def test_latches_are_held_once_the_keeper_holds_these() -> None:
+    keeper = Keeper()
+    handover = Handover(Latches(), keeper)
+    handover.take(ALL)
+    assert not handover.held
+    keeper.held = ALL
+    assert handover.held
+
+
+def test_a_stop_that_no_step_served_is_latched_with_the_name_of_its_client() -> None:
+    keeper = Keeper()
+    Handover(Latches(), keeper).take_stops(Latches(), ["joe", "page"], NOW)
+    (latches,) = keeper.given
+    assert latches.stop == Latch(NOW.wall_ns // 1_000_000, NOW.wall_ns, "joe", "stopped by joe")
+
+
+def test_a_stop_without_a_name_is_stopped_by_a_request() -> None:
+    keeper = Keeper()
+    Handover(Latches(), keeper).take_stops(Latches(), [""], NOW)
+    assert keeper.given[0].stop
+    assert keeper.given[0].stop.why == "stopped by request"
+
+
+def test_on_the_way_down_the_keeper_has_the_time_in_which_a_stop_is_answered() -> None:
+    keeper = Keeper()
+    handover = Handover(ALL, keeper)
+    handover.wait()
+    assert keeper.waits == [(ALL, ANSWER_NS / NS_PER_S)]
+
+
+def test_the_events_and_the_trouble_are_those_of_the_keeper() -> None:
+    handover = Handover(Latches(), keeper := Keeper())
+    assert handover.news() == keeper.news()
+    assert handover.trouble == keeper.trouble
+
+
+def test_without_a_keeper_nothing_waits_and_nothing_is_in_trouble() -> None:
+    handover = Handover(Latches(), None)
+    handover.take(ALL)
+    handover.wait()
+    assert handover.held
+    assert handover.news() == []
+    assert handover.trouble is None

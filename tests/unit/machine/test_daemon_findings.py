@@ -1,0 +1,205 @@
+"""Tests of the doctor's findings about the daemon, its gyro and its link."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+from msgspec.structs import replace
+
+from acsard.core.config.settings import BusConfig, Config, McuConfig
+from acsard.core.messages.schema import DiagnosticStatus, Time
+from acsard.machine.daemon_findings import (
+    clocks,
+    gateway,
+    gone,
+    gyro,
+    latch_file,
+    late,
+    link,
+    lost,
+    refused,
+)
+from acsard.machine.finding import Finding
+from acsard.machine.running import Running
+from tests.each import each
+from tests.unit.machine.test_running import INFO, STATE
+
+NOW = 1_800_000_000_000_000_000
+S = 10**9
+
+
+def seen(apart: float, trip: float = 0.0, here: bool = False, **counters: int) -> Running:
+    """Return the view of a daemon whose clock is `apart` s ahead, queried within `trip` s."""
+    state = replace(STATE, stamp=Time.from_ns(NOW + int(apart * S)), counters=counters)
+    return Running(INFO, Config(), state, state, NOW, int(trip * S), (), here)
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.3, -0.3])
+def test_clocks_that_agree_are_no_finding(apart: float) -> None:
+    assert list(clocks(seen(apart, commands=7))) == []
+
+
+@pytest.mark.parametrize(
+    ("apart", "words"), [(3600.0, "3600.0 s ahead of"), (-0.5, "0.5 s behind")]
+)
+def test_clocks_that_do_not_are_a_warning_with_its_mend(apart: float, words: str) -> None:
+    (finding,) = clocks(seen(apart))
+    assert (finding.subject, finding.level) == ("clock", "warning")
+    assert words in finding.text
+    assert "timedatectl" in finding.mend
+
+
+def test_an_answer_that_was_late_is_no_clock_that_is_wrong() -> None:
+    assert list(clocks(seen(-0.5, trip=1.0))) == list(clocks(seen(0.5, trip=1.0))) == []
+    assert len(list(clocks(seen(-2.0, trip=1.0)))) == 1
+
+
+def test_a_daemon_on_this_machine_has_its_clock() -> None:
+    assert list(clocks(seen(-3.0, here=True))) == []
+
+
+def test_stamps_that_were_replaced_are_told() -> None:
+    (finding,) = clocks(seen(0.0, stamps_replaced=12))
+    assert "12 commands" in finding.text
+
+
+def test_periods_that_are_missed_now_are_told_after_months_without() -> None:
+    running = seen(0.0, lines_sent=345_600_000, missed_periods=600)
+    assert not list(late(running))
+    row = DiagnosticStatus(1, "acsard: control loop", "600 of 6000 periods missed", "acsar", [])
+    (finding,) = late(replace(running, rows=(row,)))
+    assert finding.level == "warning"
+    assert "600 of 6000" in finding.text
+
+
+def test_a_gateway_is_told_where_it_listens() -> None:
+    with socket.create_server(("0.0.0.0", 0)) as gateway_of_ours:
+        endpoint = f"tls/0.0.0.0:{gateway_of_ours.getsockname()[1]}"
+        (finding,) = gateway(Config(bus=BusConfig(listen=("tcp/127.0.0.1:7448", endpoint))))
+    assert (finding.level, finding.text) == ("ok", f"open at {endpoint}")
+
+
+@pytest.mark.parametrize("does", ["off", "used", "waiting for rest"])
+def test_a_gyro_that_does_what_it_should_is_no_warning(does: str) -> None:
+    assert [one.level for one in gyro(does, {})] == ([] if does == "off" else ["ok"])
+
+
+@each("does", ["silent", "disagrees", "not believed", "what a later one does"])
+def test_a_gyro_that_does_not_is_a_warning_with_its_mend(does: str) -> None:
+    (finding,) = gyro(does, {})
+    assert (finding.subject, finding.level) == ("gyro", "warning")
+    assert finding.text
+    assert finding.mend
+
+
+def test_samples_of_a_gyro_that_do_not_count_are_told_by_their_reasons() -> None:
+    counters = {"imu_out_of_range": 3, "imu_second_sender": 12, "imu_not_finite": 0, "lines": 9}
+    _, finding = gyro("used", counters)
+    assert finding.level == "warning"
+    assert "12 second sender, 3 out of range" in finding.text
+    assert finding.mend
+
+
+def test_a_stop_that_would_be_lost_at_a_restart_is_a_warning_with_its_mend() -> None:
+    trouble = "a stop cannot be kept over a restart: /x/a.latches.json: Read-only file system"
+    (finding,) = latch_file(trouble)
+    assert (finding.subject, finding.level, finding.text) == ("latch file", "warning", trouble)
+    assert "control.state_directory" in finding.mend
+    assert not list(latch_file(""))
+
+
+CONFIG = Config(mcu=McuConfig(port="/dev/ttyX"))
+
+
+def found(before: dict[str, int], after: dict[str, int], **state: str) -> list[Finding]:
+    one, two = replace(STATE, counters=before), replace(STATE, counters=after, **state)
+    return list(link(Running(INFO, CONFIG, one, two, 0)))
+
+
+def test_a_sound_link_is_one_ok() -> None:
+    (finding,) = found({"lines": 5, "lines_sent": 900}, {"lines": 104, "lines_sent": 1000})
+    assert (finding.subject, finding.level) == ("link", "ok")
+
+
+@pytest.mark.parametrize("state", ["booting", "stale"])
+def test_no_link_is_a_failure_with_what_was_heard_and_the_check(state: str) -> None:
+    (finding,) = found({}, {}, link=state, mode="waiting", reason="nothing was received")
+    assert finding.level == "failure"
+    assert "nothing was received" in finding.text
+    assert "acsard mcu check --port /dev/ttyX" in finding.mend
+    assert "kill 77" in finding.mend
+
+
+def test_a_port_that_is_closed_is_mended_at_the_port() -> None:
+    (finding,) = found({}, {}, link="down", mode="waiting", reason="no such device")
+    assert "port above" in finding.mend
+
+
+def test_lines_that_are_not_answered_are_a_warning() -> None:
+    (finding,) = found({"lines": 80, "lines_sent": 100}, {"lines": 160, "lines_sent": 200})
+    assert finding.level == "warning"
+    assert "only 80 of 100 lines that were sent in a second were answered" in finding.text
+    assert "mcu check" in finding.mend
+
+
+@each(
+    ("sent", "came", "period", "told"),
+    [(100, 100, 0.0, 0), (100, 98, 0.0, 0), (100, 97, 0.0, 0), (100, 96, 0.0, 1),
+     (100, 130, 0.0, 0), (10, 0, 0.0, 0), (100, 10, 0.1, 0)],
+)  # fmt: skip
+def test_what_is_no_loss_is_not_told(sent: int, came: int, period: float, told: int) -> None:
+    config = Config(mcu=McuConfig(reply_period=period))
+    assert len(list(lost({"lines_sent": sent, "lines": came}, config))) == told
+
+
+def test_lines_that_did_not_count_are_told_by_kind_above_one_in_fifty() -> None:
+    assert not list(refused({"lines": 1000, "line_malformed": 20, "lines_sent": 9}))
+    (text,) = refused({"lines": 1000, "line_malformed": 12, "line_crc_error": 30})
+    assert "12 malformed, 30 crc error" in text
+
+
+def test_a_link_that_went_because_this_computer_was_late_is_not_blamed_on_the_board() -> None:
+    (late,) = found({}, {"link_lost": 3, "link_lost_host_stall": 3})
+    assert "lost 3 times" in late.text
+    assert "this computer" in late.text
+    assert "mcu check" not in late.mend
+    late, board = found({}, {"link_lost": 5, "link_lost_host_stall": 3})
+    assert "lost 2 times" in board.text
+    assert "mcu check" in board.mend
+    states = replace(STATE, counters={"link_lost": 2})
+    (sim,) = link(Running(INFO, Config(), STATE, states, 0))
+    assert "this computer" in sim.text
+    assert "mcu check" not in sim.mend
+    why = "this computer did not run for 0.80 s, and heard nothing"
+    (finding,) = found({}, {}, link="stale", mode="waiting", reason=why)
+    assert why in finding.text
+    assert "mcu check" not in finding.mend
+
+
+def test_a_wheel_that_is_left_out_is_told() -> None:
+    *_, finding = found({}, {}, wheel_fault="rear left: its encoder stands")
+    assert (finding.subject, finding.level) == ("wheels", "warning")
+
+
+DAYS_40 = {"lines": 340_000_000, "lines_sent": 345_600_000}
+"""Line counters after 40 days at 100 Hz."""
+
+
+def test_after_months_what_is_wrong_now_is_told_and_no_old_accident() -> None:
+    (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 40})
+    assert finding.level == "ok"
+    assert "lost 40 times" in finding.text
+    (finding,) = found(DAYS_40, DAYS_40 | {"link_lost": 41})
+    assert finding.level == "warning"
+    now = {"lines": DAYS_40["lines"] + 90, "lines_sent": DAYS_40["lines_sent"] + 100}
+    _, finding = found(DAYS_40, now | {"line_malformed": 10})
+    assert finding.level == "warning"
+    assert "10 malformed" in finding.text
+
+
+def test_a_link_that_went_is_told_with_how_often() -> None:
+    assert not gone({"lines": 9})
+    (finding,) = found({}, {"link_lost": 4})
+    assert finding.level == "warning"
+    assert "lost 4 times" in finding.text

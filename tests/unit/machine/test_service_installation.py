@@ -1,0 +1,228 @@
+"""Tests of the service's files and steps, and of the places from which it can run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acsard.host.errors import ExitError
+from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Write
+from acsard.machine.service_installation import (
+    GATEWAY,
+    GONE,
+    INSTALLED,
+    PAGE,
+    STATES,
+    STOP,
+    UNIT,
+    Found,
+    admitted,
+    files,
+    installing,
+    misplaced,
+    present,
+    strangers,
+    uninstalling,
+)
+from tests.each import each
+
+PROGRAM = "/usr/bin/env"
+"""A program that every user may run."""
+
+
+@each(
+    ("prefix", "base", "good"),
+    [
+        ("/opt/acsard/venv", "/usr", True),
+        ("/usr", "/usr", False),
+        ("/home/anna/venv", "/usr", False),
+        ("/root/venv", "/usr", False),
+        ("/tmp/venv", "/usr", False),
+        ("/rooted/venv", "/usr", True),
+    ],
+)
+def test_a_service_cannot_live_in_a_home_nor_outside_a_venv(
+    prefix: str, base: str, good: bool
+) -> None:
+    assert (misplaced(prefix, base, PROGRAM) == "") is good
+
+
+def test_nor_can_it_borrow_the_python_of_a_home() -> None:
+    told = misplaced("/opt/acsard/venv", "/root/.pyenv/versions/3.11.7", PROGRAM)
+    assert "/root/.pyenv/versions/3.11.7" in told
+    assert "/usr/bin/python3 -m venv --clear /opt/acsard/venv" in told
+
+
+def test_a_link_to_a_python_in_a_home_is_followed(tmp_path: Path) -> None:
+    home = tmp_path / "home" / "anna"
+    home.mkdir(parents=True)
+    (home / "python3").symlink_to(PROGRAM)
+    (tmp_path / "python").symlink_to(home / "python3")
+    there = misplaced("/opt/v", "/usr", str(tmp_path / "python"), hidden=("/usr/bin",))
+    assert "/usr/bin" in there
+
+
+def test_a_directory_that_others_may_not_enter_is_named(tmp_path: Path) -> None:
+    venv = tmp_path / "venv"
+    venv.mkdir()
+    tmp_path.chmod(0o700)
+    told = misplaced(str(venv), "/usr", PROGRAM, hidden=())
+    assert "may not enter" in told
+    assert "chmod o+rx" in told
+
+
+ETC = Path("/etc/x")
+UNIT_FILE = File(ETC / UNIT, b"unit")
+STOP_FILE = File(ETC / STOP, b"stop", 0o755)
+RULES = File(ETC / "rules", b"rules")
+OWN = File(ETC / "acsard.toml", b"first", kept=True)
+GATEWAY_FILE = File(ETC / GATEWAY, b"gateway")
+PAGE_FILE = File(ETC / PAGE, b"page")
+ALL = [UNIT_FILE, GATEWAY_FILE, PAGE_FILE, STOP_FILE, RULES, OWN]
+
+
+def there(**other: bytes | None) -> Found:
+    """Return a machine with all files installed, except for these."""
+    names = {
+        "unit": UNIT_FILE,
+        "gateway": GATEWAY_FILE,
+        "page": PAGE_FILE,
+        "stop": STOP_FILE,
+        "rules": RULES,
+        "own": OWN,
+    }
+    changes = {names[name].path: content for name, content in other.items()}
+    return {file.path: file.content for file in ALL} | changes
+
+
+NOTHING: Found = {file.path: None for file in ALL}
+
+
+def test_all_files_are_written_where_there_is_none_then_the_commands_run() -> None:
+    assert installing(ALL, NOTHING, force=False) == [*map(Write, ALL), *INSTALLED]
+
+
+def test_the_daemon_starts_before_the_page_whose_unit_mounts_its_directory() -> None:
+    steps = list(INSTALLED)
+    everything = Run(("systemctl", "enable", "--now", UNIT, GATEWAY, PAGE))
+    alone = Run(("systemctl", "start", UNIT), may_fail=True)
+    assert steps.index(alone) < steps.index(everything)
+
+
+def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> None:
+    assert installing(ALL, there(), force=False) == [*(Keep(f.path) for f in ALL), *INSTALLED]
+
+
+def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
+    found = there(unit=b"mine", own=None)
+    with pytest.raises(ExitError, match=f"would overwrite {UNIT_FILE.path};"):
+        installing(ALL, found, force=False)
+    steps = installing(ALL, found, force=True)
+    assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_configuration_that_was_written_is_never_replaced(force: bool) -> None:
+    assert Keep(OWN.path) in installing(ALL, there(own=b"mine"), force=force)
+
+
+def test_all_that_is_as_installed_is_removed() -> None:
+    removed = [Remove(file.path) for file in ALL]
+    leaving = Run(("systemctl", "disable", "--now", PAGE, GATEWAY, UNIT))
+    assert uninstalling(ALL, there(), force=False) == [leaving, *removed, *GONE]
+
+
+def test_a_unit_that_is_not_there_is_not_disabled() -> None:
+    """The machine was upgraded from a version without TLS gateway and page."""
+    leaving, *_ = uninstalling(ALL, there(gateway=None, page=None), force=False)
+    assert leaving == Run(("systemctl", "disable", "--now", UNIT))
+
+
+def test_where_nothing_is_nothing_is_stopped_or_removed() -> None:
+    assert uninstalling(ALL, NOTHING, force=False) == [*GONE]
+
+
+def kept(found: Found, *, force: bool) -> set[Path]:
+    steps = uninstalling(ALL, found, force=force)
+    return {step.path for step in steps if isinstance(step, Keep)}
+
+
+def test_what_somebody_has_changed_stays_unless_forced() -> None:
+    assert kept(there(rules=b"mine"), force=False) == {RULES.path}
+    assert kept(there(rules=b"mine"), force=True) == set()
+
+
+def test_a_changed_configuration_stays_whatever_is_said() -> None:
+    assert kept(there(own=b"mine"), force=True) == {OWN.path}
+
+
+def test_a_unit_that_stays_keeps_what_sends_zeros_after_it() -> None:
+    assert kept(there(unit=b"mine"), force=False) == {UNIT_FILE.path, STOP_FILE.path}
+
+
+def test_the_files_are_those_of_deploy_with_the_port_of_a_real_robot() -> None:
+    unit, gateway, page, _, _, configuration = files()
+    assert (unit.path.name, gateway.path.name, page.path.name) == (UNIT, GATEWAY, PAGE)
+    assert b'port = "/dev/acsar"' in configuration.content
+    assert set(present([unit])) == {unit.path}
+
+
+def test_each_that_stays_says_why_and_what_removes_it() -> None:
+    tls, own = Path("/etc/acsard/tls"), ETC / "own.conf"
+    found = there(unit=b"mine", own=b"mine")
+    steps = uninstalling(ALL, found, [tls, own], force=False)
+    assert {step.path: step.why for step in steps if isinstance(step, Keep)} == {
+        UNIT_FILE.path: "it has been edited; --force removes it",
+        STOP_FILE.path: f"{UNIT} stays and needs it",
+        OWN.path: "your configuration; --purge removes it",
+        tls: "certificates and their authority; --purge removes it",
+        own: "not the service's own; --purge removes it",
+    }
+
+
+def test_a_purge_keeps_nothing() -> None:
+    tls, found = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
+    steps = uninstalling(ALL, found, [tls], force=True, purge=True)
+    assert not [step for step in steps if isinstance(step, Keep)]
+    assert {step.path for step in steps if isinstance(step, (Remove, RemoveAll))} == {
+        *(file.path for file in ALL),
+        tls,
+    }
+
+
+@pytest.mark.parametrize("purge", [False, True])
+def test_recordings_and_invitations_stay_unless_purged(purge: bool) -> None:
+    steps = uninstalling(ALL, there(), force=False, purge=purge, stateful=STATES)
+    kept = {step.path for step in steps if isinstance(step, Keep)}
+    cleans = {Run(("systemctl", "clean", "--what=state", unit)) for unit in (UNIT, PAGE)}
+    assert kept == (set() if purge else {where for where, _ in STATES.values()})
+    assert cleans & {*steps} == (cleans if purge else set())
+    if purge:  # the units have stopped, but systemd still knows them
+        assert {*steps[1:3]} == cleans
+
+
+def test_what_else_lies_in_its_directories_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "tls").mkdir()
+    (tmp_path / "acsard.toml").touch()
+    ours = File(tmp_path / "acsard.toml", b"", kept=True)
+    assert strangers([ours], [tmp_path, tmp_path / "missing"]) == [tmp_path / "tls"]
+
+
+DROP_IN = File(
+    ETC / "lan.conf", b"IPAddressAllow=10.0.0.0/8\nLoadCredential=key.pem:/a/b/key.pem\n"
+)
+
+
+def test_a_drop_in_comes_with_the_place_of_the_certificates() -> None:
+    step = admitted(DROP_IN, None, Path("/srv/tls"))
+    assert isinstance(step, Write)
+    assert b"LoadCredential=key.pem:/srv/tls/key.pem\n" in step.file.content
+
+
+def test_networks_that_somebody_has_narrowed_stay() -> None:
+    own = b"IPAddressAllow=10.1.2.0/24\nLoadCredential=key.pem:/srv/tls/key.pem\n"
+    assert isinstance(admitted(DROP_IN, own, Path("/srv/tls")), Keep)
+    moved = admitted(DROP_IN, own, Path("/etc/tls"))
+    assert isinstance(moved, Write)
+    assert moved.file.content == own.replace(b"/srv/tls", b"/etc/tls")

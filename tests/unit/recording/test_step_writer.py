@@ -1,0 +1,44 @@
+"""Tests of the messages that the recorder's thread writes."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from acsard.core.config.settings import Config, RecordConfig
+from acsard.core.values import Received
+from acsard.recording.chunks import MAX_MESSAGE_BYTES
+from acsard.recording.directory import listed
+from acsard.recording.file import Recording
+from acsard.recording.file_replay import steps
+from acsard.recording.step_writer import BATCH, StepWriter
+from tests.scenarios.taped import Tape
+from tests.scenarios.world import World
+
+
+def test_a_second_above_the_largest_message_is_divided_and_read_back(tmp_path: Path) -> None:
+    """The reader refuses larger messages, and with one the rest of its chunk."""
+    tape, dice, each = Tape(), random.Random(1), MAX_MESSAGE_BYTES // 40
+    World(recorder=tape).run(0.5)
+    items = [
+        taken._replace(
+            inputs=replace(
+                taken.inputs, received=(Received(taken.inputs.now, dice.randbytes(each)),)
+            )
+        )
+        for taken in tape.taken[:50]
+    ]
+    assert len(items) < BATCH
+    config = replace(Config(), record=RecordConfig(str(tmp_path), 100.0))
+    writer = StepWriter(config, lambda event: None, lambda: None, 0)
+    writer.write([*items], False)
+    writer.write([*tape.taken[50:]], True)
+    assert writer.lost == 0
+    (path,) = listed(tmp_path)
+    read = list(steps(Recording(path)))
+    assert [step.number for step in read] == list(range(len(tape.taken)))
+    assert [step.inputs.received for step in read[:50]] == [one.inputs.received for one in items]
+    messages = [data for topic, _, data in Recording(path).messages() if topic == "steps"]
+    assert len(messages) == 3

@@ -1,0 +1,282 @@
+"""Tests of the JSON prompt: a program asks the operator through JSON lines in both directions."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import json
+import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acsard.checkup.findings import Finding
+from acsard.terminal import json_prompt
+from acsard.terminal.json_prompt import LINE_BYTES, JsonPrompt
+from acsard.terminal.prompt import Ask, ended_by_signals
+
+DISTANCE = Ask("How far?", "m", 0.5, 3.0)
+OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
+
+
+class Program:
+    """A parent program that answers the prompt's questions.
+
+    It gives its next answer to each question and keeps every line in `said`.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        asked, self._to_child = os.pipe()
+        self._from_child, told = os.pipe()
+        self._asked, self._told = os.fdopen(asked), os.fdopen(told, "w")
+        monkeypatch.setattr("sys.stdin", self._asked)
+        self.said: list[dict[str, Any]] = []
+        self.answers: list[object] = []
+        self._thread = threading.Thread(target=self._live, daemon=True)
+        self._thread.start()
+
+    def say(self, *messages: object, raw: bytes = b"") -> None:
+        lines = b"".join(json.dumps(one).encode() + b"\n" for one in messages)
+        os.write(self._to_child, raw + lines)
+
+    @contextmanager
+    def hears(self, person: JsonPrompt) -> Iterator[JsonPrompt]:
+        """Send everything that the prompt prints on standard output to this program."""
+        with redirect_stdout(self._told), person:
+            yield person
+
+    def hang_up(self) -> None:
+        end, self._to_child = self._to_child, -1
+        os.close(end)
+
+    def close(self) -> None:
+        for end in (self._asked, self._told):
+            end.close()
+        self._thread.join()
+        if self._to_child >= 0:
+            self.hang_up()
+
+    def _live(self) -> None:
+        with os.fdopen(self._from_child) as lines:
+            for line in lines:
+                said = json.loads(line)
+                self.said.append(said)
+                if "question" in said and self.answers:
+                    value = self.answers.pop(0)
+                    if callable(value):
+                        value(said["question"])
+                    else:
+                        self.say({"answer": said["question"], "value": value})
+
+    def told(self, name: str) -> list[Any]:
+        """Close the output and return the value of every message that has this key."""
+        self._told.close()
+        self._thread.join()
+        return [one[name] for one in self.said if name in one]
+
+
+@pytest.fixture
+def program(monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
+    program = Program(monkeypatch)
+    yield program
+    program.close()
+
+
+def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(program: Program) -> None:
+    program.answers = ["far", 0.1, -2, None, "1,75"]
+    with program.hears(JsonPrompt()) as person:
+        assert person.number(DISTANCE) == 1.75
+    assert program.told("question") == [1, 2, 3, 4, 5]
+    assert program.told("wrong") == ["a number of m from 0.5 to 3"] * 4
+    assert {key: program.said[0][key] for key in ("words", "unit", "least", "most")} == {
+        "words": "How far?", "unit": "m", "least": 0.5, "most": 3.0,
+    }  # fmt: skip
+
+
+def test_no_value_is_what_is_usual(program: Program) -> None:
+    program.answers = [None]
+    with program.hears(JsonPrompt()) as person:
+        assert person.number(OPTIONAL) == 0.0
+    assert program.said[0]["usual"] == 0.0
+
+
+def test_nothing_but_start_starts_a_leg_and_no_key_from_before_stops_it(program: Program) -> None:
+    program.answers = ["go", "start"]
+    with program.hears(JsonPrompt()) as person:
+        program.say({"key": True})
+        person.start("Go.", by_key=True)
+        assert person.keys(0.05) == ""
+    assert [one.get("leg") for one in program.said] == [True, True]
+    assert program.said[0]["by_key"] is True
+    assert program.said[1]["wrong"] == "one of: start"
+
+
+def test_a_key_on_the_heels_of_the_start_stops(program: Program) -> None:
+    def both(number: int) -> None:
+        program.say({"answer": number, "value": "start"}, {"key": True})
+
+    program.answers = [both]
+    with program.hears(JsonPrompt()) as person:
+        person.start("Go.")
+        assert person.keys(5.0) == " "
+        assert person.keys(0.01) == ""
+
+
+def test_what_is_no_answer_to_what_is_asked_leaves_the_question_open(program: Program) -> None:
+    def noise(number: int) -> None:
+        program.say(raw=b'\xff\n[]\n{"answer": "1"}\n{"answer": 1, "value": {}}\n\n')
+        program.say({"answer": number + 1, "value": "start"}, {"answer": -1}, {})
+        program.say({"answer": number, "value": "start", "more": 1})
+
+    program.answers = [noise]
+    with program.hears(JsonPrompt()) as person:
+        person.start("Go.")
+    assert program.told("question") == [1]
+
+
+def interrupted(program: Program, do: Callable[[], object]) -> None:
+    with ended_by_signals(), pytest.raises(KeyboardInterrupt):
+        do()
+
+
+def test_the_end_of_the_input_ends_it_also_while_nothing_is_asked(program: Program) -> None:
+    with program.hears(JsonPrompt()) as person:
+        program.answers = [lambda number: program.hang_up()]
+        interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+
+
+def test_it_ends_although_nobody_is_there_to_be_told(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The parent program has died, so its end of standard error is closed as well."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    gone = open(writer, "wb", buffering=0)  # noqa: SIM115
+    with gone, program.hears(JsonPrompt()) as person:
+        monkeypatch.setattr("sys.stderr", io.TextIOWrapper(gone, write_through=True))
+        program.answers = [lambda number: program.hang_up()]
+        interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+
+
+def test_it_ends_although_nobody_reads_what_it_asks(program: Program) -> None:
+    """The parent program hangs while its pipe is full, and later disappears."""
+    reader, writer = os.pipe()
+    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+    os.write(writer, b"x" * 4096)
+    with os.fdopen(reader), os.fdopen(writer, "w") as full:
+        with redirect_stdout(full), JsonPrompt() as person:
+            hangs_up = threading.Timer(0.3, program.hang_up)
+            hangs_up.start()
+            interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+            hangs_up.join()
+        os.read(reader, 4096)
+
+
+def test_what_is_nested_too_deep_leaves_the_question_open(program: Program) -> None:
+    with program.hears(JsonPrompt()) as person:
+
+        def nested(number: int) -> None:
+            program.say(raw=b'{"x":' + b"[" * 30_000 + b"\n")
+            program.say({"answer": number, "value": "lifted"})
+
+        program.answers = [nested]
+        assert person.ask("lifted?", ("lifted",)) == "lifted"
+
+
+def test_a_line_without_an_end_ends_it(program: Program) -> None:
+    with program.hears(JsonPrompt()) as person:
+
+        def flood(number: int) -> None:
+            for _ in range(LINE_BYTES // 4096 + 1):
+                program.say(raw=b"x" * 4096)
+
+        program.answers = [flood]
+        interrupted(program, lambda: person.ask("lifted?", ("lifted",)))
+
+
+def test_silence_ends_what_moves_and_signs_of_life_do_not(
+    program: Program, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(json_prompt, "HEARD_S", 0.25)
+    monkeypatch.setattr(json_prompt, "LISTEN_S", 0.02)
+    program.answers = ["start"]
+    with program.hears(JsonPrompt()) as person:
+        person.start("Go.")
+        for _ in range(10):
+            program.say({})
+            assert person.keys(0.05) == ""
+        interrupted(program, lambda: person.keys(60.0))
+    assert "no sign of life of the operator arrived for 0.25 s" in capfd.readouterr().err
+
+
+def test_a_question_waits_for_a_person_for_as_long_as_he_takes(
+    program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(json_prompt, "HEARD_S", 0.05)
+    monkeypatch.setattr(json_prompt, "LISTEN_S", 0.01)
+
+    def late(number: int) -> None:
+        threading.Timer(0.3, program.say, [{"answer": number, "value": 1.0}]).start()
+
+    program.answers = ["start", late]
+    with program.hears(JsonPrompt()) as person:
+        person.start("Go.")
+        assert person.number(DISTANCE) == 1.0
+
+
+def test_what_is_found_is_told_as_it_is_made_with_how_far_it_is(program: Program) -> None:
+    with program.hears(JsonPrompt()) as person:
+        person.begin("port sim", simulated=True)
+        person.doing("a motor turns")
+        for _ in range(20):
+            person.found(Finding("baud rate", "PASS", "115200 baud"))
+    assert program.told("doing") == ["a motor turns"]
+    assert program.said[0] == {"subject": "port sim", "simulated": True}
+    assert program.told("finding")[0]["figure"] == "115200 baud"
+    shares = program.told("progress")
+    assert shares == sorted(shares)
+    assert max(shares) < 1.0
+
+
+def test_the_result_ends_the_progress(program: Program) -> None:
+    with program.hears(JsonPrompt()) as person:
+        person.progress(0.5)
+        person.result("\nall of it\n")
+    assert program.told("progress") == [0.5, 1.0]
+    assert program.said[-1] == {"result": "all of it"}
+
+
+OFFERED = {"mcu.baud_rate": 57600}
+
+
+@pytest.mark.parametrize(("answer", "text"), [("write", "57600"), ("leave", "# mine\n")])
+def test_the_lines_are_written_when_that_is_wanted(
+    program: Program, tmp_path: Path, answer: str, text: str
+) -> None:
+    file = tmp_path / "acsard.toml"
+    file.write_text("# mine\n")
+    program.answers = [answer]
+    with program.hears(JsonPrompt()) as lines:
+        assert lines.offer(str(file), OFFERED) == (answer == "write")
+    assert str(file) in program.said[0]["words"]
+    assert file.read_text().startswith("# mine\n")
+    assert text in file.read_text()
+
+
+def test_what_cannot_be_written_is_not_asked_for_and_says_why(
+    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ACSARD_CONFIG", raising=False)
+    monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
+    with program.hears(JsonPrompt()) as lines:
+        assert not lines.offer(None, OFFERED)
+        assert not lines.offer(None, OFFERED, "the daemon runs with another")
+    assert program.told("question") == []
+    first, second = program.told("message")
+    assert "no configuration file" in first
+    assert "the daemon runs with another" in second

@@ -1,0 +1,117 @@
+"""Tests of the two operator prompts: a terminal prompt, and no operator at all."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from acsard.checkup.findings import Finding
+from acsard.host.terminal_modes import one_by_one
+from acsard.terminal.output import plain
+from acsard.terminal.prompt import Ask, NobodyError
+from acsard.terminal.terminal_prompt import NoPrompt, TerminalPrompt, row
+
+DISTANCE = Ask("How far?", "m", 0.5, 3.0)
+OPTIONAL = Ask("How far, if you like?", "m", 0.0, 3.0, 0.0)
+
+Types = Callable[[str], None]
+
+
+@pytest.fixture
+def types(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
+    """Return a function that types a text on the terminal that is standard input.
+
+    It types after a delay because the prompt discards everything that was typed before the question
+    appeared.
+    """
+    master, slave = pty.openpty()
+    hands: list[threading.Timer] = []
+
+    def types(text: str) -> None:
+        hands.append(threading.Timer(0.1 * (len(hands) + 1), os.write, [master, text.encode()]))
+        hands[-1].start()
+
+    with open(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        yield types
+    for hand in hands:
+        hand.join()
+    os.close(master)
+
+
+def test_a_number_is_asked_for_until_it_is_one_within_its_bounds(
+    types: Types, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with one_by_one():
+        person = TerminalPrompt()
+        for line in ("far\n", "0.1\n", "-2\n", "\n", "1,75\n"):
+            types(line)
+        assert person.number(DISTANCE) == 1.75
+    assert capsys.readouterr().err.count("from 0.5 to 3") == 4
+
+
+def test_enter_alone_is_what_is_usual(types: Types) -> None:
+    with one_by_one():
+        person = TerminalPrompt()
+        types("\n")
+        assert person.number(OPTIONAL) == 0.0
+
+
+@pytest.mark.parametrize("asked", [lambda p: p.number(DISTANCE), lambda p: p.start("Go.")])
+def test_q_leaves_wherever_it_is_asked(
+    types: Types, asked: Callable[[TerminalPrompt], object]
+) -> None:
+    with one_by_one():
+        person = TerminalPrompt()
+        types("q\n")
+        with pytest.raises(KeyboardInterrupt):
+            asked(person)
+
+
+def test_nothing_but_enter_starts_a_leg(types: Types) -> None:
+    with one_by_one():
+        person = TerminalPrompt()
+        types("x ")
+        types("\n")
+        types(" ")
+        person.start("Go.")
+        assert person.keys(5.0) == " "
+
+
+def test_keys_come_one_by_one_and_the_terminal_is_left_as_it_was(types: Types) -> None:
+    before = termios.tcgetattr(sys.stdin)
+    with one_by_one():
+        person = TerminalPrompt()
+        assert termios.tcgetattr(sys.stdin) != before
+        types(" a")
+        assert person.keys(5.0) == " a"
+    assert termios.tcgetattr(sys.stdin) == before
+
+
+def test_nobody_measures_nothing() -> None:
+    assert NoPrompt().number(OPTIONAL) == 0.0
+    with pytest.raises(NobodyError, match=re.escape("leave --yes out")):
+        NoPrompt().number(DISTANCE)
+
+
+@pytest.mark.parametrize(("as_json", "shown"), [(False, "robot acsar\n"), (True, "")])
+def test_the_subject_is_left_out_of_the_output_of_one_object(
+    as_json: bool, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    TerminalPrompt(as_json).begin("robot acsar", simulated=False)
+    assert capsys.readouterr().out == shown
+
+
+def test_a_row_has_the_verdict_what_it_means_and_the_mend() -> None:
+    finding = Finding("watchdog", "FAIL", "none", "it drives on " * 20, "give it one")
+    head, *rest = plain(row(finding), width=100).splitlines()
+    assert head == "FAIL    watchdog               none"
+    assert all(line.startswith(" " * 8) for line in rest)
+    assert rest[-1] == "        -> give it one"

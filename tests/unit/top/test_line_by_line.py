@@ -1,0 +1,48 @@
+"""Tests of keyboard driving without a screen: when a report is due, and where the help is."""
+
+from __future__ import annotations
+
+from msgspec.structs import replace
+
+from acsard.core.messages.schema import RobotState
+from acsard.top.line_by_line import NO_END, News, Page
+from acsard.top.teleop import HELP
+from tests.unit.top.screens import STATE
+from tests.unit.top.test_teleop import SEEN
+
+
+def told(states: list[tuple[float, RobotState]]) -> list[RobotState]:
+    """Return the states that are printed when these states arrive at these times, s."""
+    news = News()
+    return [state for now, state in states if news.tell(replace(SEEN, state=state), now)]
+
+
+def test_a_robot_that_moves_is_a_line_a_second_and_one_at_rest_one_in_ten() -> None:
+    moving = [(n / 20, replace(STATE, x=n / 40, linear=0.5)) for n in range(200)]
+    assert len(told(moving)) == 10
+    resting = [(n / 20, replace(STATE, linear=0.0, angular=0.0)) for n in range(200)]
+    assert len(told(resting)) == 1
+
+
+def test_another_reason_is_told_at_once_but_never_more_than_two_lines_a_second() -> None:
+    stopped = replace(STATE, mode="stopped", reason="stopped by request")
+    found = told([(0.0, STATE), (0.5, stopped), (0.6, STATE), (1.0, STATE)])
+    assert [state.mode for state in found] == ["driving", "stopped", "driving"]
+    flickering = [(n / 20, replace(STATE, reason=f"because {n}")) for n in range(200)]
+    assert len(told(flickering)) <= 20
+
+
+def test_the_help_comes_again_before_news_shoves_it_off_the_terminal() -> None:
+    page, shown = Page(), list[str]()
+    for number in range(100):
+        shown += page.with_help([f"news {number}", *["more of it"] * (number % 4)], 24)
+        # The last line of a terminal stays empty, because the cursor is there.
+        assert list(HELP) == [line for line in shown[-23:] if line in HELP]
+    assert shown.count(HELP[0]) < 30
+    assert shown[-4:-3] == ["news 99"]
+
+
+def test_a_file_has_the_help_once() -> None:
+    page = Page()
+    assert page.with_help(["news"], NO_END) == [*HELP, "news"]
+    assert page.with_help(["news"] * 1000, NO_END) == ["news"] * 1000
