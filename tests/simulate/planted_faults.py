@@ -147,8 +147,8 @@ FAULTS = (
         "arbiter priority",
         "the source of the lowest priority wins",
         ARBITER,
-        "key=lambda one: (-one[0].priority, one[1].came_ns)",
-        "key=lambda one: (one[0].priority, one[1].came_ns)",
+        "key=lambda source: -source.priority",
+        "key=lambda source: source.priority",
     ),
     fault(
         "arbiter arming",
