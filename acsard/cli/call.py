@@ -12,9 +12,9 @@ from acsard.cli.echo import of_robot
 from acsard.client import Client
 from acsard.core.formatting import json_line, lines, printable
 from acsard.core.messages.encodings import encode
-from acsard.core.messages.schema import ServiceReply
-from acsard.core.messages.topics import SERVICES
-from acsard.core.values import AcsardError
+from acsard.core.messages.schema import MESSAGES, ServiceReply
+from acsard.core.messages.topics import PLAIN_SERVICES, SERVICES
+from acsard.core.values import AcsardError, Verb
 from acsard.daemon.bus import robot_discovery
 from acsard.daemon.bus.robot_discovery import ALL, named, present, seen
 from acsard.host.errors import Exit, UsageError
@@ -27,6 +27,8 @@ CALLED = tuple(service for service in SERVICES if service != "set")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
+    fields = {service: " ".join(_fields(service)) for service in CALLED}
+    forms = [f"{service} {names.upper()}" for service, names in fields.items() if names]
     parser.add_argument(
         "service",
         # Accept `srv/stop` too, as `state` and the key table write it.
@@ -36,14 +38,18 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help=", ".join(CALLED),
     )
     parser.add_argument(
-        "values", nargs="*", type=float, metavar="X Y YAW", help="for set_pose: m, m, rad"
+        "values",
+        nargs="*",
+        type=float,
+        metavar="NUMBER",
+        help=f"the values of the payload: {'; '.join(forms)}",
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     add_bus(parser, MANY + " (stop only)")
 
 
 def main(args: argparse.Namespace) -> int:
-    wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
+    wanted = _fields(args.service)
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])
         raise UsageError(f"write: {form}")
@@ -55,6 +61,13 @@ def main(args: argparse.Namespace) -> int:
         reply = robot.call(args.service, **dict(zip(wanted, args.values, strict=True)))
     print(json_line(encode(reply, "json").decode()) if args.json else lines(reply.message))
     return 0 if reply.success else 1
+
+
+def _fields(service: Verb) -> tuple[str, ...]:
+    """Return the names of the numbers in the payload that a service needs."""
+    if service in PLAIN_SERVICES:
+        return ()
+    return MESSAGES[SERVICES[service].payload].__struct_fields__
 
 
 def for_one(service: str, values: Sequence[float], ids: tuple[str, ...]) -> str:

@@ -199,7 +199,7 @@ class Client:
             raise self.unheard(error) from None
 
     def call(self, service: str, **fields: float) -> schema.ServiceReply:
-        """Call `stop`, `clear`, `activate`, `deactivate`, `reset_odometry` or `set_pose`.
+        """Call a service, such as "stop", with the fields of its payload.
 
         `clear` releases the stop or fault that `state` shows now, and `activate` switches on a
         robot that `state` shows as switched off now. Pass the `latch` of the state that a person

@@ -180,7 +180,7 @@ EventName = Literal[
     "gateway_open", "gateway_full", "gateway_stuck", "gateway_lost_daemon", "gateway_ended",
     "page_ended", "page_refused",
     "router_open", "router_full", "router_stuck", "router_ended",
-    "stop", "clear", "activate", "deactivate", "reset_odometry", "set_pose", "set",
+    Verb,
     "mode", "commander", "commands_without_effect", "new_sender", "command_refused", "fault",
 ]  # fmt: skip
 """All names of log events. `deploy/systemd/README.md` explains each of them."""

@@ -15,8 +15,8 @@ from msgspec import Struct
 
 from acsard.core.messages.json_schema import SCHEMAS
 from acsard.core.messages.permissions import SERVICE_ROLES, least_role
-from acsard.core.messages.topics import TOPICS, VERBS, Topic
-from acsard.core.values import ROLES, Role, Verb
+from acsard.core.messages.topics import SERVICES, TOPICS, VERBS, Topic
+from acsard.core.values import ROLES, Role
 
 Handler = Callable[[Any, Any], Awaitable[Any]]
 """Takes the page and the request, and returns the response."""
@@ -36,13 +36,6 @@ class Which(Struct, frozen=True):
     """The robot to stop: the page's own, or another one of the same router."""
 
     robot: str = ""
-
-
-PAYLOADS: Mapping[Verb, type | str] = {
-    "stop": Which, "set": "Settings", "set_pose": "SetPose", "clear": "Release",
-    "activate": "Release",
-}  # fmt: skip
-"""Type of each service's request. The daemon decodes it, so the daemon's words refuse it."""
 
 
 class Problem(Struct, frozen=True):
@@ -117,11 +110,13 @@ def services(handler: Handler) -> Iterator[Route]:
     """Yield the row of each service."""
     notes = {topic.key: topic.note for topic in TOPICS}
     for key, verb in VERBS.items():
+        # The daemon decodes the payload, so the daemon's words refuse it.
+        takes = Which if verb == "stop" else SERVICES[verb].payload or None
         gives = {
             200: Body("It was done.", "ServiceReply"),
             409: Body("It was not done; the reason is in the answer.", "ServiceReply"),
         }
         yield Route(
             "POST", f"/api/{key}", SERVICE_ROLES[verb], handler, notes[key],
-            takes=PAYLOADS.get(verb), gives=gives, paced=verb != "stop",
+            takes=takes, gives=gives, paced=verb != "stop",
         )  # fmt: skip

@@ -8,10 +8,10 @@ from typing import get_args
 import msgspec
 import pytest
 
-from acsard.core.incoming.commands import EXAMPLES, Arrival, Via
+from acsard.core.incoming.commands import Arrival, Via
 from acsard.core.incoming.queries import Query
 from acsard.core.messages.signature import public_name
-from acsard.core.messages.topics import VERBS
+from acsard.core.messages.topics import SERVICES, VERBS
 from acsard.core.values import NS_PER_S, Event, EventName
 from tests.scenarios.world import World
 
@@ -48,7 +48,7 @@ def call(world: World, service: str, name: bytes = b"", via: Via = "native") -> 
         world.bus.arrivals.append(
             Arrival("stop", True, b"", "", at_ns, None, "", via=via, attachment=name)
         )
-    payload = EXAMPLES.get(VERBS[key], "").encode()
+    payload = SERVICES[VERBS[key]].example.encode()
     if service == "clear":
         payload = msgspec.json.encode({"latch": world.state.latch})
     query = Query(1, key, key, "", payload, "", at_ns, via, name)

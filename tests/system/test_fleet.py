@@ -364,7 +364,7 @@ class Visitor:
                 found[label] = found.get(label) or _answered(waiting[label])
             return all(found.values())
 
-        self._fleet.comes(all_mine, 50)
+        self._fleet.comes(all_mine, 200)
         return {label: found.get(label) or _answered(waiting[label]) for label in waiting}
 
     def followed(self, rows: Sequence[Try]) -> bool:

@@ -18,13 +18,16 @@ from functools import lru_cache
 from typing import Literal
 
 from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from acsard.core.config.settings import JointsConfig
 from acsard.core.messages import signature
 from acsard.core.messages.encodings import DecodeError, Decoder, decode_cdr, detect
 from acsard.core.messages.schema import (
+    MESSAGES,
     Header,
     JointState,
+    Message,
     Release,
     SetPose,
     Settings,
@@ -33,7 +36,7 @@ from acsard.core.messages.schema import (
     Vector3,
 )
 from acsard.core.messages.signature import public_name
-from acsard.core.messages.topics import COMMANDS
+from acsard.core.messages.topics import COMMANDS, SERVICES
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.ros.attachments import GID_BYTES, unpack
 from acsard.core.ros.transports import Transport
@@ -134,20 +137,11 @@ STAMPED_TWISTS = ("geometry_msgs/msg/TwistStamped", "acsard.TwistStamped.v1")
 
 _twists = Decoder(_TwistPayload)
 _wheels = Decoder(JointState)
-_poses = Decoder(SetPose)
-_settings = Decoder(Settings)
-_releases = Decoder(Release)
-
-EXAMPLES: dict[Verb, str] = {
-    "set_pose": '{"x": 0, "y": 0, "yaw": 0}',
-    "set": '{"settings": {"limits.linear_speed": 0.8}}',
-    "clear": '{"latch": 1800000000000}',
-    "activate": '{"latch": 1800000000000}',
+_payloads = {
+    verb: Decoder[Message](MESSAGES[service.payload])
+    for verb, service in SERVICES.items()
+    if service.payload
 }
-"""An example payload of each service that takes one."""
-
-MAY_BE_PLAIN: tuple[Verb, ...] = ("clear", "activate")
-"""Services that may also be called without a payload."""
 
 
 class Receiver:
@@ -255,23 +249,21 @@ class Receiver:
             payload: the payload of the query.
             asked_ns: the monotonic time of the query, ns.
         """
-        if verb not in EXAMPLES or (verb in MAY_BE_PLAIN and not payload):
-            return Request(verb, ticket, asked_ns=asked_ns)
+        request = Request(verb, ticket, asked_ns=asked_ns)
+        if verb not in _payloads or (SERVICES[verb].optional and not payload):
+            return request
         if len(payload) > MAX_COMMAND_BYTES:
             raise DecodeError("too_big", f"over {MAX_COMMAND_BYTES} bytes")
-        if verb == "set":
-            wished = _settings.decode(encoding, payload).settings
-            return Request(verb, ticket, asked_ns=asked_ns, settings=wished)
-        if verb in MAY_BE_PLAIN:
-            latch = _releases.decode(encoding, payload).latch
-            return Request(verb, ticket, asked_ns=asked_ns, latch=latch)
-        got = _poses.decode(encoding, payload)
-        if (
-            not all(map(math.isfinite, (got.x, got.y, got.yaw)))
-            or max(abs(got.x), abs(got.y)) > 1e6
-        ):
-            raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
-        return Request(verb, ticket, Pose(got.x, got.y, got.yaw), asked_ns)
+        match _payloads[verb].decode(encoding, payload):
+            case Settings(settings):
+                return replace(request, settings=settings)
+            case Release(latch):
+                return replace(request, latch=latch)
+            case SetPose(x, y, yaw):
+                if not all(map(math.isfinite, (x, y, yaw))) or max(abs(x), abs(y)) > 1e6:
+                    raise DecodeError("not_finite", "x and y must be within 1000 km, yaw finite")
+                return replace(request, pose=Pose(x, y, yaw))
+        return request
 
 
 class Identity(Struct, frozen=True):

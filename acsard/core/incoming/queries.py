@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from acsard.core.config.parsing import effective
 from acsard.core.config.settings import Config
-from acsard.core.incoming.commands import EXAMPLES, MAX_COMMAND_BYTES, Receiver, Via, caller_name
+from acsard.core.incoming.commands import MAX_COMMAND_BYTES, Receiver, Via, caller_name
 from acsard.core.messages.cdr import CdrError
 from acsard.core.messages.encodings import (
     FORMATS,
@@ -38,6 +38,7 @@ from acsard.core.messages.schema import (
 from acsard.core.messages.topics import (
     JSON_TREE,
     PUBLISHED,
+    SERVICES,
     VERBS,
     WHOAMI,
     full_key,
@@ -212,7 +213,7 @@ class Queries:
                 query.arrived_ns,
             )
         except DecodeError as error:
-            message = ServiceReply(False, f"{error}; send {EXAMPLES[VERBS[query.topic]]}")
+            message = ServiceReply(False, f"{error}; send {SERVICES[VERBS[query.topic]].example}")
             payload, name = encode(message, form), encoding_name(form, "ServiceReply")
             return [Reply(query.ticket, query.topic, payload, name)]
         self._waiting[query.ticket] = _Waiting(query.topic, form, None)

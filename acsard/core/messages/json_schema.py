@@ -15,19 +15,15 @@ import msgspec
 from acsard.core.config.settings import Config
 from acsard.core.messages.schema import (
     MESSAGES,
-    GatewayState,
     Imu,
     JointState,
-    Release,
-    SetPose,
-    Settings,
-    Twist,
     TwistStamped,
 )
+from acsard.core.messages.topics import SERVICES
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
-ONLY_IN = (Twist, SetPose, Release, Settings, GatewayState)
+ONLY_IN = {"Twist", "GatewayState", *(service.payload for service in SERVICES.values())}
 BOTH_WAYS = (TwistStamped, JointState, Imu)
 
 ENOUGH: dict[type, list[str]] = {
@@ -69,7 +65,7 @@ def _described(cls: type, name: str) -> Schema:
 
 SCHEMAS: dict[str, Schema] = {
     **{
-        name: (coming_in if cls in ONLY_IN else going_out)(cls, name)
+        name: (coming_in if name in ONLY_IN else going_out)(cls, name)
         for name, cls in MESSAGES.items()
     },
     **{f"{cls.__name__}In": coming_in(cls, f"{cls.__name__}In") for cls in BOTH_WAYS},

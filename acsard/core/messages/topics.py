@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from functools import cache
-from typing import Literal, get_args
+from typing import Literal, NamedTuple
 
 from msgspec import Struct
 
@@ -63,24 +63,58 @@ class Topic(Struct, frozen=True):
         return _PLACE.sub("*", self.key.replace("<key>", "**"))
 
 
-SERVICES: tuple[Verb, ...] = get_args(Verb)
+class Service(NamedTuple):
+    """One row of the table of services."""
 
-_SERVICES: dict[Verb, tuple[Role, str]] = {
-    "stop": ("viewer", "stop, and stay stopped until clear"),
-    "clear": (
+    least: Role
+    """Least role that may call the service. Every client may stop the robot."""
+    note: str
+    """Effect of the service."""
+    payload: str = ""
+    """Type of the payload, a name in `MESSAGES`; "" for a service without a payload."""
+    example: str = ""
+    """An example payload in JSON."""
+    optional: bool = False
+    """True for a service that may also be called without its payload."""
+
+
+SERVICES: dict[Verb, Service] = {
+    "stop": Service("viewer", "stop, and stay stopped until clear"),
+    "clear": Service(
         "operator",
         "clear the fault if there is one, else the stop; the payload {latch} names it",
+        "Release",
+        '{"latch": 1800000000000}',
+        optional=True,
     ),
-    "activate": (
+    "activate": Service(
         "operator",
         "switch on, so that commands count; the payload {latch} names the latch",
+        "Release",
+        '{"latch": 1800000000000}',
+        optional=True,
     ),
-    "deactivate": ("operator", "switch off: ramp to zero and ignore commands"),
-    "reset_odometry": ("operator", "set the pose to x 0, y 0, yaw 0"),
-    "set_pose": ("maintainer", "set the pose to the payload {x, y, yaw}"),
-    "set": ("maintainer", "change settings; the payload is {settings: {key: value}}"),
+    "deactivate": Service("operator", "switch off: ramp to zero and ignore commands"),
+    "reset_odometry": Service("operator", "set the pose to x 0, y 0, yaw 0"),
+    "set_pose": Service(
+        "maintainer",
+        "set the pose to the payload {x, y, yaw}",
+        "SetPose",
+        '{"x": 0, "y": 0, "yaw": 0}',
+    ),
+    "set": Service(
+        "maintainer",
+        "change settings; the payload is {settings: {key: value}}",
+        "Settings",
+        '{"settings": {"limits.linear_speed": 0.8}}',
+    ),
 }
-"""The least role that may call each service, and its effect. Every client may stop the robot."""
+"""Every service. What each interface needs of a service comes from its row."""
+
+PLAIN_SERVICES = tuple(
+    verb for verb, service in SERVICES.items() if service.optional or not service.payload
+)
+"""The services that can be called without a payload."""
 
 IMU = "imu"
 """Key of the gyro's samples. The simulator publishes the samples of its gyro on the same key."""
@@ -134,8 +168,10 @@ def _query(key: str, kind: str, note: str, least: Role | Literal["<role>"] = "vi
 
 
 def _service(verb: Verb) -> Topic:
-    least, note = _SERVICES[verb]
-    return Topic(service_key(verb), "service", "ServiceReply", "", note, query=least)
+    service = SERVICES[verb]
+    return Topic(
+        service_key(verb), "service", "ServiceReply", "", service.note, query=service.least
+    )
 
 
 TOPICS: tuple[Topic, ...] = (

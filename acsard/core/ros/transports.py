@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from acsard.core.config.settings import Config, RosConfig
 from acsard.core.messages.encodings import encoding_name
-from acsard.core.messages.topics import IMU, Direction, service_key
+from acsard.core.messages.topics import IMU, PLAIN_SERVICES, Direction, service_key
 from acsard.core.ros.names import (
     Kind,
     Node,
@@ -72,7 +72,7 @@ class Endpoint(Struct, frozen=True):
 
 KINDS: dict[Direction, Kind] = {"out": "MP", "in": "MS", "query": "SS", "service": "SS"}
 
-TRIGGERS = ("stop", "clear", "activate", "deactivate", "reset_odometry")
+TRIGGERS = PLAIN_SERVICES
 
 _NAMED = re.compile(rf"\bsrv/({'|'.join(TRIGGERS)})\b")
 

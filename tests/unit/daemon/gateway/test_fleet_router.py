@@ -21,7 +21,7 @@ from acsard.core.config.settings import (
     RobotConfig,
     RosConfig,
 )
-from acsard.core.messages.topics import source_keys
+from acsard.core.messages.topics import JSON_TREE, TOPICS, source_keys
 from acsard.core.values import ROLES, Role
 from acsard.daemon.bus.access import gateway_access
 from acsard.daemon.gateway.fleet_router import Router, router_file
@@ -152,7 +152,8 @@ def test_each_role_may_use_the_same_keys_as_at_the_gateway_of_a_robot(
     )
     keys = granted(read(TEMPLATE), {f"{role}s", f"certificate {role}"}, message)
     # A fleet may have a simulated robot. `alive` answers nothing.
-    keys -= {"acsard/robot1/sim/pose", "acsard/robot1/json/sim/pose"}
+    simulated = {topic.key for topic in TOPICS if topic.simulated}
+    keys -= {f"acsard/robot1/{tree}{key}" for key in simulated for tree in ("", JSON_TREE)}
     keys -= {"acsard/robot1/alive"} if message == "query" else set()
     assert keys == granted(gateway, {role, f"certificate {role}"}, message)
 
