@@ -259,7 +259,10 @@ def remarks(
         )
     left, right = float(turned[turned > 0].sum()), float(-turned[turned < 0].sum())
     if min(left, right) < ONE_SIDED * max(left, right):
-        yield "nearly all turns are to one side, so differences between the sides are not measured"
+        yield (
+            "nearly all turns are to one side, so the calibration does not show a difference "
+            "between the sides: drive turns to both sides"
+        )
     size = float(values[1:].mean())
     if sized and not 1 / ODD_SIZE < size < ODD_SIZE:
         yield (
