@@ -89,7 +89,7 @@ class ControlLoop:
         """
         self.robot = Robot(config, latches)
         self.report = Report(config, start, certificate_ends_ns)
-        self.leaving = False
+        self.shutting_down = False
         """Set it to go down: the robot ramps to zero and stays there."""
         self.outputs: Outputs | None = None
         self._start_ns = start.mono_ns
@@ -178,7 +178,7 @@ class ControlLoop:
             missed,
             tuple(self._others),
             pace.at_once(now.mono_ns, port.sent_ns),
-            self.leaving,
+            self.shutting_down,
         )
         if inputs.events:
             self._others.clear()
