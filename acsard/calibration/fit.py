@@ -159,9 +159,9 @@ def fit(
     parameters, size = start.copy(), np.inf
     for at in range(MOST_STEPS):
         normal, score = _sum([source(parameters) for source in sources])
-        known, told = _known(parameters, held, places, usual)
+        known, prior = _known(parameters, held, places, usual)
         step = np.zeros(COUNT)
-        step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + told, active)
+        step[list(active)] = _solved(normal.sum(axis=0) + known, score.sum(axis=0) + prior, active)
         # Far from the solution, take only a part of the step: the linearization holds only near its
         # point. After a third of the steps, halve each step. Otherwise an outlier could count in
         # every other step only, and the fit would not converge.
@@ -170,37 +170,37 @@ def fit(
         parameters = parameters + step * min(whole, 0.3 / size if size else 1.0)
         if size < SMALL:
             break
-    found = [source(parameters) for source in sources]
-    normal, score = _sum(found)
+    evidence = [source(parameters) for source in sources]
+    normal, score = _sum(evidence)
     known, _ = _known(parameters, held, places, usual)
-    varies = _varies(found, parameters)
+    varies = _varies(evidence, parameters)
     return Fit(parameters, normal, score, known, active, varies, size < SETTLED, usual)
 
 
-def _sum(found: Sequence[Evidence]) -> tuple[Floats, Floats]:
+def _sum(evidence: Sequence[Evidence]) -> tuple[Floats, Floats]:
     """Return the sums of the normal equations and of the scores of all sensors.
 
     The weight of a sensor follows from the scatter of its scores from block to block. Unlike the
     residuals themselves, this scatter shows how much less information correlated residuals contain.
     """
-    normal, score = np.zeros_like(found[0].normal), np.zeros_like(found[0].score)
-    for one in found:
-        weight = _weight(one)
-        normal, score = normal + weight * one.normal, score + weight * one.score
+    normal, score = np.zeros_like(evidence[0].normal), np.zeros_like(evidence[0].score)
+    for part in evidence:
+        weight = _weight(part)
+        normal, score = normal + weight * part.normal, score + weight * part.score
     return normal, score
 
 
-def _weight(one: Evidence) -> float:
-    total = one.normal.sum(axis=0)
+def _weight(part: Evidence) -> float:
+    total = part.normal.sum(axis=0)
     used = np.flatnonzero(np.diag(total) > 0.0)
     if not len(used):
         return 0.0
     inner = np.linalg.pinv(total[np.ix_(used, used)], rcond=1e-10, hermitian=True)
     rank = int(np.linalg.matrix_rank(inner, hermitian=True))
     # Use the deviations from the mean, because the mean is not noise until the fit has converged.
-    apart = one.score[:, used] - one.score[:, used].mean(axis=0)
+    apart = part.score[:, used] - part.score[:, used].mean(axis=0)
     noise = float(np.einsum("bi,ij,bj->", apart, inner, apart))
-    white = float(one.squares.sum() / max(1.0, one.counts.sum()))
+    white = float(part.squares.sum() / max(1.0, part.counts.sum()))
     return 1.0 / max(noise / max(1, rank), white, 1e-18)
 
 
@@ -233,23 +233,23 @@ def _solved(normal: Floats, score: Floats, active: Sequence[int]) -> Floats:
     return np.asarray(np.linalg.lstsq(part, score[list(active)], rcond=1e-15)[0])
 
 
-def _varies(found: Sequence[Evidence], parameters: Floats) -> float:
+def _varies(evidence: Sequence[Evidence], parameters: Floats) -> float:
     """Return the fraction by which the track differs between blocks, beyond the noise within them.
 
     This is the moment estimator for random effects (DerSimonian & Laird 1986).
     """
     spread = weight = 0.0
-    for one in found:
-        share = _weight(one)
-        size, pull = (
-            share * one.normal[:, INVERSE_TRACK, INVERSE_TRACK],
-            share * one.score[:, INVERSE_TRACK],
+    for part in evidence:
+        share = _weight(part)
+        size, score = (
+            share * part.normal[:, INVERSE_TRACK, INVERSE_TRACK],
+            share * part.score[:, INVERSE_TRACK],
         )
-        seen = size > 0.0
-        own = pull[seen] ** 2 / size[seen]
-        free = max(1.0, float(one.counts[seen].sum() - seen.sum()))
-        noise = max(0.0, float(share * one.squares[seen].sum() - own.sum())) / free
-        spread += float(own.sum()) - noise * int(seen.sum())
+        used = size > 0.0
+        own = score[used] ** 2 / size[used]
+        free = max(1.0, float(part.counts[used].sum() - used.sum()))
+        noise = max(0.0, float(share * part.squares[used].sum() - own.sum())) / free
+        spread += float(own.sum()) - noise * int(used.sum())
         weight += float(size.sum())
     return (
         float(np.sqrt(max(0.0, spread) / weight)) / abs(parameters[INVERSE_TRACK])

@@ -123,11 +123,11 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | 
         return None
     if all(np.ptp(run.gyro) == 0.0 for run in driven if len(run.gyro)):
         raise LogError("yaw_rate is the same in every row: the gyro was not recorded, or is dead")
-    seen = [_biases(run) for run in driven]
-    every = np.concatenate([values for _, values, _ in seen])
-    usual = float(np.median(every)) if len(every) else 0.0
+    biases = [_biases(run) for run in driven]
+    all_biases = np.concatenate([values for _, values, _ in biases])
+    usual = float(np.median(all_biases)) if len(all_biases) else 0.0
     found, rested = [], []
-    for run, (t, values, noise) in zip(driven, seen, strict=True):
+    for run, (t, values, noise) in zip(driven, biases, strict=True):
         true = np.abs(values - usual) < TURNED_BY_HAND
         rested.append((t[true], values[true], noise[true]))
         bias = np.interp(run.gyro_t, t[true], values[true]) if true.any() else usual
@@ -136,9 +136,11 @@ def of_gyro(driven: Sequence[Run], angles: Sequence[WheelAngles]) -> Headings | 
         steps = np.diff(run.gyro_t)
         steps[np.isin(run.gyro_t[:-1], holes[:, 0])] = 0.0
         found.append(Heading(run.gyro_t, _sums(rate, steps), holes))
-    late = offset(found, angles)
-    unsure = _unsure(rested, [float(run.t[-1]) for run in driven]) if len(every) else 0.0
-    return Headings("yaw_rate", tuple(found), late, usual, not len(every), unsure)
+    seconds = [float(run.t[-1]) for run in driven]
+    return Headings(
+        "yaw_rate", tuple(found), offset(found, angles), usual, bias_unknown=not len(all_biases),
+        bias_std=_bias_std(rested, seconds) if len(all_biases) else 0.0,
+    )  # fmt: skip
 
 
 def of_yaw(driven: Sequence[Run], angles: Sequence[WheelAngles], gain: float) -> Headings | None:
@@ -204,7 +206,7 @@ def _mean(samples: Floats) -> tuple[float, float]:
     return float(kept.mean()), float(np.var(parts, ddof=1)) / len(parts) + few
 
 
-def _unsure(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
+def _bias_std(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     """Return the standard deviation of the mean bias over all runs, rad/s.
 
     Its causes are the noise in the rests and the random walk of the bias between the rests.
@@ -212,10 +214,10 @@ def _unsure(rested: Sequence[Rests], seconds: Sequence[float]) -> float:
     count = sum(len(t) for t, _, _ in rested)
     noise = sum(float(variance.sum()) for _, _, variance in rested) / max(1, count) ** 2
     walked = [np.column_stack((np.diff(v) ** 2 - n[1:] - n[:-1], np.diff(t))) for t, v, n in rested]
-    gone, lasted = np.concatenate(walked).sum(axis=0)
+    changed, lasted = np.concatenate(walked).sum(axis=0)
     # An estimate from few differences is uncertain, so increase it.
     few = 1 + 2 / max(1, count - len(rested))
-    walk = max(WALK**2, few * gone / lasted) if lasted else UNSEEN_WALK**2
+    walk = max(WALK**2, few * changed / lasted) if lasted else UNSEEN_WALK**2
     # Between two rests the bias error is a Brownian bridge; outside of them it is a free random
     # walk.
     whole = sum(seconds)

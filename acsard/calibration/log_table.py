@@ -53,7 +53,7 @@ def parted(cell: str) -> tuple[str, str]:
 
 
 def factor(name: str, unit: str) -> float | None:
-    """Return the factor that converts this unit to SI, or None if the unit is unknown."""
+    """Return the factor from a unit of the column `name` to SI, or None if it is unknown."""
     known = UNITS.get(name, RATE)
     return known.get(unit.replace("degrees", "deg").replace("/sec", "/s"), None if unit else 1.0)
 

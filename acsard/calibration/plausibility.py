@@ -16,7 +16,7 @@ from acsard.calibration.search import StartingPoint
 from acsard.core.values import AcsardError
 
 UNLIKE = 0.5
-"""Largest part of a sensor's motion that the wheels may leave unexplained, as squares."""
+"""Largest fraction of the sum of a sensor's squared motions that the wheels may not explain."""
 
 UNITS = 8.0
 """Factor by which a result may be too large or too small. Beyond it, a unit must be wrong."""
@@ -24,7 +24,7 @@ UNITS = 8.0
 LEAST_TURN = 0.2
 """Smallest credible ratio of the measured turn to the turn that the configured wheels predict.
 
-A robot that skids turns further than this. If it turns less, its wheel speeds are probably in rpm.
+Even a robot that skids turns further. If it turns less, its wheel speeds are probably in rpm.
 """
 
 FAR_SIZE = 2e-3
@@ -55,7 +55,10 @@ LARGE_BIAS = 0.05
 """Gyro bias, rad/s, above which it is reported."""
 
 ONE_SIDED = 0.1
-"""Ratio of the turns to one side to those to the other below which this is reported."""
+"""Ratio of the turns to the rarer side to all turns to the other side.
+
+Below it, the report says that turns to one side are missing.
+"""
 
 ODD_SIZE = 1.25
 """Ratio of the measured radius to the configured one from which it is reported."""
@@ -259,7 +262,10 @@ def remarks(
         )
     left, right = float(turned[turned > 0].sum()), float(-turned[turned < 0].sum())
     if min(left, right) < ONE_SIDED * max(left, right):
-        yield "nearly all turns are to one side, so differences between the sides are not measured"
+        yield (
+            "nearly all turns are to one side, so the calibration does not show a difference "
+            "between the sides: drive turns to both sides"
+        )
     size = float(values[1:].mean())
     if sized and not 1 / ODD_SIZE < size < ODD_SIZE:
         yield (

@@ -81,7 +81,8 @@ def rolls_enough(rows: Rows) -> None:
     cross = float(together @ against) ** 2
     if cross > ALIKE * float(together @ together) * float(against @ against):
         raise RefusedError(
-            f"the robot drives always the same circle, which measures nothing: {DRIVE}"
+            f"the robot always drives the same curve, which does not separate the wheels from the "
+            f"track: {DRIVE}"
         )
 
 

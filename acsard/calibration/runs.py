@@ -190,7 +190,7 @@ def _restarts(t: Floats, rows: Rows, columns: dict[str, Floats]) -> list[Rows]:
 
 
 def _wheel_times(t: Floats, rows: Rows, columns: dict[str, Floats]) -> Floats:
-    """Return the sorted times of the rows that have both sides, with repetitions."""
+    """Return the sorted times of the rows with speeds of both sides. A time may occur twice."""
     held = np.isfinite(columns["left"][rows]) & np.isfinite(columns["right"][rows])
     return np.sort(t[rows[held]])
 

@@ -1,4 +1,7 @@
-"""Computes the calibration from a log, or raises an error that says why it cannot."""
+"""Computes the calibration from a log: prepares it, fits, checks the result and evaluates it.
+
+If a log gives no calibration, an error says why and what to do.
+"""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class LegDriver:
         if state.mode in (*NEVER, "waiting"):
             self._halt(f"the robot is {state.mode}: {state.reason}")
         elif state.source not in ("", self._source):
-            self._halt(f"{state.source} commands the robot now")
+            self._halt(f"{state.source} commands the robot now: end that program, and start again")
         elif self.phase is Phase.OPENING:
             self._waits = why
         elif state.sender not in ("", self._sender):
@@ -126,7 +126,8 @@ class LegDriver:
         if held_up > QUIET_S / 2 and self.phase is Phase.MOVING:
             self._halt(HELD_UP)
         elif now - self._received > QUIET_S:
-            self._halt("nothing received from the daemon" if held_up <= QUIET_S / 2 else HELD_UP)
+            silent = "nothing received from the daemon: does it run?"
+            self._halt(silent if held_up <= QUIET_S / 2 else HELD_UP)
         if self.phase is Phase.OPENING:
             self._open(now)
         if self.phase is Phase.MOVING and now >= self._ends:
@@ -146,7 +147,10 @@ class LegDriver:
         self._number += 1
         if self._number >= len(self._leg.moves):
             if self._leg.by_key:
-                self._halt("no key was pressed although the robot must have turned a full circle")
+                self._halt(
+                    "no key was pressed although the robot must have turned a full circle: start "
+                    "again, and press SPACE at the end of the circle"
+                )
             else:
                 self._settle(now)
             return
@@ -164,7 +168,10 @@ class LegDriver:
         if self._still_since is not None and now - self._still_since >= STANDING_S:
             self.phase = Phase.DONE
         elif now - self._ends > STANDS_S:
-            self._halt("the wheels do not come to rest although zero is commanded")
+            self._halt(
+                "the wheels do not come to rest although zero is commanded: does somebody push the "
+                "robot, or does an encoder report a speed at rest?"
+            )
 
     def _tolerate_briefly(self, why: str, now: float) -> None:
         """Halt the leg if `why` is given for `DEVIATES_S`. "" means that all is well.
@@ -198,7 +205,7 @@ class LegDriver:
         if now - self._changed < OBEYED_S:
             return ""
         if not state.wheels:
-            return "the microcontroller sends no feedback"
+            return "the microcontroller sends no feedback: look at its cable and its power supply"
         right, left = (state.wheels[a] + state.wheels[b] for a, b in ((0, 3), (1, 2)))
         linear = self._drive.wheel_radius * (right + left) / 4
         track = self._drive.wheel_separation * self._drive.wheel_separation_multiplier

@@ -129,7 +129,8 @@ class RobotOnBus:
                 "the daemon's state cannot be read: does another version of acsard run?"
             )
         if driver.halted:
-            raise GuideError(f"{driver.halted}. The tool commanded zero, and writes nothing")
+            end = "" if driver.halted.endswith("?") else "."
+            raise GuideError(f"{driver.halted}{end} The tool commanded zero, and writes nothing")
         return recorder.run()
 
     def _drive(self, driver: LegDriver, recorder: Recorder) -> None:

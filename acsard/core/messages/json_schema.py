@@ -56,7 +56,7 @@ def coming_in(cls: type, name: str) -> Schema:
 
 def _described(cls: type, name: str) -> Schema:
     # A pattern is an ECMAScript expression. It has no \Z, but its $ matches only at the end.
-    text = msgspec.json.encode(msgspec.json.schema(cls)).replace(rb'\\Z"', b'$"')
+    text = msgspec.json.encode(msgspec.json.schema(cls)).replace(rb"\\Z", b"$")
     whole: Schema = msgspec.json.decode(text)
     parts, own = whole["$defs"], whole["$ref"].rpartition("/")[2]
     top: Schema = parts.pop(own) | {"title": name}

@@ -93,7 +93,7 @@ class Twist(Message, frozen=True):
 
 
 class TwistStamped(Message, frozen=True):
-    """A twist with the time for which it was meant."""
+    """A twist with a stamp."""
 
     header: Header
     twist: Twist

@@ -1,7 +1,7 @@
-"""Learns a gyro's bias, its reading while the robot stands, at every rest (zero-velocity update).
+"""Learns the bias of a gyro, which is its reading while the robot stands (zero-velocity update).
 
-The bias drifts between two rests, so a rest counts for more if the one before was long ago: this is
-the scalar Kalman filter of a random walk. The first estimate is the plain mean.
+The bias drifts between rests. The estimate is a scalar Kalman filter of a random walk, so a rest
+has more weight if the rest before was long ago. The first estimate is the mean of the samples.
 """
 
 from __future__ import annotations
@@ -9,56 +9,63 @@ from __future__ import annotations
 import math
 
 KNOWN_S = 0.5
-"""Seconds of rest before the bias is known."""
+"""Time at rest after which the bias is known, s."""
 
 MAX_BIAS = 0.2
-"""Greatest plausible bias, rad/s. A higher rate means that a person turns the robot."""
+"""Largest plausible bias, rad/s. A higher rate means that a person turns the robot."""
 
 WALK = 1e-4
 """Random walk of a cheap gyro's bias with temperature, rad/s per square root of a second."""
 
 UNLIKELY = 5.0
-"""Standard deviations from the bias beyond which a sample is not noise."""
+"""Number of standard deviations from the bias above which a sample is not noise."""
 
 SLACK = 0.01
-"""rad/s that are allowed in addition, for vibration of a robot that stands."""
+"""Deviation that is allowed in addition, rad/s, because a robot that stands may vibrate."""
 
 LEAST_NOISE = 1e-5
-"""Least noise, rad/s. A gyro that repeats one value is coarse, not free of noise."""
+"""Smallest standard deviation of a sample, rad/s. A gyro that repeats one value is coarse."""
 
 ANEW_S = 1.0
-"""Seconds of rest with one other bias after which that one is taken. The gyro was restarted or grew
-warm, or the robot was turned while the first bias was learned."""
+"""Time at rest with another constant bias after which the other bias is used, s.
+
+The gyro has restarted or became warm, or the robot was turned while the first bias was learned.
+"""
 
 LEARNING = 0.02
-"""Weight of a new sample in the estimate of the noise: about the last fifty count."""
+"""Weight of a new sample in the estimate of the noise. About the last fifty samples count."""
 
 
 class Bias:
-    """The bias, its variance, and the noise of a sample; in rad/s and rad2/s2."""
+    """The estimated bias and its variance."""
 
     def __init__(self) -> None:
         self.value = 0.0
+        """The bias, rad/s."""
         self.variance = MAX_BIAS**2
+        """Variance of the bias, rad2/s2."""
         self.noise = 0.0
-        """Variance of one sample."""
+        """Variance of one sample, rad2/s2."""
         self._rested_s, self._samples = 0.0, 0
         self._other: Bias | None = None
-        """A second estimate, from consecutive samples that contradict this one."""
+        """A second estimate, from consecutive samples that contradict this estimate."""
 
     @property
     def known(self) -> bool:
-        """Whether the robot has stood long enough."""
+        """Whether the robot has stood long enough to know the bias."""
         return self._rested_s >= KNOWN_S
 
     def drift(self, dt: float) -> None:
-        """Let `dt` s pass, at rest or not."""
+        """Let `dt` s pass, in which the bias may drift."""
         self.variance += WALK * WALK * dt
 
     def rest(self, rate: float, variance: float, dt: float) -> bool:
-        """Learn from a sample while the wheels stand; return False if it shows a turn instead.
+        """Learn from a sample while the wheels stand. Return False if the sample shows a turn.
 
-        `variance` is the gyro's own claim, 0 without one. `dt` s is the sample's share of the rest.
+        Args:
+            rate: the turn rate of the sample, rad/s.
+            variance: the variance that the gyro declares, rad2/s2; 0 if it declares none.
+            dt: the time since the sample before, s.
         """
         if not self.known:
             return self._average(rate, variance, dt)
@@ -71,14 +78,15 @@ class Bias:
         gain = self.variance / (self.variance + noise)
         self.value += gain * error
         self.variance *= 1.0 - gain
-        # The part of the error that the bias explains is not noise.
+        # The part of the error by which the bias was corrected is not noise.
         self.noise += LEARNING * ((1.0 - gain) * error * error - self.noise)
         return True
 
     def _doubt(self, rate: float, variance: float, dt: float, noise: float) -> bool:
-        """Return whether a contradicting sample belongs to another bias instead of a turn.
+        """Return whether a contradicting sample shows that the bias has changed.
 
-        Another bias is one that stays constant. It then replaces this one.
+        The bias has changed if the contradicting samples are constant for `ANEW_S`. Otherwise the
+        robot turns.
         """
         other = self._other = self._other or Bias()
         if not other.rest(rate, variance, dt) or other._rested_s < ANEW_S:
@@ -90,7 +98,10 @@ class Bias:
         return True
 
     def _average(self, rate: float, variance: float, dt: float) -> bool:
-        """Update the mean of the first samples and their variance (Welford)."""
+        """Update the mean and the variance of the first samples by Welford's method.
+
+        Returns False if the sample shows a turn.
+        """
         if abs(rate) > MAX_BIAS:
             return False
         self._rested_s += dt

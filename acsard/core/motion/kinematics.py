@@ -1,14 +1,15 @@
-"""Converts between the body twist and the wheel speeds of a four-wheel differential-drive base.
+"""Converts between the twist and the wheel speeds of a four-wheel differential-drive base.
 
-Let v and w be the linear and angular velocity of base_link, r_l and r_r the wheel radii, and L the
-effective track: the wheel separation times its multiplier, because skidding wheels turn the robot
-as if they stood further apart.
+Let v be the linear velocity of base_link in m/s, w its angular velocity in rad/s, r_l and r_r the
+wheel radii of both sides, and L the effective track, all in m. L is the wheel separation times its
+multiplier: wheels that skid turn the robot as if they were further apart. left and right are the
+mean wheel speeds of the sides, rad/s.
 
     (1)  left = (front_left + rear_left) / 2      right = (front_right + rear_right) / 2
     (2)  v = (r_r right + r_l left) / 2
     (3)  w = (r_r right - r_l left) / L
 
-Solved for the wheels of a base that does both exactly:
+The wheel speeds of a given twist are
 
     front_left = rear_left = (v - w L / 2) / r_l    front_right = rear_right = (v + w L / 2) / r_r
 """
@@ -20,7 +21,7 @@ from acsard.core.values import Twist, WheelSpeeds
 
 
 class Kinematics:
-    """A converter between twist (m/s, rad/s, in base_link) and wheel speeds (rad/s)."""
+    """Converts between twists of base_link (m/s, rad/s) and wheel speeds (rad/s)."""
 
     def __init__(self, drive: DriveConfig) -> None:
         self.multipliers = (
@@ -35,7 +36,7 @@ class Kinematics:
 
     @property
     def radius(self) -> float:
-        """The mean radius of the two sides' wheels, m."""
+        """Mean of the wheel radii of both sides, m."""
         return (self._left_radius + self._right_radius) / 2
 
     def wheel_speeds(self, twist: Twist) -> WheelSpeeds:
@@ -51,10 +52,10 @@ class Kinematics:
         return Twist(linear, angular)
 
     def moved(self, wheels: tuple[float, float, float, float]) -> tuple[float, float]:
-        """Return the motion of the base, m and rad, for wheel angles in rad and `WHEELS` order.
+        """Return the distance (m) and the turn (rad) of the base for these wheel angles (rad).
 
-        With wheel speeds the result is per second. It equals `twist` without the objects, because
-        each line needs it several times.
+        `wheels` is in the order of `WHEELS`. For wheel speeds the result is a twist. The method is
+        faster than `twist`, because each feedback line needs it several times.
         """
         front_right, front_left, rear_left, rear_right = wheels
         left = self._left_radius * (front_left + rear_left) / 2
@@ -62,10 +63,10 @@ class Kinematics:
         return (right + left) / 2, (right - left) / self.track
 
     def opposite(self, left: float, right: float, turn: float) -> tuple[float, float]:
-        """Return the angle of each side's wheels by the other side and the base's `turn`, rad.
+        """Return the wheel angle that each side has if the other side and the turn are right, rad.
 
-        The first result is for the left side, given `right`, and the second for the right side,
-        given `left`. This is equation (3) solved for either side.
+        The first result is for the left side and follows from `right` and `turn`. The second is for
+        the right side and follows from `left` and `turn`. This is equation (3) for angles.
         """
         across = turn * self.track
         return (
@@ -76,7 +77,7 @@ class Kinematics:
     def saturate(self, twist: Twist, wheel_speed: float) -> Twist:
         """Return the twist, scaled down until no wheel exceeds `wheel_speed` rad/s.
 
-        Curvature is kept.
+        The curvature of the motion stays the same.
         """
         speeds = self.wheel_speeds(twist)
         fastest = max(abs(speeds.front_right), abs(speeds.front_left))

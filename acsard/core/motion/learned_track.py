@@ -1,9 +1,9 @@
-"""Chooses the effective track by which the wheels turn the robot: configured, or learned by a gyro.
+"""Chooses the effective track for turns that only the wheels measure: configured, or learned.
 
-While a gyro tells the heading, each turn shows how far the robot turns per turn of its wheels
-(`gyro_match.py`). When the wheels are alone again, this track is better than one that nobody
-measured on this floor. It is used if `[odometry] learned_track` asks for it, once it is known and
-if it lies within bounds. It affects only later turns, so the pose does not jump.
+While a gyro measures the heading, each turn shows the true effective track (`gyro_match.py`). When
+the gyro is silent, this learned track is better than the configured one, which may come from
+another floor. It is used if `[odometry] learned_track` is true, if it is certain enough, and if it
+is within bounds. It affects only later turns, so the pose does not jump.
 """
 
 from __future__ import annotations
@@ -13,21 +13,26 @@ from msgspec import Struct
 from acsard.core.values import Event, GyroStatus, Level, TrackUse
 
 LEAST = 0.05
-"""Least relative standard deviation, because the next floor and the next rate differ. It is half of
-`gyro_match.FINE`, the error of a single moment, because a way has many moments."""
+"""Smallest relative standard deviation, because the next floor and turn rate may differ.
+
+It is half of `gyro_match.FINE`, the error of a single moment, because a drive has many moments.
+"""
 
 CERTAIN, UNCERTAIN = 0.1, 0.2
-"""Relative standard deviations: the track is known below the first one, and no longer known above
-the second."""
+"""Relative standard deviations below which the track becomes known, and above which unknown."""
 
 BOUNDS = (0.5, 2.5)
-"""Range of the learned track as a share of the configured one. Robots skid by 1.4 to 1.9 on most
-floors, by 2.5 on slippery ones (with drive.wheel_separation alone). Beyond the range one of the two
-tracks is wrong."""
+"""Range of the learned track, divided by the configured one.
+
+The effective track is 1.4 to 1.9 times the wheel separation on most floors, and 2.5 times on
+slippery ones. Beyond the range, one of the two tracks must be wrong.
+"""
 
 INWARDS = 1.05
-"""Factor by which the track must lie inside the range before it is used. Without it the track would
-change with each turn at a bound."""
+"""Factor by which the track must be inside the range before it is used.
+
+Without it, a track near a bound could be used and not used in turn.
+"""
 
 NOTES: dict[TrackUse, str] = {
     "shown": "(only shown)",
@@ -38,12 +43,15 @@ NOTES: dict[TrackUse, str] = {
 
 
 class Track(Struct, frozen=True):
-    """An effective track as a share of the configured one."""
+    """An effective track."""
 
     share: float = 1.0
+    """The track divided by the configured one."""
     deviation: float = 0.0
-    """Standard deviation as a share of the track. It is 0 for the configured track, whose deviation
-    `[odometry]` declares."""
+    """Relative standard deviation.
+
+    It is 0 for the configured track, whose standard deviation is a setting of `[odometry]`.
+    """
 
 
 CONFIGURED = Track()
@@ -53,17 +61,17 @@ class LearnedTrack:
     """The decision between the configured and the learned track."""
 
     def __init__(self, multiplier: float) -> None:
-        """Start; `multiplier` is the configured track over the wheel separation."""
+        """Start. `multiplier` is the configured track divided by the wheel separation."""
         self._multiplier = multiplier
         self.use: TrackUse = "uncertain"
         """The present use of the learned track."""
         self.used = CONFIGURED
-        """The track by which the wheels turn the robot."""
+        """The track in use."""
         self.event: Event | None = None
-        """The event of the last `look`, if it changed the use."""
+        """The event of the last `look`, or None if it did not change the use."""
 
     def look(self, learned: Track | None) -> None:
-        """Take the track learned so far, None before the first one."""
+        """Choose the track. `learned` is the track learned so far, or None without one."""
         before, self.event = self.use, None
         self.use = _use(learned, before)
         self.used = learned if learned is not None and self.use == "used" else CONFIGURED
@@ -83,7 +91,7 @@ def _use(learned: Track | None, before: TrackUse) -> TrackUse:
 
 
 def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
-    """Return both multipliers in words, and which one is in use."""
+    """Return the learned and the configured multiplier in words, and which one is in use."""
     value = learned.share * multiplier
     configured = "" if use == "used" else " in use"
     return (
@@ -93,7 +101,10 @@ def beside(learned: Track, multiplier: float, use: TrackUse) -> str:
 
 
 def tracks(gyro: GyroStatus, multiplier: float) -> str:
-    """Return the tracks in words, "" if the gyro has taught none yet."""
+    """Return the same words for the state of the gyro, or "" if no track is learned yet.
+
+    `multiplier` is the configured track divided by the wheel separation.
+    """
     if gyro.track is None:
         return ""
     return beside(Track(gyro.track, gyro.track_deviation), multiplier, gyro.track_use)

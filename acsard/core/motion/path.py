@@ -1,8 +1,9 @@
-"""Integrates a chain of exact arcs, with sums that stay exact over millions of arcs.
+"""Adds arcs to a pose, without an error from rounding over millions of arcs.
 
-The chord of an arc of length d through dyaw is d sin(dyaw/2) / (dyaw/2) long and points along yaw +
-dyaw/2. The rounding error of each sum is kept with it and added to the next (Kahan, Further
-Remarks on Reducing Truncation Errors, 1965). A turn is 2 pi, not the double nearest to it.
+An arc of length d through the angle a, from a pose with the heading yaw, has a chord of length d
+sin(a / 2) / (a / 2) in the direction yaw + a / 2. The rounding error of each sum is kept and added
+to the next sum (Kahan, Further Remarks on Reducing Truncation Errors, 1965). A whole turn is 2 pi,
+and not the double nearest to it, so that many turns cause no error either.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ TAU_REST = 2.4492935982947064e-16
 
 
 class Path:
-    """The pose at the end of the arcs so far."""
+    """A path that consists of arcs, of which only the last pose is kept."""
 
     def __init__(self) -> None:
         self.set(Pose())
 
     def set(self, pose: Pose) -> None:
-        """Continue from `pose`."""
+        """Continue the path from `pose`."""
         self._x, self._x_rest = pose.x, 0.0
         self._y, self._y_rest = pose.y, 0.0
         self._yaw, self._yaw_rest = math.remainder(pose.yaw, math.tau), 0.0
@@ -30,9 +31,10 @@ class Path:
         """Pose of base_link in odom, yaw within [-pi, pi]."""
 
     def advance(self, distance: float, turn: float) -> tuple[float, float, float]:
-        """Advance by an arc of length `distance` m through `turn` rad.
+        """Add an arc of length `distance` m through `turn` rad.
 
-        Return its chord: m along x, m along y, and its direction in rad.
+        Returns:
+            The chord of the arc: its components along x and y, m, and its direction, rad.
         """
         half = turn / 2
         # sin(h)/h is accurate in doubles down to tiny h. Only h = 0 needs its limit.
@@ -46,7 +48,7 @@ class Path:
         return dx, dy, heading
 
     def turn(self, turn: float) -> None:
-        """Turn on the spot by `turn` rad."""
+        """Add a turn on the spot by `turn` rad."""
         self._turn(turn)
         self.pose = Pose(self._x, self._y, self._yaw)
 

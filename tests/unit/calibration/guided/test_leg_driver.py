@@ -162,7 +162,7 @@ def test_a_daemon_that_falls_silent_stops_it() -> None:
     world.speaks = False
     world.run(QUIET_S + 2 * TICK)
     assert world.said[-1] == REST
-    assert world.driver.halted == "nothing received from the daemon"
+    assert world.driver.halted == "nothing received from the daemon: does it run?"
 
 
 def test_a_calibration_that_was_not_let_run_stops_and_does_not_blame_the_daemon() -> None:
