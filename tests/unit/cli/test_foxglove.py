@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from acsard.cli import foxglove
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from tests.each import each
 
 
@@ -21,7 +21,7 @@ def test_without_its_library_it_says_which_extra_to_install(
     for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
-    with pytest.raises(ExitError, match=r"pip install .*\[foxglove\]'") as told:
+    with pytest.raises(MendableError, match=r"pip install .*\[foxglove\]'") as told:
         foxglove.main(argparse.Namespace())
     assert told.value.code == Exit.FAILURE
 

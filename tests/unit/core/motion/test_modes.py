@@ -11,7 +11,7 @@ from acsard.core.motion.modes import REFUSALS, Mode, RefusedError, mode_of, requ
 from acsard.core.values import Verb
 from tests.each import each
 
-FACTS = ("leaving", "fault", "stopped", "inactive", "linked", "commanded")
+FACTS = ("shutting_down", "fault", "stopped", "inactive", "linked", "commanded")
 
 ALL = [dict(zip(FACTS, values, strict=True)) for values in product((False, True), repeat=6)]
 
