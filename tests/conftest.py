@@ -52,11 +52,11 @@ LIVE = ("bench", "firmware", "system", "systemd")
 """Directories whose tests run real processes in real time. They run before the computed tests."""
 
 LOUD = (
-    "test_bad_commands.py", "test_bus.py", "test_daemon.py", "test_faults.py", "test_faults_bus.py",
-    "test_isolation.py", "test_page_lets_go.py", "test_period.py", "test_record_disks.py",
-    "test_strangers.py", "test_web_attacks.py", "test_web_lets_go.py",
+    "test_bad_commands.py", "test_board.py", "test_bus.py", "test_daemon.py", "test_faults.py",
+    "test_faults_bus.py", "test_isolation.py", "test_page_lets_go.py", "test_period.py",
+    "test_record_disks.py", "test_strangers.py", "test_web_attacks.py", "test_web_lets_go.py",
 )  # fmt: skip
-"""Live modules that load the machine on purpose, or that count missed periods.
+"""Live modules that load the machine, or that count missed periods.
 
 One worker runs all of them and `bench`, one after the other: they would disturb each other.
 """

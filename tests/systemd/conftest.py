@@ -21,6 +21,17 @@ from tests.systemd.container import (
 )
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give each test here the time in which a busy machine makes the container.
+
+    The first test makes it. If that took too long, all tests would fail with the first.
+    """
+    for item in items:
+        ours = item.path.is_relative_to(Path(__file__).parent)
+        if ours and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(600))
+
+
 @pytest.fixture(scope="session")
 def rootfs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A small Debian: kept where $ACSARD_TEST_ROOTFS says, else made and removed again."""
