@@ -5,7 +5,7 @@ No other module counts them. A connection goes through these states:
 1. silent: only a socket and a place in `Sockets`. TLS starts with the first byte, so a silent
    connection costs a file and no memory;
 2. waiting, if `HANDSHAKES` others are in the TLS handshake;
-3. starting: in the TLS handshake, for at most `HANDSHAKE_S`;
+3. starting: in the TLS handshake, for at most `HANDSHAKE_S`, or `HURRIED_S` if others wait;
 4. open: aiohttp reads its requests.
 
 If there is no room, `Sockets` names the connection that must go. The first request must arrive
@@ -20,6 +20,7 @@ import errno
 import resource
 import socket
 import ssl
+import traceback
 from asyncio import sslproto
 from collections import Counter
 from collections.abc import Callable
@@ -36,6 +37,10 @@ from acsard.web.limits import SOCKETS_HERE, Sockets, sockets_for
 
 HANDSHAKE_S, HANDSHAKES = 3.0, 32
 """Time limit for a TLS handshake, and maximum number of handshakes at once."""
+
+HURRIED_S = 0.3
+"""Time limit for a TLS handshake while others wait. A client that falls silent in its handshake
+must not keep a phone waiting for `HANDSHAKE_S`."""
 
 REQUEST_S = 10.0
 """Time limit from the accept to the head of the first request; the connection is cut after that."""
@@ -82,8 +87,9 @@ class Acceptor:
         self._away = Sockets["_Connection"](sockets_for(files))
         self._listeners: list[socket.socket] = []
         self._waiting: dict[_Connection, None] = {}
-        self._starting: Counter[str] = Counter()
-        """Number of TLS handshakes per network."""
+        self._starting: dict[_Connection, float] = {}
+        """The connections in the TLS handshake, with the time of its start, oldest first."""
+        self._hurry: asyncio.TimerHandle | None = None
 
     def listen(self, opened: socket.socket, secure: ssl.SSLContext | None, make: Factory) -> None:
         """Accept connections at a listening socket; `make` creates their protocol.
@@ -166,18 +172,33 @@ class Acceptor:
 
     def started(self, one: _Connection) -> None:
         """Note the end of a handshake, and start the next one."""
-        self._starting[one.network] -= 1
-        if not self._starting[one.network]:
-            del self._starting[one.network]
+        self._starting.pop(one, None)
         self._next()
 
     def _next(self) -> None:
-        while self._waiting and self._starting.total() < HANDSHAKES:
+        now = asyncio.get_running_loop().time()
+        while self._waiting and self._has_room(now):
             # A network with many slow handshakes must not delay those of the others.
-            one = min(self._waiting, key=lambda one: self._starting[one.network])
+            networks = Counter(one.network for one in self._starting)
+            one = min(self._waiting, key=lambda one: networks[one.network])
             del self._waiting[one]
-            self._starting[one.network] += 1
+            self._starting[one] = now
             one.start()
+
+    def _has_room(self, now: float) -> bool:
+        """Return whether a handshake may start, after the oldest one was cut if it is too slow."""
+        if len(self._starting) < HANDSHAKES:
+            return True
+        oldest, begun = next(iter(self._starting.items()))
+        if now < begun + HURRIED_S:
+            if self._hurry is not None:
+                self._hurry.cancel()
+            loop = asyncio.get_running_loop()
+            self._hurry = loop.call_at(begun + HURRIED_S, self._next)
+            return False
+        del self._starting[oldest]
+        self.slow(oldest)
+        return True
 
 
 class _Connection(asyncio.Protocol):
@@ -244,10 +265,12 @@ class _Connection(asyncio.Protocol):
                 ssl_handshake_timeout=HANDSHAKE_S if secure else None,
                 ssl_shutdown_timeout=CLOSE_S if secure else None,
             )
-        except ConnectionAbortedError:
-            self._acceptor.slow(self)
-        except OSError:
-            pass  # the client does not speak TLS, does not trust the certificate, or has gone
+        except OSError as error:
+            # The frames hold the error, and with it the memory of TLS until the next collection.
+            traceback.clear_frames(error.__traceback__)
+            if isinstance(error, ConnectionAbortedError):
+                self._acceptor.slow(self)  # `HANDSHAKE_S` is over
+            # Otherwise the client does not speak TLS, or does not trust the certificate.
         finally:
             if secure is not None:
                 self._acceptor.started(self)

@@ -24,7 +24,7 @@ SOCKETS_LEAST = 16
 """Connections from other machines that are accepted even if the limit of open files is very low."""
 
 OWN_FILES = 128
-"""Files of the process beside those of its connections: it has 30 open when nobody is connected. A
+"""Files of the process beside those of its connections: it has 20 open when nobody is connected. A
 report and a calibration need more for a while."""
 
 OVERRUNS = 600

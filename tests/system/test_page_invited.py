@@ -130,3 +130,27 @@ def test_who_comes_without_a_token_is_told_once_and_a_press_asks_again(stranger:
     browser.tap("again")
     stranger.shows("role", "viewer")
     assert browser.too_small() == []
+
+
+@pytest.mark.parametrize(("agrees", "role"), [(False, "operator"), (True, "viewer")])
+def test_a_link_with_fewer_permissions_is_used_only_after_a_question(
+    stranger: Stranger, agrees: bool, role: str
+) -> None:
+    browser, server = stranger.browser, stranger.server
+    stranger.opens(server.invite("operator", f"mine{agrees}"))
+    stranger.shows("role", "operator")
+    browser.open("about:blank")
+    question = "window.confirm = (text) => { window.asked = text; return AGREES; }"
+    added = browser.ask(
+        "Page.addScriptToEvaluateOnNewDocument",
+        source=question.replace("AGREES", str(agrees).lower()),
+    )
+    try:
+        stranger.opens(server.invite("viewer", f"lesser{agrees}"))
+        until(lambda: browser.js("window.asked"), 15.0, "it asks")
+        asked = browser.js("window.asked")
+        assert f"mine{agrees} (operator) here; the link makes it lesser{agrees} (viewer)" in asked
+        stranger.shows("role", role)
+        assert browser.js("location.hash") == ""
+    finally:
+        browser.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added["identifier"])

@@ -7,21 +7,23 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import socket
 import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
 from yarl import URL
 
-from acsard.web.acceptor import REQUEST_S
+from acsard.web.acceptor import REQUEST_S, UNREAD_S
 from acsard.web.app import BODY_S
 from acsard.web.limits import SOCKETS_OF_ONE
 from tests.system.browser import NAME, Hands, Page, hands, run
-from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, cpu_seconds, resident_kb
+from tests.system.harness import PATIENCE_S, Bus, Daemon, Periods, cpu_seconds, resident_kb, until
 
 pytestmark = pytest.mark.network
 
@@ -431,6 +433,30 @@ def test_who_takes_his_time_is_sent_away(table: Table, bus: Bus) -> None:
         answer = keeps.recv(4096)
     assert answer.startswith(b"HTTP/1.1 408"), answer
     assert time.monotonic() - begun < max(BODY_S, REQUEST_S) + PATIENCE_S
+
+
+def test_who_does_not_read_the_answers_is_disconnected_soon(table: Table, bus: Bus) -> None:
+    place = Path(f"/proc/{table.page.pid}/fd")
+    with socket.socket() as greedy:
+        greedy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        greedy.connect(("127.0.0.1", int(table.page.here.rpartition(":")[2])))
+        ours = f":{greedy.getsockname()[1]:04X} "
+
+        def held() -> bool:
+            """Return whether the server still has the connection."""
+            lines = Path("/proc/net/tcp").read_text().splitlines()
+            (inode,) = [line.split()[9] for line in lines if ours in line.split()[2] + " "] or ["0"]
+            with suppress(FileNotFoundError):  # the server closes another file meanwhile
+                return any(os.readlink(one) == f"socket:[{inode}]" for one in place.iterdir())
+            return True
+
+        greedy.setblocking(False)
+        with suppress(BlockingIOError):
+            for _ in range(100_000):
+                greedy.send(b"GET /page/main.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        until(held, PATIENCE_S, "it is accepted")
+        until(lambda: not held(), UNREAD_S + PATIENCE_S / 3, "it is disconnected")
+    assert "Traceback" not in table.page.stderr
 
 
 VIEWERS, A_SECOND, LASTS_S = 6, 190, 4.0

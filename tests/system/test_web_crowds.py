@@ -51,17 +51,23 @@ for n in range(int(count)):
         one.connect((host, int(port)))
         if kind == "tls":
             one = trusting.wrap_socket(one)
+        elif kind == "hello":
+            one.sendall(b"\\x16\\x03\\x01\\x02\\x00\\x01")
     except OSError:
         pass
     kept.append(one)
 print("opened", flush=True)
 time.sleep(600)
 """
-"""Opens connections from these addresses in turn, silent or with TLS, and keeps them idle."""
+"""Opens connections from these addresses in turn and keeps them idle.
+
+They are silent, or have TLS, or have sent the beginning of its first message.
+"""
 
 CROWDS: dict[str, tuple[str, int, Sequence[str]]] = {
     "2500 silent": ("silent", 2500, OLDER),
     "300 idle TLS of 5 addresses": ("tls", 300, OLDER),
+    "300 beginnings of TLS of 5 addresses": ("hello", 300, OLDER),
     "300 idle TLS of a /64": ("tls", 300, NEWER),
 }
 
