@@ -25,9 +25,6 @@ from acsard.daemon.serial.simulated_board import PtyEnd
 from acsard.host import clock
 from acsard.host.timerfd import TimerFd
 
-PRIORITY = 80
-"""Real-time priority: a microcontroller does not wait for its host."""
-
 
 class Part(msgspec.Struct, frozen=True):
     """Role of the far end."""
@@ -103,7 +100,8 @@ class FarEnd:
 def main(part: Part) -> None:
     """Run until standard input ends, then write the recorded data."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        # A microcontroller does not wait for its host.
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(80))
     except OSError:
         # Without real-time priority the times are only as good as the machine is idle.
         pass

@@ -38,7 +38,8 @@ from acsard.core.config.settings import (
 )
 from acsard.core.config.writing import document
 from acsard.core.messages.schema import RobotState
-from acsard.host.errors import Exit, ExitError
+from acsard.host import real_time
+from acsard.host.errors import MendableError
 
 
 def bench_config(config: Config, *, simulated: bool) -> Config:
@@ -85,7 +86,6 @@ def free_endpoint() -> str:
 
 
 def write(config: Config, where: Path) -> Path:
-    """Write the configuration to a file in the directory `where`."""
     file = where / "acsard.toml"
     file.write_text("\n".join(document(effective(config))) + "\n", encoding="utf-8")
     return file
@@ -112,9 +112,8 @@ def _own(state: RobotState) -> dict[str, Summary]:
     }
 
 
-def _nothing_seen(sent: int, state: RobotState) -> ExitError:
-    return ExitError(
-        Exit.FAILURE,
+def _nothing_seen(sent: int, state: RobotState) -> MendableError:
+    return MendableError(
         f"none of the {sent} commands arrived at the port's far end, so nothing was measured; "
         f"the daemon says: {state.reason}",
     )
@@ -124,8 +123,7 @@ def _result(
     config: Config, port: str, seconds: float, rig: Rig, shares: tuple[float, float]
 ) -> Result:
     state, pid = rig.state(), rig.process.pid
-    policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
-    realtime = policy in (os.SCHED_FIFO, os.SCHED_RR)
+    realtime = bool(real_time.has(pid))
     resident = resident_mb(pid)
     record = rig.end()
     read = [sample.at.wall_ns - sample.stamp_ns for sample in record.samples]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from rich.console import RenderableType
 
 from acsard import __version__
 from acsard.bench.matching import Summary
+from acsard.host import real_time
 from acsard.terminal.output import table
 
 POINTS = {
@@ -84,14 +84,13 @@ class Result(Struct, frozen=True, omit_defaults=False):
 
 
 def this_machine() -> Machine:
-    """Return the description of this machine."""
     return Machine(
         cpu=_cpu_model(),
         cores=len(os.sched_getaffinity(0)),
         kernel=platform.release(),
         python=platform.python_version(),
         acsard=__version__,
-        realtime_permitted=_realtime_permitted(),
+        realtime_permitted=real_time.allowed(),
     )
 
 
@@ -108,23 +107,6 @@ def _cpu_model() -> str:
         if name.strip() == "model name":
             return value.strip()
     return platform.machine()
-
-
-def _realtime_permitted() -> bool:
-    permitted = []
-
-    # A thread asks, because a granted priority ends with it.
-    def ask() -> None:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-            permitted.append(True)
-        except OSError:
-            pass
-
-    thread = threading.Thread(target=ask)
-    thread.start()
-    thread.join()
-    return bool(permitted)
 
 
 def parts(result: Result) -> Iterator[RenderableType]:

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -40,23 +41,18 @@ from acsard.daemon.bus.subscription import encoded
 from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from acsard.host.child import end, end_with_parent, environment, how_it_ended
-from acsard.host.errors import Exit, ExitError, NoAnswerError, UnreachableError
+from acsard.host.errors import Exit, ExitError, MendableError, NoAnswerError, UnreachableError
 
 END_S = 5.0
 """Time limit for the end of a process, s. It usually takes 0.2 s."""
 
 
-def end_with_us() -> None:
-    """End this child process if the benchmark is killed, so that no daemon remains."""
-    end_with_parent(signal.SIGTERM)
-
-
-def ended(who: str, code: int, said: str = "") -> ExitError:
+def ended(who: str, code: int, said: str = "") -> MendableError:
     """Return an error that describes the unexpected end of a process."""
-    return ExitError(Exit.FAILURE, f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
+    return MendableError(f"{who} {how_it_ended(code)}" + (f": {said}" if said else ""))
 
 
-def daemon_ended(code: int, log: Path) -> ExitError:
+def daemon_ended(code: int, log: Path) -> MendableError:
     """Return why the daemon ended by itself, with its own message and exit code if it gave them."""
     lines = log.read_text(errors="replace").splitlines()
     # The daemon's log lines are JSON; its reason for ending is plain text.
@@ -188,7 +184,8 @@ class Rig:
                 stderr=log,
                 env=env,
                 start_new_session=True,
-                preexec_fn=end_with_us,
+                # If the benchmark is killed, no daemon may remain.
+                preexec_fn=partial(end_with_parent, signal.SIGTERM),
             )
         stack.callback(end, self.process, END_S)
 
@@ -206,7 +203,7 @@ class Rig:
             if found is not None:
                 return found
             if clock.mono_ns() > deadline_ns:
-                raise ExitError(Exit.FAILURE, f"no {what} within {START_S:g} s{self._why()}")
+                raise MendableError(f"no {what} within {START_S:g} s{self._why()}")
             time.sleep(0.01)
 
     def _why(self) -> str:
@@ -295,7 +292,6 @@ class Rig:
         self._kept.undeclare()
 
     def state(self) -> RobotState:
-        """Return the daemon's `state`."""
         key = full_key(self._config.robot.id, "state")
         for reply in self._session.get(key, timeout=3.0) if self._session else ():
             if reply.ok is not None:
@@ -303,7 +299,6 @@ class Rig:
         raise NoAnswerError(f"no answer on {key}")
 
     def leave(self) -> None:
-        """End the program."""
         end(self.process, END_S)
 
     def end(self) -> Record:

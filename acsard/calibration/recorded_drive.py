@@ -9,7 +9,7 @@ from acsard.calibration.runs import runs
 from acsard.calibration.solve import Calibration, calibrate
 from acsard.calibration.tape_distance import Tape
 from acsard.core.config.settings import DriveConfig
-from acsard.host.errors import Exit, ExitError, RecordingError
+from acsard.host.errors import MendableError, RecordingError
 from acsard.recording.export import measured
 from acsard.recording.file import Recording
 from acsard.recording.mcap_records import MAGIC
@@ -18,21 +18,17 @@ from acsard.recording.mcap_records import MAGIC
 def calibrated(log: Path, drive: DriveConfig, tape: Tape | None) -> Calibration:
     """Return the calibration from a CSV file or a black-box recording.
 
-    Raises `LogError`, `RefusedError`, and `ExitError` for a file that cannot be read.
+    Raises `LogError`, `RefusedError`, and `MendableError` for a file that cannot be read.
     """
     if log.is_dir():
         raise LogError(f"it is a directory (perhaps a ROS bag): {AS_CSV}")
     try:
         # The whole log is read into memory.
         if log.stat().st_size > 1 << 30:
-            raise ExitError(
-                Exit.FAILURE, f"{log} is larger than 1 GiB: cut it; ten minutes are enough"
-            )
+            raise MendableError(f"{log} is larger than 1 GiB: cut it; ten minutes are enough")
         data = log.read_bytes()
     except OSError as error:
-        raise ExitError(
-            Exit.FAILURE, f"cannot read {log}: {error.strerror}; correct --log"
-        ) from None
+        raise MendableError(f"cannot read {log}: {error.strerror}; correct --log") from None
     if data.startswith(MAGIC):
         data = _measured(log)
     table = read(data)

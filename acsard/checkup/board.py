@@ -21,7 +21,7 @@ from acsard.checkup.restarts import RestartedError, Restarts
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import McuConfig, WheelMap
 from acsard.core.config.wire_time import line_bytes, wire_ns
-from acsard.core.link.check import ASK_SAMPLE, SEQUENCES, seal, unseal
+from acsard.core.link.checksum import ASK_SAMPLE, SEQUENCES, seal, unseal
 from acsard.core.link.codec import LETTERS, Codec, FrameError, Motors
 from acsard.core.link.lines import LineReader
 from acsard.core.link.link_diagnosis import Heard
@@ -369,7 +369,6 @@ class Board:
         raise StoppedError(found)
 
     def _flee(self) -> None:
-        """Send zeros once, and no more after them."""
         self.fled = True
         self.zeros()
 
@@ -416,5 +415,4 @@ class Board:
             self.ask(comma=comma)
 
     def _slows(self) -> bool:
-        """Return whether any motor slows down."""
         return min(motion.trend(self.replies, self.now_s, self.gap_s)) < motion.FALLS

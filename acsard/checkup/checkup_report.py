@@ -129,7 +129,6 @@ def report(
 
 
 def failed(findings: Sequence[Finding]) -> bool:
-    """Return whether any finding failed."""
     return any(finding.verdict == "FAIL" for finding in findings)
 
 

@@ -8,12 +8,8 @@ from acsard.checkup import outcomes
 from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.motion import GLANCE_S, SPEED, ZERO, moving
-from acsard.core.link.check import seal
+from acsard.core.link.checksum import seal
 from acsard.core.link.codec import LETTERS
-
-REPEATS = 3
-"""Number of times each damaged line is sent. A motor needs a moment to show that it obeyed."""
-
 
 WHOLE = {"over-long", "garbage before it"}
 """Kinds of damage that leave the four values intact.
@@ -74,7 +70,7 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
 
 def _moves(board: Board, line: bytes) -> bool:
     """Return whether a standing motor turns because of this line. It stands again afterwards."""
-    for _ in range(REPEATS):
+    for _ in range(3):  # a motor needs a moment to show that it obeyed
         board.wire.send(line)
         board.listen(max(GLANCE_S / 6, len(line) * 12 / board.baud_rate))
     shown = board.drive(ZERO, GLANCE_S + 2 * board.gap_s)

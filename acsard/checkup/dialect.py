@@ -17,20 +17,8 @@ from acsard.checkup.findings import Finding, StoppedError, motor_name
 from acsard.checkup.motion import BOOT_S, CUT_S, GLANCE_S, ZERO, Reply
 from acsard.core.config.settings import Baud
 from acsard.core.config.wire_time import COMFORTABLE_USE, highest_rate, line_bytes
-from acsard.core.link.check import seal
+from acsard.core.link.checksum import seal
 from acsard.core.link.session import IDENTITY
-
-OTHER_S = 0.6
-"""Time for which each other baud rate is tried, s."""
-
-ENOUGH = 3
-"""Number of good replies that prove a baud rate."""
-
-ASKED = 3
-"""Number of times that the identification is asked for. The question or its answer may be lost."""
-
-TRIES = 5
-"""Number of lines that are sent to see whether the board answers."""
 
 
 def baud(board: Board) -> Finding:
@@ -43,7 +31,7 @@ def baud(board: Board) -> Finding:
     heard = board.heard
     for rate in (rate for rate in reversed(get_args(Baud)) if rate != configured):
         board.open(rate)
-        if _knock(board, OTHER_S):
+        if _knock(board, 0.6):
             seen = {"rate": rate, "configured": configured, "heard": heard.counted}
             return outcomes.find("baud rate: other", {"mcu.baud_rate": rate}, **seen)
     board.open(configured)
@@ -52,14 +40,14 @@ def baud(board: Board) -> Finding:
 
 
 def _knock(board: Board, seconds: float) -> bool:
-    """Send zeros in both forms until enough good replies have arrived."""
+    """Send zeros in both forms until three good replies have arrived."""
     end_s = board.now_s + seconds
     while board.now_s < end_s:
         board.zeros()
         # Firmware that has accepted a checked line since it booted refuses plain ones.
         board.wire.send(seal(board.line(ZERO), 0))
         board.listen(max(GLANCE_S / 4, 5 * board.period_s))
-        if len(board.replies) >= ENOUGH:
+        if len(board.replies) >= 3:
             board.sealed = all(b"#" in reply.line for reply in board.replies)
             return True
     return False
@@ -71,7 +59,7 @@ def identity(board: Board) -> Finding:
     Ends the check if the answer is an echo of the question.
     """
     board.others.clear()
-    for _ in range(ASKED):
+    for _ in range(3):  # the question or its answer may be lost
         board.restarts.asked(board.now_s)
         board.wire.send(b"\r\n?\r\n")
         board.listen(1.5 * GLANCE_S)
@@ -102,7 +90,7 @@ def form(board: Board) -> Finding | None:
 
 
 def _answers(board: Board, comma: bool) -> list[Reply]:
-    return [reply for _, reply in board.answers(TRIES, GLANCE_S / 6, comma)]
+    return [reply for _, reply in board.answers(5, GLANCE_S / 6, comma)]
 
 
 def comma(board: Board, dead: bool) -> Finding:
@@ -164,21 +152,6 @@ def check(board: Board) -> Finding:
     return outcomes.find(f"checked link: {outcome}", {"mcu.link_check": use}, figure=figure)
 
 
-ENOUGH_FOR_RATE = 10
-"""Number of replies that is enough for a rate."""
-
-ANSWERED = 0.8
-"""Fraction of answered lines below which lines are lost or remain unanswered."""
-
-SLOW_S = 0.008
-"""Round trip in addition to the lines' time on the wire that delays the control loop, s.
-
-An MCU usually takes 1 to 5 ms.
-"""
-
-TRIPS = 10
-
-
 def rate(board: Board) -> Finding:
     """Measure how often the board answers at the host's rate, and whether it reports unasked."""
     board.paced = True
@@ -189,7 +162,7 @@ def rate(board: Board) -> Finding:
     highest_hz = highest_rate(board.baud_rate, line_bytes(board.comma), COMFORTABLE_USE)
     period_s, before = 1 / min(board.rate_hz, highest_hz), board.sent_lines
     got = board.drive(ZERO, 0.5, period_s)
-    if len(got) < ENOUGH_FOR_RATE:
+    if len(got) < 10:
         got += board.drive(ZERO, 1.0, period_s)
     if len(got) < 2:
         return outcomes.find("reply rate: none")
@@ -198,7 +171,7 @@ def rate(board: Board) -> Finding:
     configured, answered = board.mcu.reply_period, len(got) / (board.sent_lines - before)
     unset_s = max(0.1, 4 * period_s)  # the silence that the host allows by default
     quiet_s = max(unset_s, 3 * configured)
-    slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < ANSWERED
+    slow, lossy = 3 * gap_s > 1.1 * quiet_s, not board.own_clock and answered < 0.8
     most_s = board.longest_reply_s
     rare, period = slow and gap_s > most_s, min(float(f"{gap_s:.1g}"), most_s)
     keys: dict[str, object] = {"mcu.reply_period": period if slow else configured}
@@ -223,9 +196,10 @@ def trip(board: Board) -> Finding:
         return lateness.finding("round trip", board.lateness.since(0.0))
     if board.own_clock:
         return outcomes.find("round trip: own clock")
-    trips = [trip_s for trip_s, _ in board.answers(TRIPS, GLANCE_S)]
+    trips = [trip_s for trip_s, _ in board.answers(10, GLANCE_S)]
     if not trips:
         return outcomes.find("round trip: none")
     middle_s, longest_s = median(trips), max(trips)
-    pace = "slow" if middle_s > SLOW_S + 2 * board.line_s else "right"
+    # An MCU usually takes 1 to 5 ms; beyond 8 ms it delays the control loop.
+    pace = "slow" if middle_s > 0.008 + 2 * board.line_s else "right"
     return outcomes.find(f"round trip: {pace}", middle=middle_s * 1000, longest=longest_s * 1000)

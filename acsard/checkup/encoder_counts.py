@@ -10,12 +10,6 @@ from acsard.checkup.board import Board
 from acsard.checkup.findings import Finding
 from acsard.checkup.motion import GLANCE_S, Reply, steps
 
-LEAST_ANGLE = 2.0
-"""Smallest angle for a measurement of the counts, rad.
-
-Below it, the speeds' own rounding spoils the result.
-"""
-
 AGREES = 0.02
 """Fraction by which the measured counts may differ from the stated ones."""
 
@@ -35,7 +29,8 @@ def per_turn(replies: Sequence[Reply], motors: Sequence[int]) -> float | None:
             if step.counts and abs(speed) >= 1.0:
                 counts += math.copysign(1.0, speed) * step.counts[motor]
                 angle += abs(speed) * step.mcu_s
-    return counts / angle * math.tau if angle >= LEAST_ANGLE else None
+    # Below 2 rad, the speeds' own rounding spoils the result.
+    return counts / angle * math.tau if angle >= 2.0 else None
 
 
 def finding(board: Board, motors: Sequence[int]) -> Finding:

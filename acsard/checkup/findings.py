@@ -64,5 +64,4 @@ def motor_name(mcu: McuConfig, motor: int) -> str:
 
 
 def motor_names(mcu: McuConfig, motors: Sequence[int], joint: str = " and ") -> str:
-    """Return the names of several motors."""
     return joint.join(motor_name(mcu, motor) for motor in motors)

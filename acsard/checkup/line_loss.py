@@ -34,9 +34,6 @@ LINES, LEAST_S, MOST_S = 300, 3.0, 10.0
 The count ends early if no line is lost, and takes longer on a slow wire.
 """
 
-OWN_PACE = 1.5
-"""Gap between answers, in periods, above which the board answers at its own, slower pace."""
-
 SILENT = 2.0
 """Multiple of the usual gap above which a gap between two answers counts as a silence."""
 
@@ -100,7 +97,7 @@ def _period_s(board: Board) -> float:
     """Return the host's period, or a longer one if the board answers less often."""
     longest = line_bytes(board.comma, board.sealed, board.sampled)
     period_s = 1 / min(board.rate_hz, highest_rate(board.baud_rate, longest, COMFORTABLE_USE))
-    if not board.own_clock and board.gap_s > OWN_PACE * period_s:
+    if not board.own_clock and board.gap_s > 1.5 * period_s:
         return 1.25 * board.gap_s
     return period_s
 
@@ -146,12 +143,6 @@ It is long enough to see and shorter than the watchdog.
 TOLD, PULSES_S = 8, 20.0
 """Number of unanswered pulses that shows the direction, and longest time to wait for them, s."""
 
-OWN_CLOCK_S = 10.0
-"""Duration for a board that reports by its own clock, s.
-
-Such a board answers no line, so nothing has shown yet whether any line is lost.
-"""
-
 SPREAD, STRIDE = 12, 5
 """Number of different pauses between pulses, and the stride by which they are ordered.
 
@@ -163,9 +154,6 @@ OBEYED = 0.5
 
 SEEN, GRAINS = 0.02, 4
 """Smallest usable angle of a pulse, in rad and in smallest steps of the encoders."""
-
-WHOLE = 1.5
-"""Multiple of the usual gap between a board's own reports above which one is missing."""
 
 
 class Ways(Struct, frozen=True):
@@ -202,7 +190,8 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
     Returns None if the motors are too slow or too coarse to tell.
     """
     on = motion.each(lambda motor: motion.SPEED if motor in motors else 0.0)
-    end_s = board.now_s + (OWN_CLOCK_S if board.own_clock else PULSES_S)
+    # A board that reports by its own clock answers no line, so nothing has shown any loss yet.
+    end_s = board.now_s + (10.0 if board.own_clock else PULSES_S)
     every: list[float] = []
     unanswered: list[float] = []
     count = 0
@@ -235,7 +224,7 @@ def pulsed(board: Board, motors: Sequence[int]) -> Ways | None:
 def _whole(board: Board, since_s: float) -> bool:
     """Return whether none of the board's own reports since then is missing."""
     times = [reply.at_s for reply in motion.since(board.replies, since_s - board.gap_s)]
-    return all(after - before < WHOLE * board.gap_s for before, after in pairwise(times))
+    return all(after - before < 1.5 * board.gap_s for before, after in pairwise(times))
 
 
 def _grain(board: Board, motors: Sequence[int]) -> float:

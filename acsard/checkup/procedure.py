@@ -128,7 +128,6 @@ class _Steps:
         self._late_left = LATE_MOST
 
     def all(self) -> None:
-        """Run all steps."""
         board, operator = self._board, self._operator
         for doing, step in SILENT:
             self._measure(doing, partial(step, board))

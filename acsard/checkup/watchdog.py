@@ -26,20 +26,8 @@ from acsard.checkup.wheels import run_up
 from acsard.core.config.wire_time import FIELD
 from acsard.core.link.codec import LETTERS, Motors
 
-FED = 0.75
-"""Fraction of the travel at full speed from which on damaged lines feed the watchdog.
-
-With a correct watchdog, the motors travel less in the same time.
-"""
-
 FEEDING = ("a wrong letter", "neither p nor n", "cut short")
 """Kinds of damaged lines that may feed a watchdog."""
-
-FINE_S = 0.03
-"""Resolution of the search by asking, s."""
-
-MOST_ASKED = 8
-"""Largest number of questions. Each one halves the interval, unless the host pauses."""
 
 TURNING, STOPPED = 0.9, 0.1
 """Fractions of full speed.
@@ -91,8 +79,8 @@ def finding(board: Board, motors: Sequence[int]) -> Finding:
     lines = damage.broken_lines(board.comma, board.sealed, motors)
     broken = cycle(line for what, line in lines if what in FEEDING)
     fed = run(board, motors, max(motion.CUT_S, 2 * most_s) + stop.slow_s, broken)
-    if fed.ran_s >= FED * fed.silent_s:
-        # A watchdog that was not fed had cut them by then.
+    if fed.ran_s >= 0.75 * fed.silent_s:
+        # A watchdog that was not fed had cut them by then, so that they travel less.
         beyond_s = fed.ran_s - stop.ran_s - most_s
         return outcomes.find("watchdog: fed", figure=judged.figure, margin_s=beyond_s)
     return judged
@@ -138,8 +126,8 @@ def measured(board: Board, motors: Sequence[int], stop: Run) -> Between:
 def _asked(board: Board, motors: Sequence[int], stop: Run, between: Between) -> Between:
     """Narrow the bounds between a silence that the motors turn through and one that they do not."""
     least_s, most_s = between
-    for _ in range(MOST_ASKED):
-        if most_s - least_s <= max(FINE_S, 0.1 * most_s):
+    for _ in range(8):  # each question halves the interval, unless this computer pauses
+        if most_s - least_s <= max(0.03, 0.1 * most_s):
             break
         answer = run(board, motors, (least_s + most_s) / 2)
         if answer.first >= TURNING or answer.second >= STOPPED:

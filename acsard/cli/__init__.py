@@ -1,8 +1,9 @@
 """The command line: one module per verb. Its docstring is the text of its `--help`.
 
-Each module has `add`, which declares the options, and `main`, which calls one room and prints. Only
-the module of the verb that is called is imported, so the modules import at their top all that the
-verb needs. Libraries that may be missing are the exception.
+Each module has `add_options`, and `main`, which calls one room and prints. A verb with actions sets
+the `main` of each action instead. Only the module of the verb that is called is imported, so the
+modules import at their top all that the verb needs. Libraries that may be missing are the
+exception.
 """
 
 from __future__ import annotations
@@ -97,7 +98,8 @@ def parser(called: Collection[str] = VERBS) -> argparse.ArgumentParser:
         if name in called:
             module = import_module(f"acsard.cli.{name}")
             verb.description = module.__doc__
-            module.add(verb)
+            verb.set_defaults(main=getattr(module, "main", None))
+            module.add_options(verb)
     return whole
 
 

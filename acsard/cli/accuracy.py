@@ -24,8 +24,7 @@ from acsard.host.errors import Exit, NoAnswerError, NotPermittedError
 from acsard.terminal.output import SENTENCES, show
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seconds",
         type=seconds,
@@ -41,11 +40,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object a line")
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Follow the robot and print its error budget."""
     with connected(args) as robot, suppress(KeyboardInterrupt):
         for found in budgets(robot, _config(robot, args.config), args.seconds):
             _print(found, args.json)

@@ -32,8 +32,7 @@ from acsard.daemon.serial.device import require
 from acsard.terminal.output import show
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     add_config(parser)
     parser.add_argument(
@@ -53,11 +52,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--rate", type=float, metavar="HZ", help="control rate (default: as configured)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the measurement and print its figures."""
     port = "" if args.port in (None, "sim") else args.port
     if port:
         require(port)

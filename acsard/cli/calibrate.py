@@ -27,11 +27,11 @@ from acsard.calibration.log_table import LogError
 from acsard.calibration.plausibility import RefusedError
 from acsard.calibration.recorded_drive import calibrated
 from acsard.calibration.tape_distance import Tape
-from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_options, differing, guided
+from acsard.cli.calibrate_drive import DRIVE_OPTIONS, add_drive_options, differing, guided
 from acsard.cli.common import add_outcome, load, require_asking
 from acsard.cli.connection import add_bus
 from acsard.host.config_file import change, writable
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.terminal.json_prompt import JsonPrompt
 from acsard.terminal.output import SENTENCES, plain, show
 from acsard.terminal.prompt import NobodyError
@@ -40,10 +40,9 @@ DRIVEN = "the drive"
 """The name of a guided drive in messages and reports, where a log has its file name."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
-    add_options(parser)
+    add_drive_options(parser)
     parser.add_argument(
         "--log",
         type=Path,
@@ -59,11 +58,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         "the straightest run",
     )
     add_outcome(parser, "the result")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the calibration and print its result."""
     if not args.json_lines or args.log:
         return _calibrate(args, None)
     require_asking(args)
@@ -72,21 +69,22 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
+    _require_fitting(args)
     where, mine = load(args.config)
     if args.write:
         writable(args.config)
     source = str(args.log) if args.log else DRIVEN
     try:
         if args.log:
-            found, config = calibrated(_only_log(args), mine.drive, args.distance), mine
+            found, config = calibrated(args.log, mine.drive, args.distance), mine
         else:
-            found, config = guided(_no_log(args), mine, where, lines)
+            found, config = guided(args, mine, where, lines)
     except (LogError, RefusedError, GuideError, NobodyError) as error:
         notes = tuple(getattr(error, "__notes__", ()))
         if args.json:
             print(msgspec.json.encode(Refusal(source, str(error), notes)).decode(), flush=True)
         behind = "".join(f"\nnote: {note}" for note in notes)
-        raise ExitError(Exit.FAILURE, f"{source}: {error}{behind}") from None
+        raise MendableError(f"{source}: {error}{behind}") from None
     if args.write:
         change(Path(where), keys(found))
     told = report(source, found, config.drive, where if args.write else "")
@@ -105,27 +103,18 @@ def _calibrate(args: argparse.Namespace, lines: JsonPrompt | None) -> int:
     return int(Exit.OK)
 
 
-def _only_log(args: argparse.Namespace) -> Path:
-    """Return the log's path.
-
-    Raises `UsageError` if an option was given that only a guided drive takes.
-    """
-    for name in DRIVE_OPTIONS:
+def _require_fitting(args: argparse.Namespace) -> None:
+    """Raise `UsageError` for an option that does not fit a recorded drive, or a guided one."""
+    if not args.log and args.distance:
+        raise UsageError(
+            "--distance goes with --log: a guided drive asks for the distances that it needs"
+        )
+    for name in DRIVE_OPTIONS if args.log else ():
         if getattr(args, name):
             option = "--" + name.replace("_", "-")
             raise UsageError(
                 f"{option} is for a guided drive and --log for a recorded one: leave one out"
             )
-    log: Path = args.log
-    return log
-
-
-def _no_log(args: argparse.Namespace) -> argparse.Namespace:
-    if args.distance:
-        raise UsageError(
-            "--distance goes with --log: a guided drive asks for the distances that it needs"
-        )
-    return args
 
 
 def _distance(text: str) -> Tape:

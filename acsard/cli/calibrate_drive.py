@@ -33,7 +33,7 @@ IMU = "imu"
 """The gyro's key if the command line names none."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def add_drive_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that only a guided drive takes."""
     parser.add_argument(
         "--method",

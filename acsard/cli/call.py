@@ -26,8 +26,7 @@ CALLED = tuple(service for service in SERVICES if service != "set")
 """
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "service",
         # Accept `srv/stop` too, as `state` and the key table write it.
@@ -41,11 +40,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print the answer as JSON")
     add_bus(parser, MANY + " (stop only)")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Call the service and print its answer."""
     wanted = ("x", "y", "yaw") if args.service == "set_pose" else ()
     if len(args.values) != len(wanted):
         form = " ".join(["acsard call", args.service, *(name.upper() for name in wanted)])

@@ -15,15 +15,12 @@ from acsard.core.config.parsing import effective
 from acsard.core.config.writing import document
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON instead of TOML")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Check the configuration and print it."""
     where, config = load(args.config)
     plain = effective(config)
     if args.json:

@@ -110,7 +110,7 @@ def load(path: str | None, options: Mapping[str, object] | None = None) -> tuple
     """Return the path of the configuration and the configuration itself.
 
     `options` are values by dotted key, such as "mcu.port"; None leaves a key as it is. Prints every
-    problem in the configuration and raises `ExitError` if there are any.
+    problem in the configuration and raises `MendableError` if there are any.
     """
     where, text = find(path)
     given = tables(options or {}, by_environment())

@@ -48,16 +48,13 @@ _acsard_recordings() {{
 """Completion of a recording for each shell, in the form that shtab expects."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     places = "; ".join(f"{shell}: {place}" for shell, place in SHELLS.items())
     parser.epilog = f"Where the shells look for it: {places}."
     parser.add_argument("shell", choices=tuple(SHELLS), metavar="SHELL", help=", ".join(SHELLS))
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the completion script of a shell."""
     try:
         import shtab
     except ImportError:

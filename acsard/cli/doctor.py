@@ -23,11 +23,9 @@ MARKS = {"ok": ("ok  ", "green"), "warning": ("warn", "yellow"), "failure": ("FA
 """The word and the colour of each level of a finding."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_bus(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from acsard.cli.connection import add_bus, connected
+from acsard.cli.connection import add_bus, connected, require_one
 from acsard.core.messages.permissions import COMMAND_ROLE, has
 from acsard.host.errors import NoAnswerError, NotPermittedError, UsageError
 from acsard.terminal.output import has_screen
@@ -16,8 +16,7 @@ from acsard.top.keyboard import Keyboard, Ride
 from acsard.top.teleop import HELP
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "\n".join(HELP)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     for name, speed, unit in (("--linear", 0.5, "M/S"), ("--angular", 1.0, "RAD/S")):
@@ -32,11 +31,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--source", default="teleop", help="command source to send as (default: teleop)"
     )
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Drive until Ctrl-C."""
+    require_one(args)
     if not sys.stdin.isatty():
         raise UsageError(
             "drive reads single keys and needs a terminal; a program uses acsard.client"

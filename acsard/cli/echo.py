@@ -19,7 +19,7 @@ import zenoh
 from acsard.calibration.log_table import HEADER, KEYS, row
 from acsard.cli.common import count
 from acsard.cli.connection import MANY, add_bus, connected, connected_to_many, require_followed
-from acsard.cli.waiting import explained, lost_by, nothing, waits_for
+from acsard.cli.waiting import silence_explained
 from acsard.client import Client
 from acsard.client.synchronous import decoder
 from acsard.core import formatting
@@ -33,8 +33,7 @@ from acsard.host import clock
 from acsard.host.errors import Exit, NoAnswerError, UsageError
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "topic", nargs="+", help="for example odom, state, wheel_states, cmd/teleop"
     )
@@ -57,11 +56,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="end with exit code 1 if no message comes for S seconds",
     )
     add_bus(parser, MANY)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print messages until Ctrl-C, a count or a timeout ends it."""
     topic = args.topic[0]
     if args.csv:
         if named(args.id or ""):
@@ -69,10 +66,7 @@ def main(args: argparse.Namespace) -> int:
         for key in args.topic:
             if key not in KEYS:
                 raise UsageError(f"{key} cannot be in a log; --csv takes {', '.join(KEYS)}")
-        with (
-            connected(args) as robot,
-            explained(waits_for(robot, topic), lost_by(robot)) as heard,
-        ):
+        with connected(args) as robot, silence_explained(robot, topic) as heard:
             return _record(robot, args.topic, args.n, args.timeout, heard)
     if len(args.topic) > 1:
         raise UsageError("several keys need --csv, which puts them into one file")
@@ -80,15 +74,15 @@ def main(args: argparse.Namespace) -> int:
     require_followed(topic)
     with connected_to_many(args) as (robot, many):
         samples = robot.samples(topic, args.timeout)
-        look = waits_for(robot, topic)
+        unexplained = topic
         if many:
             samples = follow(robot.session, many, topic).until_silence(args.timeout)
             _say_who(robot, many)
-            look = nothing
+            unexplained = ""
         elif robot.where.tls and (why := robot.whoami().silence):
             print(f"acsard: {why}. Waiting.", file=sys.stderr)
-            look = nothing  # the reason for the silence has just been printed
-        with explained(look, lost_by(robot)) as heard:
+            unexplained = ""  # the reason for the silence has just been printed
+        with silence_explained(robot, unexplained) as heard:
             return _print(samples, short_form, args.n, bool(many), heard)
 
 

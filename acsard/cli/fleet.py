@@ -11,22 +11,19 @@ import sys
 
 from acsard.cli.connection import MANY, add_bus, connected_to_many
 from acsard.daemon.bus.robot_discovery import ALL
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import Exit, UnreachableError
 from acsard.terminal.output import has_screen
 from acsard.top import terminal
 from acsard.top.fleet import Fleet
 from acsard.top.roster import table
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="print one table and end")
     add_bus(parser, MANY + " (the default)")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show the robots until the operator leaves, or print one table."""
     with connected_to_many(args) as (robot, many):
         ids = (many or (robot.where.robot_id,)) if args.id else (ALL,)
         fleet = Fleet(robot, ids)
@@ -38,10 +35,10 @@ def main(args: argparse.Namespace) -> int:
             # Over TLS our certificate may not be permitted to see any of the named robots.
             named = robot.where.tls and ids != (ALL,)
             silence = robot.like(ids[0]).whoami().silence if named else ""
-            raise ExitError(Exit.UNREACHABLE, "; ".join(filter(None, (fleet.hint(), silence))))
-    width = shutil.get_terminal_size((160, 24)).columns
-    # Flush now: nothing that delays our exit may hold back the table.
-    print("\n".join(table(rows, width)), flush=True)
+            raise UnreachableError("; ".join(filter(None, (fleet.hint(), silence))))
+        width = shutil.get_terminal_size((160, 24)).columns
+        # Flush now: nothing that delays the end of the session may hold back the table.
+        print("\n".join(table(rows, width)), flush=True)
     for told in filter(None, (fleet.seen, fleet.more)):
         print(f"acsard: {told}", file=sys.stderr)
     return int(Exit.OK)

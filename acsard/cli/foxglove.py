@@ -20,8 +20,7 @@ DEFAULT = "127.0.0.1:8765"
 """The address that Foxglove and Lichtblick try by default."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--address",
         default=DEFAULT,
@@ -35,11 +34,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         "is open in a browser on this machine can send them",
     )
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Serve Foxglove until a signal ends it."""
     try:
         from acsard.foxglove.bridge import Bridge
     except ImportError:

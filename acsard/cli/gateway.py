@@ -18,8 +18,7 @@ from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument("--id", metavar="ID", help="the robot's id on the bus")
     parser.add_argument("--namespace", metavar="NAME", help="the robot's ROS namespace")
@@ -28,11 +27,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="end when standard input closes; `acsard run` uses this",
     )
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the gateway until a signal ends it or until it must be restarted."""
     given = {"robot.id": args.id or None, "ros.namespace": args.namespace}
     where, config = load(args.config, given)
     if not config.bus.outside:

@@ -19,15 +19,12 @@ from acsard.daemon.bus.robot_discovery import present
 from acsard.host.errors import Exit
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("key", help="for example info, config, schema/Twist, state")
     add_bus(parser, MANY)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Query the key and print its answer, or one answer per robot."""
     require_asked(args.key)
     with connected_to_many(args) as (robot, many):
         if not many:

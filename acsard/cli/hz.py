@@ -14,27 +14,21 @@ import zenoh
 
 from acsard.cli.common import count
 from acsard.cli.connection import add_bus, connected, require_followed
-from acsard.cli.waiting import explained, lost_by, waits_for
+from acsard.cli.waiting import silence_explained
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("topic", help="for example odom")
     parser.add_argument("-n", type=count, metavar="N", help="end after N lines")
     parser.add_argument("--json", action="store_true", help="print JSON lines")
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print a line every second until Ctrl-C or until `-n` lines."""
     require_followed(args.topic)
     times: deque[float] = deque(maxlen=10_000)
     left = args.n
-    with (
-        connected(args) as robot,
-        explained(waits_for(robot, args.topic), lost_by(robot)) as heard,
-    ):
+    with connected(args) as robot, silence_explained(robot, args.topic) as heard:
 
         def take(_: zenoh.Sample) -> None:
             times.append(time.monotonic())

@@ -11,13 +11,11 @@ from acsard.cli import parser
 from acsard.host.extras import missing
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.set_defaults(main=main)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare none."""
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the man page."""
     try:
         from argparse_manpage.manpage import Manpage
     except ImportError:

@@ -41,8 +41,7 @@ to judge a test; in that case try again when the computer is idle.
 """
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the action and its options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     check = actions.add_parser(
         "check",
@@ -66,11 +65,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="with --yes: confirm that no wheel touches anything and that you watch the robot",
     )
     add_outcome(check, "the found lines, and --port,")
-    check.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the check and print its result."""
     given = {"mcu.port": args.port, "mcu.baud_rate": args.baud_rate}
     where, config = load(args.config, given)
     if args.write:
@@ -122,7 +119,7 @@ def _checked(args: argparse.Namespace, config: Config, where: str, prompt: Promp
 def _prompt(args: argparse.Namespace, port: str) -> TerminalPrompt | NoPrompt | JsonPrompt:
     """Return the prompt for these options.
 
-    Raises `ExitError` unless a person can answer, or nothing real can move.
+    Raises `UsageError` unless a person can answer, or nothing real can move.
     """
     if port == SIMULATOR and args.port != SIMULATOR:
         raise UsageError(

@@ -13,14 +13,11 @@ import msgspec
 from acsard.machine.serial_ports import serial_devices
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """List the ports."""
     found = serial_devices()
     if args.json:
         print(msgspec.json.encode(found).decode())

@@ -17,7 +17,7 @@ from acsard.cli.common import load
 from acsard.cli.recording_files import progress
 from acsard.core.formatting import json_line, many, printable
 from acsard.core.ros.shapes import how_often
-from acsard.host.errors import Exit, ExitError, RecordingError
+from acsard.host.errors import Exit, ExitError, MendableError, RecordingError
 from acsard.recording.atomic_output import replacing
 from acsard.recording.directory import listed
 from acsard.recording.end_record import EndRecord, how_it_ends, read_end
@@ -38,10 +38,8 @@ SERVICE = Path("/var/lib/acsard/record")
 """The directory in which the service records."""
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     _directory(parser, None)
-    parser.set_defaults(main=main)
     actions = parser.add_subparsers(title="verbs", metavar="VERB")
     shown = actions.add_parser(
         "show",
@@ -115,7 +113,6 @@ def _directory(parser: argparse.ArgumentParser, default: object) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print a line for each recording."""
     where, files = _files(args)
     if not files:
         print(f"no recordings in {where}")
@@ -148,7 +145,6 @@ def _bracketed(text: str) -> str:
 
 
 def main_show(args: argparse.Namespace) -> int:
-    """Print the timeline of a recording."""
     recording = _recording(args)
     begin, end = span(recording, args.begin, args.end)
     story, last = TimelineWriter(), recording.about.wall_ns / 1e9
@@ -203,19 +199,17 @@ def main_replay(args: argparse.Namespace) -> int:
 
 
 def main_recover(args: argparse.Namespace) -> int:
-    """Rewrite an unfinished or damaged recording as a finished file."""
     recording, new = _recording(args), Path(args.new)
     try:
         with replacing(new, args.force) as part:
             count = rewrite(recording, part)
     except OSError as error:
-        raise ExitError(Exit.FAILURE, f"cannot write {new}: {error.strerror}") from None
+        raise MendableError(f"cannot write {new}: {error.strerror}") from None
     print(f"{many(count, 'message')} in {new}{_bracketed(recording.missing)}")
     return int(Exit.OK)
 
 
 def main_export(args: argparse.Namespace) -> int:
-    """Export a recording for other programs."""
     recording = _recording(args)
     trouble = recording_files.export(recording, args)
     _note(recording, trouble or _bracketed(recording.missing))
@@ -223,7 +217,6 @@ def main_export(args: argparse.Namespace) -> int:
 
 
 def main_report(args: argparse.Namespace) -> int:
-    """Draw a recording as an HTML file."""
     plotly = recording_files.library()
     recording = _recording(args)
     for note in recording_files.report(recording, args, plotly):
@@ -236,8 +229,7 @@ def _files(args: argparse.Namespace) -> tuple[Path, list[Path]]:
     try:
         return where, listed(where)
     except FileNotFoundError:
-        raise ExitError(
-            Exit.FAILURE,
+        raise MendableError(
             f"nothing is recorded in {where}: the directory does not exist. The service records "
             "by itself; `acsard run --record DIRECTORY` records where you say. --directory "
             "reads another directory",
@@ -259,7 +251,7 @@ def _recording(args: argparse.Namespace) -> Recording:
         files = [path for path in files if int(path.name.partition("-")[0]) == int(name)]
     if not files:
         which = "recording" if name is None else f"recording {name}"
-        raise ExitError(Exit.FAILURE, f"no {which} in {where}; `acsard recording` lists them")
+        raise MendableError(f"no {which} in {where}; `acsard recording` lists them")
     return Recording(files[-1])
 
 

@@ -66,7 +66,6 @@ def _written(new: Path) -> Iterator[None]:
 
 
 def add_export(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `acsard recording export`."""
     parser.add_argument(
         "new",
         nargs="?",
@@ -106,7 +105,6 @@ def export(recording: Recording, args: argparse.Namespace) -> str:
 
 
 def add_report(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of `acsard recording report`."""
     parser.add_argument(
         "new",
         nargs="?",
@@ -117,7 +115,7 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 
 
 def library() -> str:
-    """Return plotly's script; raise `ExitError` with the command that installs it."""
+    """Return plotly's script; raise `MendableError` with the command that installs it."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:

@@ -21,15 +21,13 @@ from acsard.host.logs import Log
 from acsard.host.systemd import Systemd
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "file", type=Path, metavar="FILE", help="Zenoh's configuration file (JSON5)"
     )
     # The verb starts itself with this option: the child is the router and ends with its standard
     # input.
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:

@@ -36,8 +36,7 @@ acsard {version}, robot {robot}
 _PAGE = "  page    {where}, for a browser; a line below says when it is ready\n"
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument("--port", metavar="DEVICE", help='serial device of the MCU, or "sim"')
     parser.add_argument("--baud-rate", type=int, metavar="N", help="from 9600 to 115200")
@@ -67,7 +66,6 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="do not start `acsard gateway` for the tls/ endpoints, because it already runs as a "
         "service",
     )
-    parser.set_defaults(main=main)
 
 
 def options(args: argparse.Namespace) -> dict[str, object]:
@@ -84,7 +82,6 @@ def options(args: argparse.Namespace) -> dict[str, object]:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Run the daemon until a signal."""
     where, config = load(args.config, options(args))
     config = recorded(config)
     log, screen, served = Log(config.log), Writer(sys.stdout), page(config, where)

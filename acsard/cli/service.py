@@ -9,15 +9,14 @@ import os
 import sys
 from collections.abc import Iterable
 
-from acsard.host.errors import Exit, ExitError, MendableError
+from acsard.host.errors import Exit, MendableError, NotPermittedError
 from acsard.machine import service_installation as service
 from acsard.machine.installation_steps import Step
 from acsard.machine.service_installation import misplaced
 from acsard.terminal.output import show, table
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for name, main, text in (
         ("install", main_install, "write the files, enable and start the service"),
@@ -47,7 +46,6 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def main_install(args: argparse.Namespace) -> int:
-    """Write the files, reload systemd, and enable and start the service."""
     _ready(args)
     trouble = misplaced()
     if trouble:
@@ -63,7 +61,6 @@ def main_install(args: argparse.Namespace) -> int:
 
 
 def main_uninstall(args: argparse.Namespace) -> int:
-    """Stop and disable the service and remove its files."""
     _ready(args)
     files = [*service.files(), *map(service.lan_drop_in, service.ALL)]
     steps = service.uninstalling(
@@ -92,9 +89,7 @@ def main_status(args: argparse.Namespace) -> int:
 
 def _ready(args: argparse.Namespace) -> None:
     if not args.dry_run and os.geteuid() != 0:
-        raise ExitError(
-            Exit.NO_PERMISSION, "run it with sudo, or use --dry-run to see what it would do"
-        )
+        raise NotPermittedError("run it with sudo, or use --dry-run to see what it would do")
 
 
 def _do(steps: Iterable[Step], dry_run: bool) -> None:
@@ -107,6 +102,6 @@ def _do(steps: Iterable[Step], dry_run: bool) -> None:
         except MendableError:
             raise
         except OSError as error:
-            raise ExitError(
-                Exit.FAILURE, f"could not: {step}: {error.strerror}; fix that and run it again"
+            raise MendableError(
+                f"could not: {step}: {error.strerror}; fix that and run it again"
             ) from None

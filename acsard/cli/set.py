@@ -25,12 +25,11 @@ from acsard.core.messages.encodings import encode
 from acsard.core.ros.parameters import described
 from acsard.core.values import Plain
 from acsard.host.config_file import change, require_changeable, writable
-from acsard.host.errors import Exit, ExitError, MendableError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "settings",
         nargs="*",
@@ -46,11 +45,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print the answer or the list as JSON")
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Set the settings, or list them if none is given."""
     settings = pairs(args.settings)
     file = _file(args.config, settings) if args.write else None
     if file is not None:
@@ -67,9 +64,7 @@ def main(args: argparse.Namespace) -> int:
         try:
             change(file, settings)
         except MendableError as error:
-            raise ExitError(
-                Exit.FAILURE, f"{reply.message}, {until}; not written: {error}"
-            ) from None
+            raise MendableError(f"{reply.message}, {until}; not written: {error}") from None
         until = f"written to {file}"
     text = f"{reply.message}; {until}" if reply.success else reply.message
     print(json_line(encode(reply, "json").decode()) if args.json else lines(text))

@@ -20,8 +20,7 @@ from acsard.host import clock
 from acsard.host.errors import UsageError
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument(
         "--fault",
@@ -35,7 +34,6 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--link", metavar="PATH", help="also make a symbolic link at PATH to the device"
     )
-    parser.set_defaults(main=main)
 
 
 def fault(text: str) -> NamedFault:
@@ -47,7 +45,6 @@ def fault(text: str) -> NamedFault:
 
 
 def main(args: argparse.Namespace) -> int:
-    """Simulate the microcontroller until a signal."""
     _, config = load(args.config)
     return asyncio.run(_play(config, args))
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 import re
 import socket
-from collections.abc import Callable
 from pathlib import Path
 
 from acsard.cli.common import add_config, load, whole
@@ -26,8 +25,7 @@ from acsard.machine.service_installation import TLS, source
 NAME = re.compile(r"(?!@)[A-Za-z0-9_ .:@+-]{1,64}")
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the actions and their options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     init = actions.add_parser(
         "init",
@@ -120,7 +118,6 @@ def _add_common(action: argparse.ArgumentParser) -> None:
 
 
 def main_init(args: argparse.Namespace) -> int:
-    """Make the authority, the robot's certificate and one client certificate per role."""
     directory = args.directory.resolve()
 
     robots: list[str] = []
@@ -136,7 +133,9 @@ def main_init(args: argparse.Namespace) -> int:
         robots.append(load(None)[1].robot.id)
     names = certificates.init(args.directory, args.address, args.days, force=args.force)
     if args.write:
-        _configure(args.write, keys)
+        changed = change(args.write, keys, new=True)
+        listen = write(changed["bus.listen"])
+        print(f"{args.write}: set bus.listen = {listen} and bus.tls\n")
     _admit_service(directory)
     host, robot = socket.gethostname(), robots[-1]
     files = {"ca": CA, "certificate": CERTIFICATE, "key": KEY}
@@ -148,7 +147,6 @@ def main_init(args: argparse.Namespace) -> int:
 
 
 def main_add(args: argparse.Namespace) -> int:
-    """Make one more client certificate."""
     listed = f"{args.role}s"
 
     def keys(config: Config) -> dict[str, object]:
@@ -185,15 +183,15 @@ def main_add(args: argparse.Namespace) -> int:
 
 
 def main_renew(args: argparse.Namespace) -> int:
-    """Replace the robot's own certificate."""
-    names = certificates.renew(args.directory, args.address, args.days)
+    names, warning = certificates.renew(args.directory, args.address, args.days)
     print(_certified(names))
+    if warning:
+        print(f"{warning}\n")
     print(f"{args.directory / CERTIFICATE} is new; run: systemctl restart acsard")
     return 0
 
 
 def main_router(args: argparse.Namespace) -> int:
-    """Print the configuration of a fleet's router."""
     for robot in args.robots:
         require_id(robot)
     template = (source() / "zenoh" / "router.json5").read_text()
@@ -204,12 +202,6 @@ def main_router(args: argparse.Namespace) -> int:
 
 def _certified(names: list[str]) -> str:
     return f"Clients may reach the robot as {', '.join(names)} (add more with --address).\n"
-
-
-def _configure(file: Path, keys: Callable[[Config], dict[str, object]]) -> None:
-    """Set the keys of the bus in a configuration file and keep its comments."""
-    changed = change(file, keys, new=True)
-    print(f"{file}: set bus.listen = {write(changed['bus.listen'])} and bus.tls\n")
 
 
 def _admit_service(directory: Path) -> None:
@@ -254,7 +246,8 @@ tls = "{directory}"
 _NEXT = """\
 Wrote {directory}:
   {ca}, {certificate}, {key}   the robot's
-  ca-key.pem                       the authority: a person who has it can admit anyone; keep it safe
+  ca-key.pem                       the authority's key: a person who has it can admit anyone.
+                                   Move it off the robot; `tls add` and `tls renew` need it
   clients/<role>/                  one directory each for viewer, operator, maintainer
 
 {lines}The daemon reads this when it starts: systemctl restart acsard, or restart `acsard run`.

@@ -12,15 +12,12 @@ from acsard.top import terminal
 from acsard.top.feed import Feed
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="print one screen and end")
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Show the robot until the operator leaves, or print one screen."""
     with connected(args) as robot:
         feed = Feed(robot)
         if args.once or not has_screen():

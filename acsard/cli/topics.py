@@ -16,16 +16,13 @@ from acsard.core.ros.transports import left_out, ros_names
 from acsard.terminal.output import show, table
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--ros", action="store_true", help="list the ROS 2 names instead")
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Print the table."""
     _, config = load(args.config)
     topics = ros_table(config) if args.ros else topic_table(config)
     if args.json:

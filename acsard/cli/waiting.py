@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from threading import Event, Thread
 
 import zenoh
@@ -17,11 +17,6 @@ from acsard.daemon.bus.address import Address
 from acsard.daemon.bus.robot_discovery import presence
 from acsard.daemon.bus.silent_key import Presence, explain_silence
 from acsard.daemon.bus.tls import trouble
-
-
-def nothing() -> str:
-    """Return "": there is nothing to explain."""
-    return ""
 
 
 @contextmanager
@@ -62,40 +57,33 @@ def explained(
         come.set()
 
 
-def waits_for(robot: Client, key: str) -> Callable[[], str]:
-    """Return a function that explains why nothing has arrived on a key."""
+def silence_explained(robot: Client, key: str = "") -> AbstractContextManager[Callable[[], None]]:
+    """Explain why nothing arrives on a key, and each later silence. "" explains only the latter."""
+    return explained(lambda: _none_yet(robot, key) if key else "", lambda: _ceased(robot))
 
-    def look() -> str:
-        where = robot.where
-        seen = presence(robot.session, where.robot_id, where.endpoint)
-        if seen is None:
+
+def _none_yet(robot: Client, key: str) -> str:
+    where = robot.where
+    seen = presence(robot.session, where.robot_id, where.endpoint)
+    if seen is None:
+        return ""
+    reason = "" if seen.linked else _of_link(where)
+    reason = reason or explain_silence(key, where.robot_id, where.endpoint, seen)
+    return f"waiting for {robot.key(key)}: {reason}"
+
+
+def _ceased(robot: Client) -> str:
+    """Return why messages ceased, or "" while the session is connected."""
+    try:
+        if robot.session.info.links():
             return ""
-        reason = "" if seen.linked else of_link(where)
-        reason = reason or explain_silence(key, where.robot_id, where.endpoint, seen)
-        return f"waiting for {robot.key(key)}: {reason}"
-
-    return look
-
-
-def lost_by(robot: Client) -> Callable[[], str]:
-    """Return a function that explains why messages ceased.
-
-    It returns "" while the session is connected.
-    """
-
-    def look() -> str:
-        try:
-            if robot.session.info.links():
-                return ""
-        except zenoh.ZError:
-            return ""  # the session is being closed
-        where, gone = robot.where, Presence(linked=False, here=False)
-        return of_link(where) or explain_silence("", where.robot_id, where.endpoint, gone)
-
-    return look
+    except zenoh.ZError:
+        return ""  # the session is being closed
+    where, gone = robot.where, Presence(linked=False, here=False)
+    return _of_link(where) or explain_silence("", where.robot_id, where.endpoint, gone)
 
 
-def of_link(where: Address) -> str:
+def _of_link(where: Address) -> str:
     """Return what is wrong with the TLS connection, or "".
 
     A certificate may have expired while the tool followed the robot.

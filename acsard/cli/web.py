@@ -1,6 +1,6 @@
 """Serve the robot's page for a running daemon until Ctrl-C. `acsard run` in a terminal starts this
-by itself. A browser on the robot's machine has every permission. A browser on another machine needs
-HTTPS with the robot's certificate, and a token.
+by itself. A browser on the robot's machine needs no token and has the role of web.local. A browser
+on another machine needs HTTPS with the robot's certificate, and a token.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from acsard.core.formatting import lasting
 from acsard.core.values import ROLES
 from acsard.daemon.bus.address import address_of
 from acsard.daemon.bus.zenoh_sessions import log_from_environment
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from acsard.host.extras import install
 from acsard.host.logs import Log
-from acsard.terminal.output import show, table
 
 if TYPE_CHECKING:
     from acsard.web.listen import Listen
@@ -36,8 +35,7 @@ USUAL_DAYS = 30
 NAME = re.compile(r"[A-Za-z0-9_.-]{1,32}\Z")
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.epilog = f"Needs an extra: {install('web')}."
     add_bus(parser)
     parser.add_argument(
@@ -80,17 +78,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         help=f"hours until the token expires, for a visitor: 1 to {MOST_HOURS}",
     )
     parser.add_argument("--supervised", action="store_true", help=argparse.SUPPRESS)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Serve the page, or manage its tokens."""
     try:
         import aiohttp  # noqa: F401
         import segno  # noqa: F401
     except ImportError:
-        raise ExitError(
-            Exit.FAILURE, f"needs the libraries aiohttp and segno; run: {install('web')}"
+        raise MendableError(
+            f"needs the libraries aiohttp and segno; run: {install('web')}"
         ) from None
     where, loaded = load(args.config, {"record.directory": args.record or None})
     config = recorded(loaded)
@@ -174,13 +170,15 @@ def _invite(args: argparse.Namespace, config: Config, where: str) -> int:
 
 
 def _vault(args: argparse.Namespace, config: Config) -> Vault:
-    """Return the tokens of the robot that the options name."""
     from acsard.web.tokens import Vault, place
 
     return Vault(place(), address_of(config, args.connect, args.id, args.tls).robot_id)
 
 
 def _list(vault: Vault) -> int:
+    # The server, which runs for months, needs no tables: they would cost it 5 MB.
+    from acsard.terminal.output import show, table
+
     tokens, now_s = vault.all(), time.time()
 
     def until(ends: int) -> str:

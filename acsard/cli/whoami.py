@@ -13,15 +13,12 @@ from acsard.cli.connection import add_bus, connected
 from acsard.host.errors import Exit
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
+def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print it as JSON")
     add_bus(parser)
-    parser.set_defaults(main=main)
 
 
 def main(args: argparse.Namespace) -> int:
-    """Ask the robot for our role and print it. Return `NO_PERMISSION` without a role."""
     with connected(args) as robot:
         us = robot.whoami()
     if args.json:

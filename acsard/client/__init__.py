@@ -36,9 +36,8 @@ to do:
     DecodeError                         a payload is not a message of acsard
 """
 
-from acsard.client.asynchronous import AsyncClient
-from acsard.client.connecting import connect, connect_async
-from acsard.client.synchronous import Client
+from acsard.client.asynchronous import AsyncClient, connect_async
+from acsard.client.synchronous import Client, connect
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.values import AcsardError, Pose
 from acsard.daemon.bus.identity import Identity

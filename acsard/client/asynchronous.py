@@ -4,18 +4,40 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
-from contextlib import aclosing, closing
+from contextlib import aclosing, asynccontextmanager, closing
 from functools import partial
 from typing import Any
 
 from acsard.client.driving import UnheardError, drive
-from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, decoder
+from acsard.client.synchronous import REPLY_TIMEOUT_S, Client, close, decoder
 from acsard.core.messages import schema
 from acsard.core.values import Plain, Pose
+from acsard.daemon.bus.address import address_by_environment
 from acsard.daemon.bus.identity import Identity
 from acsard.daemon.bus.subscription import encoded
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host.errors import NoAnswerError
 from acsard.host.threads import in_thread
+
+
+@asynccontextmanager
+async def connect_async(
+    endpoint: str | None = None,
+    *,
+    robot_id: str | None = None,
+    source: str = "app",
+    tls: str | None = None,
+) -> AsyncIterator[AsyncClient]:
+    """Connect as `connect` does, for asyncio programs.
+
+    Opening and closing do not block the event loop.
+    """
+    where = await in_thread(lambda: address_by_environment(endpoint, robot_id, tls), 5.0)
+    session = await in_thread(lambda: client_session(where.endpoint, where.tls), 10.0, late=close)
+    try:
+        yield AsyncClient(Client(session, where.robot_id, source, where.tls, where.endpoint))
+    finally:
+        await in_thread(lambda: close(session), 5.0)
 
 
 class AsyncClient:

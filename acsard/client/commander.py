@@ -55,10 +55,6 @@ DRIVES_NS = NS_PER_S // 2
 LONGEST_S = 10.0
 """Longest possible timeout of a source, s. The robot follows no speed that is older."""
 
-LATE_NS = NS_PER_S // 10
-"""Time by which the robot may follow a speed for longer than its source's timeout, because the
-command took this long to arrive."""
-
 NEVER = ("inactive", "stopped", "fault", "shutdown")
 """Modes in which no command counts."""
 
@@ -145,7 +141,8 @@ class Commander:
         moved_ns, self._moved_ns = self._moved_ns, None
         self._wish = self._asked_ns = None
         self._lead = False
-        if moved_ns is None or now_ns - moved_ns > timeout_s * NS_PER_S + LATE_NS:
+        # The command may have taken 0.1 s to arrive, and the robot follows it from then on.
+        if moved_ns is None or now_ns - moved_ns > timeout_s * NS_PER_S + NS_PER_S // 10:
             return None
         return self._zero(now_ns)
 

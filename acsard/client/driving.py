@@ -97,7 +97,6 @@ def _require(**numbers: object) -> None:
 
 
 def _opening(robot: Driven, checks: _Drive) -> Iterator[float]:
-    """Send zeros until the daemon follows them."""
     begun = time.monotonic()
     while (passed := time.monotonic() - begun) < OPENING_S or checks.objection != "":
         robot.send(0.0, 0.0)

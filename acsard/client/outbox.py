@@ -104,7 +104,6 @@ class Outbox:
         return [due_ns for due_ns in times if due_ns is not None]
 
     def _due(self) -> list[tuple[Commander, Put]]:
-        """Return the senders with a command that is due."""
         now_ns = clock.mono_ns()
         known = [(commander.due_ns(), commander, put) for commander, put in self._senders.items()]
         return [(one, put) for due_ns, one, put in known if due_ns is not None and due_ns <= now_ns]

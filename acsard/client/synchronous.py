@@ -7,7 +7,7 @@ import platform
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import lru_cache
 from typing import Any
 
@@ -31,12 +31,13 @@ from acsard.core.messages.topics import (
     unknown,
 )
 from acsard.core.values import Plain, Pose
-from acsard.daemon.bus.address import Address
+from acsard.daemon.bus.address import Address, address_by_environment
 from acsard.daemon.bus.identity import Identity, identity
 from acsard.daemon.bus.robot_discovery import presence
 from acsard.daemon.bus.silent_key import explain_silence
 from acsard.daemon.bus.subscription import Subscription, encoded, queue_on
 from acsard.daemon.bus.tls import shown_at
+from acsard.daemon.bus.zenoh_sessions import client_session
 from acsard.host import clock
 from acsard.host.errors import (
     MendableError,
@@ -55,6 +56,37 @@ REPLY_TIMEOUT_S = 3.0
 
 TIMED_OUT = "Timeout"
 """Text that Zenoh returns if a queryable received the query and did not reply in time."""
+
+
+@contextmanager
+def connect(
+    endpoint: str | None = None,
+    *,
+    robot_id: str | None = None,
+    source: str = "app",
+    tls: str | None = None,
+) -> Iterator[Client]:
+    """Connect to the daemon at `endpoint`, to command as `source` (see `[[commands.sources]]`).
+
+    `tls` is the directory with your certificate, for an endpoint like "tls/robot.local:7449". An
+    argument that is None comes from the file that the environment variable ACSARD_CONFIG names.
+    Without such a file it is "tcp/127.0.0.1:7448", "acsar" or no certificate.
+    """
+    where = address_by_environment(endpoint, robot_id, tls)
+    session = client_session(where.endpoint, where.tls)
+    try:
+        yield Client(session, where.robot_id, source, where.tls, where.endpoint)
+    finally:
+        close(session)
+
+
+def close(session: zenoh.Session) -> None:
+    """Close a session, even if the other side is stuck."""
+    try:
+        session.close()
+    except zenoh.ZError:
+        # The other side is stuck, and this client leaves in any case.
+        pass
 
 
 class _Puts:
@@ -253,14 +285,21 @@ class Client:
         except zenoh.ZError:
             raise _no_key(name) from None
 
-    def put(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
-        """Send one command with a signature, for a program that forwards another sender's."""
-        self._puts.wait()
-        self._publish(twist, signature)
+    def put(
+        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str = ""
+    ) -> None:
+        """Send one command with a signature, for a program that forwards another sender's.
 
-    def _publish(self, twist: schema.Twist | schema.TwistStamped, signature: Signature) -> None:
+        `source` is the client's own by default.
+        """
+        self._puts.wait()
+        self._publish(twist, signature, source or self.source)
+
+    def _publish(
+        self, twist: schema.Twist | schema.TwistStamped, signature: Signature, source: str
+    ) -> None:
         self.session.put(
-            self.key(self.command_key(self.source)),
+            self.key(self.command_key(source)),
             encode(twist, "msgpack"),
             encoding=encoding_name("msgpack", type(twist).__name__),
             express=True,
@@ -277,7 +316,7 @@ class Client:
             schema.Header(schema.Time.from_ns(stamp_ns)),
             schema.Twist(schema.Vector3(x=linear), schema.Vector3(z=angular)),
         )
-        self._publish(message, self._sender.sign(stamp_ns, steady=steady))
+        self._publish(message, self._sender.sign(stamp_ns, steady=steady), self.source)
 
     def _ask(self, name: str, payload: bytes | None = None) -> tuple[str, bytes]:
         """Return the first reply. A stranger may send any number of further ones."""

@@ -27,7 +27,7 @@ from acsard.core.motion.event_throttle import EventThrottle
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.lifecycle import Lifecycle
 from acsard.core.motion.limits import Limiter
-from acsard.core.motion.modes import LEAVING, Mode, RefusedError
+from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError
 from acsard.core.motion.odometry import Odometry
 from acsard.core.motion.sanity import Sanity
 from acsard.core.values import (
@@ -171,7 +171,8 @@ class Robot:
             self._hear(inputs, events)
         self._choice = self._arbiter.choose(inputs.now.mono_ns)
         self._life.command(self._choice.twist is not None)
-        news = self._news()
+        # A newer command or mode than that of the last line may go at once.
+        news = (self._choice.arrived_ns, self._life.mode) != self._made_of
         due = inputs.tick or (inputs.at_once and news)
         line = self._drive(inputs) if due else None
         applied = self._limiter.twist
@@ -199,10 +200,6 @@ class Robot:
             news,
             self._life.latches,
         )
-
-    def _news(self) -> bool:
-        """Return whether the next line has a newer command or mode, so that it may go at once."""
-        return (self._choice.arrived_ns, self._life.mode) != self._made_of
 
     # The fate of the line before.
 
@@ -293,7 +290,7 @@ class Robot:
         if inputs.guard_trip:
             trip = f"the guard replaced a line: {inputs.guard_trip}"
             self._fault(trip, inputs.now, events)
-        if inputs.leaving and self._life.mode is not Mode.SHUTDOWN:
+        if inputs.shutting_down and self._life.mode is not Mode.SHUTDOWN:
             self._life.leave()
         if not inputs.requests:
             return ()
@@ -425,6 +422,6 @@ class Robot:
             case Mode.STOPPED | Mode.FAULT | Mode.INACTIVE:
                 return self._life.why
             case Mode.SHUTDOWN:
-                return LEAVING
+                return GOING_DOWN
             case _:
                 assert_never(self._life.mode)

@@ -393,7 +393,7 @@ class Inputs(Struct, frozen=True):
     events: tuple[Event, ...] = ()
     """Events of the shell, to be logged together with those of the robot."""
     at_once: bool = False
-    leaving: bool = False
+    shutting_down: bool = False
     """Whether the daemon is going down. The robot then ramps to zero and stays there."""
 
 

@@ -34,9 +34,6 @@ GATHER_S = 0.015
 """Time to gather messages before a round. A screen shows 60 frames a second, and gathering for less
 than one frame makes the rounds a third cheaper. Commands do not wait for it."""
 
-ROUND_S = 0.5
-"""Longest time between two rounds."""
-
 GONE = "daemon"
 """Id of the status message that the daemon is gone."""
 
@@ -85,7 +82,7 @@ class Bridge:
         while not self._ended.is_set():
             if dead.done():
                 dead.result()
-            self._wake.wait(ROUND_S)
+            self._wake.wait(0.5)
             time.sleep(GATHER_S)
             self._wake.clear()
             self._round()
@@ -153,12 +150,10 @@ class Bridge:
         self._server.publish_parameter_values(as_parameters(self._settings.learn(facts.tables)))
 
     def _timeout_s(self, facts: Facts) -> float:
-        """Return the timeout of the source as which viewers drive, s."""
         sources = facts.config.commands.sources
         return next((one.timeout for one in sources if one.name == self._robot.source), LONGEST_S)
 
     def _follow(self, driving: bool) -> None:
-        """Follow the robot's state while a viewer drives."""
         now = clock.mono_ns() / NS_PER_S
         if self._watch is not None and not driving:
             self._watch.end()

@@ -159,7 +159,6 @@ class _Heard:
         return self._box.take()
 
     def undeclare(self) -> None:
-        """End the subscriptions."""
         for one in self._declared:
             try:
                 one.undeclare()

@@ -23,12 +23,6 @@ from acsard.core.values import NS_PER_S
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
-CHANNELS = 64
-"""Maximum number of channels on which one viewer may publish."""
-
-END_S = 0.5
-"""Time limit for sending the final zeros, which normally takes a few ms."""
-
 SLOW_NS, SLOW_TIMES = 5 * NS_PER_S // 2, 3
 """Thresholds for a panel that publishes too seldom: this many messages in a row after a silence of
 the commander, none longer than `SLOW_NS`."""
@@ -121,7 +115,7 @@ class Drives:
             viewer = self._viewers.get(client)
             if viewer is None:
                 viewer = self._viewers[client] = Viewer(self._robot_of(client))
-            if len(viewer.channels) < CHANNELS:
+            if len(viewer.channels) < 64:
                 viewer.channels[channel] = found, problem
 
     def came(self, client: int, channel: int, data: bytes) -> None:
@@ -177,7 +171,7 @@ class Drives:
             for viewer in self._viewers.values():
                 self.outbox.release(viewer.commander, self.timeout_s)
             self._viewers.clear()
-        self.outbox.end(END_S)
+        self.outbox.end(0.5)  # the final zeros normally take a few ms
 
     # Run by the sending thread.
 

@@ -66,7 +66,6 @@ class _Out:
         self.last: bytes | None = None
 
     def log(self, message: object) -> None:
-        """Forward a message."""
         self.last = self.row.encode(message)
         self.channel.log(self.last)
 
@@ -142,7 +141,6 @@ class Relay:
         return Subscription(arrivals, self._robot.key(key))
 
     def pass_on(self) -> None:
-        """Forward the received messages."""
         for topic, command in self._commanders.take():
             self._outs[topic].log(command)
         for key, samples in self._followed.items():
@@ -156,7 +154,6 @@ class Relay:
                     out.log(message)
 
     def log(self, line: Log) -> None:
-        """Publish a line on the topic `log`."""
         out = self._outs.get(self.log_topic)
         if out is not None:
             out.log(line)

@@ -103,7 +103,6 @@ class Listener:
 
 
 def as_parameters(values: dict[str, foxglove.AnyNativeParameterValue]) -> list[foxglove.Parameter]:
-    """Return settings in the form that the protocol uses."""
     return [foxglove.Parameter(key, value=value) for key, value in values.items()]
 
 

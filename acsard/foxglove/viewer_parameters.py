@@ -12,9 +12,6 @@ from acsard.core.values import NS_PER_S, AcsardError
 from acsard.foxglove.notices import Notices
 from acsard.host import clock
 
-OLD_NS = NS_PER_S
-"""Age at which the settings are read again for a viewer that asks."""
-
 POLL_NS = 5 * NS_PER_S
 """Interval at which the settings are read while a viewer follows them, because other clients change
 them too."""
@@ -83,7 +80,7 @@ class Settings:
         """Read the settings again if a viewer needs them; return the settings that changed."""
         with self._lock:
             age_ns = clock.mono_ns() - self._read_ns
-            due = (self._asked and age_ns > OLD_NS) or (self._followed and age_ns > POLL_NS)
+            due = (self._asked and age_ns > NS_PER_S) or (self._followed and age_ns > POLL_NS)
         if not due or not self._readable:
             return {}
         try:
@@ -106,5 +103,4 @@ def asked(known: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings whose value has changed."""
     return {key: value for key, value in now.items() if before.get(key) != value}

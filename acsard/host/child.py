@@ -29,7 +29,6 @@ from msgspec import Struct
 
 from acsard.core.values import NS_PER_S
 from acsard.host import clock
-from acsard.host.silence import Silence
 
 OUR_UNIT = ("NOTIFY_SOCKET", "INVOCATION_ID")
 """Variables that systemd sets for the parent. A child must not answer in the parent's name."""
@@ -44,14 +43,23 @@ SILENT_NS = 3 * NS_PER_S
 START_NS = 15 * NS_PER_S
 """Time for the first sign of life: the start of Python on a busy machine."""
 
-SILENT = "no longer reported that it is alive (stopped or hung), and was ended"
-
 LINE_BYTES = 65536
 """Length of the longest line of output that a child may send."""
 
-FIRST_TO_GO = b"1000"
-"""Value for `oom_score_adj`: when the computer runs out of memory, the kernel kills such a child
-before any other process."""
+
+class Silence:
+    """Silence of a peer, judged again and again.
+
+    A machine or a CPU quota that stops this process too does not count as silence of the peer.
+    """
+
+    def __init__(self, most_ns: int) -> None:
+        self._most_ns, self._ns = most_ns, 0
+
+    def too_long(self, heard: bool, passed_ns: int) -> bool:
+        """Return whether the silence exceeds `most_ns`, `passed_ns` after the last call."""
+        self._ns = 0 if heard else self._ns + min(passed_ns, NS_PER_S // 2)
+        return self._ns > self._most_ns
 
 
 # The parent's side: start, limit and end
@@ -79,7 +87,8 @@ def limit(pid: int, limits: Limits) -> None:
     """Set the priority and the data memory of a child; it is the first to go without memory."""
     try:
         with suppress(OSError):
-            Path(f"/proc/{pid}/oom_score_adj").write_bytes(FIRST_TO_GO)
+            # When memory runs out, the kernel ends this child before any other process.
+            Path(f"/proc/{pid}/oom_score_adj").write_bytes(b"1000")
         os.setpriority(os.PRIO_PROCESS, pid, limits.nice)
         memory = limits.memory_bytes
         resource.prlimit(pid, resource.RLIMIT_DATA, (memory, memory))
@@ -182,7 +191,7 @@ class Child:
                 alive, silence = True, Silence(SILENT_NS)
             now_ns = clock.mono_ns()
             if silence.too_long(bool(beat), now_ns - before_ns):
-                self.silent = SILENT
+                self.silent = "no longer reported that it is alive (stopped or hung), and was ended"
                 return True
             before_ns = now_ns
 
@@ -225,13 +234,9 @@ class Parent:
             return True  # the parent went before it had read all signs of life
 
 
-# From linux/prctl.h.
-PR_SET_PDEATHSIG = 1
-
-
 def end_with_parent(number: signal.Signals) -> None:
     """Ask the kernel for this signal when the thread that started this process ends.
 
     The child calls it. It then ends with its parent even if the parent crashes.
     """
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+    ctypes.CDLL(None).prctl(1, number)  # PR_SET_PDEATHSIG in linux/prctl.h

@@ -10,7 +10,7 @@ from acsard.core.config.editing import edited
 from acsard.core.config.parsing import ConfigError, parse
 from acsard.core.config.settings import Config
 from acsard.host.atomic_file import replace
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import Exit, ExitError, MendableError
 from acsard.host.extras import install
 
 PLACES = (Path("acsard.toml"), Path("/etc/acsard/acsard.toml"))
@@ -39,13 +39,12 @@ def find(path: str | None) -> tuple[str, bytes]:
 def writable(path: str | None) -> Path:
     """Return the file that --write changes.
 
-    Raises `ExitError` if it or the library tomlkit is missing.
+    Raises `MendableError` if it or the library tomlkit is missing.
     """
     require_tomlkit()
     where, text = find(path)
     if not text and not Path(where).is_file():
-        raise ExitError(
-            Exit.FAILURE,
+        raise MendableError(
             "--write has no configuration file to change: run it on the robot, and name the "
             "file with --config or make an acsard.toml there (it may be empty); a file on "
             "another machine changes nothing on the robot",
@@ -62,8 +61,7 @@ def require_tomlkit() -> None:
     try:
         import tomlkit  # noqa: F401
     except ImportError:
-        raise ExitError(
-            Exit.FAILURE,
+        raise MendableError(
             f"--write needs the library tomlkit; run: {install('write')}, or leave --write out and "
             "paste the lines",
         ) from None
@@ -72,7 +70,7 @@ def require_tomlkit() -> None:
 def change(file: Path, keys: Keys | Callable[[Config], Keys], *, new: bool = False) -> Keys:
     """Set keys in an `acsard.toml`, and return them.
 
-    `keys` may be a function that computes them from the configuration. Raises `ExitError` and
+    `keys` may be a function that computes them from the configuration. Raises `MendableError` and
     leaves the file unchanged if that is impossible. With `new` the file need not exist.
     """
     try:
@@ -106,5 +104,5 @@ def _changed(
     return place, edited(text, given), given
 
 
-def _left(file: Path, error: Exception) -> ExitError:
-    return ExitError(Exit.FAILURE, f"{file} was not changed: {error}; write the lines by hand")
+def _left(file: Path, error: Exception) -> MendableError:
+    return MendableError(f"{file} was not changed: {error}; write the lines by hand")

@@ -1,9 +1,9 @@
 """Errors with an external cause that a person can fix, and the exit codes of acsard.
 
 Each error is an `AcsardError` and also the built-in exception that Python uses for such a case, so
-either can be caught. The text says what is wrong and how to fix it. Modules that other programs may
-import raise these errors. `ExitError` is for verbs, which name their exit code themselves. Bugs are
-not among these errors, and neither are states of the robot, such as a lost port or a stale command.
+either can be caught. The text says what is wrong and how to fix it. Each class has the exit code of
+a verb that ends with it. A `MendableError` itself is for what no other class names. Bugs are not
+among these errors, and neither are states of the robot, such as a lost port or a stale command.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote, urlsplit
 
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import MendableError
 
 Extra = Literal["foxglove", "report", "shell", "tls", "web", "write"]
 
@@ -27,9 +27,9 @@ def install(extra: Extra) -> str:
     return shlex.join([*_installer(), *wanted])
 
 
-def missing(library: str, extra: Extra) -> ExitError:
+def missing(library: str, extra: Extra) -> MendableError:
     """Return the error about a missing library, with the command that installs it."""
-    return ExitError(Exit.FAILURE, f"needs the library {library}; run: {install(extra)}")
+    return MendableError(f"needs the library {library}; run: {install(extra)}")
 
 
 def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
@@ -45,11 +45,8 @@ def wanted_by(installed: Distribution, extra: Extra) -> list[str]:
         editable = told.get("dir_info", {}).get("editable", False)
         return [*(["-e"] if editable else []), f"{place}[{extra}]"]
     libraries = (line.partition(";") for line in installed.requires or ())
-    return [name.strip() for name, _, when in libraries if when.split() == _only(extra)]
-
-
-def _only(extra: Extra) -> list[str]:
-    return ["extra", "==", f"'{extra}'"]
+    only = ["extra", "==", f"'{extra}'"]
+    return [name.strip() for name, _, when in libraries if when.split() == only]
 
 
 def _installer() -> list[str]:

@@ -79,17 +79,11 @@ class JournalStream(io.StringIO):
             raise
 
     def write(self, text: str) -> int:
-        """Send one line of the log."""
         self._socket.send(text.encode(errors="replace"))
         return len(text)
 
 
 Form = Literal["console", "json", "logfmt", "journal"]
-
-QUEUED_LINES = 1000
-"""Largest number of queued lines: more than the daemon logs in a minute with all faults at once
-(`core/motion/event_throttle.py`).
-"""
 
 MAX_VALUE = 500
 """Largest number of characters of one value, which may be a stranger's text."""
@@ -100,7 +94,8 @@ class Writer:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
-        self._lines: queue.Queue[str | None] = queue.Queue(QUEUED_LINES)
+        # The daemon logs less in a minute, even with all faults at once (`event_throttle.py`).
+        self._lines: queue.Queue[str | None] = queue.Queue(1000)
         self._thread = threading.Thread(target=self._work, name="log", daemon=True)
         self._thread.start()
 

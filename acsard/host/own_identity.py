@@ -14,9 +14,6 @@ from pathlib import Path
 from acsard.core.messages.signature import MAX_NAME
 from acsard.host.processes import called
 
-SECRET_BYTES = 16
-"""Size of the random secret: 128 bits, which no program can guess."""
-
 
 def own_name() -> str:
     """Return a name like `alice@laptop patrol`: user, machine, and the program if it has a name."""
@@ -36,11 +33,8 @@ def sender_id(name: str, secret: str = "") -> str:
 
 
 def new_secret() -> str:
-    """Return 22 random characters that hold no "/"."""
-    return secrets.token_urlsafe(SECRET_BYTES)
-
-
-ASK_S = 5.0
+    """Return 128 random bits as 22 characters that hold no "/"."""
+    return secrets.token_urlsafe(16)
 
 
 def own_addresses() -> list[str]:
@@ -50,7 +44,7 @@ def own_addresses() -> list[str]:
     missing.
     """
     try:
-        found = json.loads(called(("ip", "-json", "address"), ASK_S).stdout or "[]")
+        found = json.loads(called(("ip", "-json", "address"), 5.0).stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):
         return []
     told = [one["local"] for link in found for one in link.get("addr_info", ()) if "local" in one]

@@ -33,7 +33,6 @@ class _Open(Struct, frozen=True):
     fd: str
 
     def device(self) -> int:
-        """Return the device number."""
         return os.stat(self.process / "fd" / self.fd).st_rdev
 
     def about(self) -> list[str]:
@@ -150,7 +149,6 @@ def _having_open(path: str) -> Iterator[_Open]:
 
 
 def _number(path: str) -> int:
-    """Return the device number of a path; 0 if it is not a device."""
     try:
         return os.stat(path).st_rdev
     except OSError:

@@ -17,8 +17,6 @@ FEEDS_PER_WATCHDOG = 4
 because that would hide a loop that is late.
 """
 
-STATUS_PERIOD_NS = NS_PER_S
-
 PATIENCE_S = 30
 """Time by which a waiting start asks systemd to extend its timeout, s."""
 
@@ -81,14 +79,13 @@ class Systemd:
         if self._feed_every_ns and now_ns - self._fed_ns >= self._feed_every_ns:
             self._fed_ns = now_ns
             self.alive()
-        if outputs.status_changed or now_ns - self._status_ns >= STATUS_PERIOD_NS:
+        if outputs.status_changed or now_ns - self._status_ns >= NS_PER_S:
             self._status_ns = now_ns
             status = status_of(outputs)
             if status != self._status and self._send(f"STATUS={status}"):
                 self._status = status
 
     def close(self) -> None:
-        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

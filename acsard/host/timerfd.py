@@ -43,7 +43,6 @@ class TimerFd:
             raise OSError(ctypes.get_errno(), "timerfd_create failed")
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
         return int(self._fd)
 
     def set(self, at_ns: int) -> None:
@@ -64,5 +63,4 @@ class TimerFd:
             raise
 
     def close(self) -> None:
-        """Close the descriptor."""
         os.close(self._fd)

@@ -23,11 +23,6 @@ from acsard.machine.running import Running, answers, asked
 LOST = 0.02
 """Largest fraction of lines that may be lost. A sound link loses none."""
 
-DAY_S = 86400.0
-
-ENOUGH = 40
-"""Number of lines sent between both states from which on the fraction of losses is meaningful."""
-
 
 def link(running: Running) -> Iterator[Finding]:
     """Yield findings about the link, by the counters and reports of the daemon."""
@@ -50,7 +45,7 @@ def link(running: Running) -> Iterator[Finding]:
     }
     # A fault that occurs at most once a day on average is history. One that is more frequent is a
     # warning.
-    often = state.counters.get("lines_sent", 0) / config.rate_hz / DAY_S
+    often = state.counters.get("lines_sent", 0) / config.rate_hz / 86400
     # The built-in simulator is late whenever the daemon is, and it is never unplugged.
     if late := state.counters.get(f"link_lost{'' if config.mcu.simulated else '_host_stall'}", 0):
         late_times = many(late, "time")
@@ -71,7 +66,8 @@ def link(running: Running) -> Iterator[Finding]:
 def lost(passed: Mapping[str, int], config: Config) -> Iterator[str]:
     """Yield a warning if too few of the lines sent between the two states were answered."""
     sent, came = passed.get("lines_sent", 0), passed.get("lines", 0)
-    if config.mcu.reply_period or sent < ENOUGH or came >= (1 - LOST) * sent - 1:
+    # With fewer than 40 lines between both states the fraction means nothing.
+    if config.mcu.reply_period or sent < 40 or came >= (1 - LOST) * sent - 1:
         return
     yield (
         f"only {came} of {sent} lines that were sent in a second were answered: the others are "

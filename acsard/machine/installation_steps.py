@@ -8,14 +8,11 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from acsard.host.errors import Exit, ExitError, MendableError, NotPermittedError
+from acsard.host.errors import MendableError, NotPermittedError
 from acsard.host.processes import called
 
 OURS = ("bin", "acsard", "acsard.service.d", "acsard-gateway.service.d", "acsard-web.service.d")
 """Directories that are removed with the last file in them."""
-
-RUN_S = 60.0
-"""Time limit of a command, s. A command that takes longer has hung."""
 
 
 class File(Struct, frozen=True):
@@ -71,22 +68,24 @@ class Write(Struct, frozen=True):
 
 
 class Remove(Struct, frozen=True):
-    """Step that removes a file, and the directories made for it if they are empty."""
+    """Step that removes a file, or a directory with everything in it."""
 
     path: Path
 
     def __str__(self) -> str:
-        return f"remove  {self.path}"
+        return f"remove  {self.path}" + ("/ and everything in it" if self._is_directory else "")
+
+    @property
+    def _is_directory(self) -> bool:
+        return self.path.is_dir() and not self.path.is_symlink()
 
     def do(self) -> None:
-        """Remove the file."""
-        self.path.unlink()
-        self.tidy(self.path)
-
-    @staticmethod
-    def tidy(path: Path) -> None:
-        """Remove acsard's own directories that have become empty."""
-        for place in path.parents:
+        """Remove it, and acsard's own directories that become empty."""
+        if self._is_directory:
+            shutil.rmtree(self.path)
+        else:
+            self.path.unlink()
+        for place in self.path.parents:
             if place.name not in OURS:
                 return
             try:
@@ -94,23 +93,6 @@ class Remove(Struct, frozen=True):
             except OSError:
                 # The directory holds something else.
                 return
-
-
-class RemoveAll(Struct, frozen=True):
-    """Step that removes a file, or a directory with everything in it."""
-
-    path: Path
-
-    def __str__(self) -> str:
-        return f"remove  {self.path}" + ("/ and everything in it" if self.path.is_dir() else "")
-
-    def do(self) -> None:
-        """Remove the file or the directory."""
-        if self.path.is_dir() and not self.path.is_symlink():
-            shutil.rmtree(self.path)
-            Remove.tidy(self.path)
-        else:
-            Remove(self.path).do()
 
 
 class Keep(Struct, frozen=True):
@@ -139,20 +121,20 @@ class Run(Struct, frozen=True):
         return f"run     {' '.join(self.words)}"
 
     def do(self) -> None:
-        """Run the command; raise `ExitError` with its error output, unless it may fail."""
+        """Run the command; raise `MendableError` with its error output, unless it may fail."""
         try:
-            done = called(self.words, RUN_S)
+            done = called(self.words, 60.0)
             failed = done.stderr.strip() if done.returncode else ""
         except (OSError, subprocess.TimeoutExpired) as error:
             failed = str(error)
         if failed and not self.may_fail:
-            raise ExitError(Exit.FAILURE, f"{' '.join(self.words)}: {failed}")
+            raise MendableError(f"{' '.join(self.words)}: {failed}")
 
 
-Step = Write | Remove | RemoveAll | Keep | Run
+Step = Write | Remove | Keep | Run
 
 
 def _unreadable(path: Path, error: OSError) -> MendableError:
     if isinstance(error, PermissionError):
         return NotPermittedError(f"no permission to read {path}; run it with sudo")
-    return ExitError(Exit.FAILURE, f"cannot read {path}: {error.strerror}; check the file")
+    return MendableError(f"cannot read {path}: {error.strerror}; check the file")

@@ -24,9 +24,6 @@ from acsard.host import clock
 from acsard.host.processes import name_of
 from acsard.machine.finding import Finding, Level
 
-WATCHED_S = 1.0
-"""Time over which lines are counted, s: about a hundred lines."""
-
 SHOWN = 6
 """Number of differing keys that are named one by one. More mean another file."""
 
@@ -89,7 +86,7 @@ def asked(config: Config, address: Address) -> Running:
     endpoint, robot_id, tls = address
     with connect(endpoint, robot_id=robot_id, tls=tls) as robot:
         info, before = robot.get("info"), robot.get("state")
-        time.sleep(WATCHED_S)
+        time.sleep(1.0)  # about a hundred lines are counted meanwhile
         rows = tuple(robot.get("diagnostics").status)
         runs, here = _configuration(robot, info, config), name_of(info.pid) == "acsard"
         asked = clock.now()

@@ -16,9 +16,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import acsard
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import MendableError
 from acsard.host.processes import called
-from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Step, Write
+from acsard.machine.installation_steps import File, Keep, Remove, Run, Step, Write
 
 HOME = "/opt/acsard/venv"
 """Path of the venv in the unit files of `deploy/`."""
@@ -99,9 +99,6 @@ STATES = {
 
 Found = Mapping[Path, bytes | None]
 """Present content of each file's path; None if it does not exist."""
-
-ASK_S = 10.0
-"""Time limit for a call of systemd, s: it answers at once, or it hangs."""
 
 RELOAD = (
     Run(("systemctl", "daemon-reload")),
@@ -184,7 +181,7 @@ def present(wanted: Iterable[File]) -> dict[Path, bytes | None]:
 
 
 def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Step]:
-    """Return the installation steps; raise `ExitError` if they would overwrite a changed file."""
+    """Return the installation steps; raise `MendableError` if one would replace a changed file."""
     steps: list[Step] = []
     changed: list[str] = []
     for file in wanted:
@@ -197,7 +194,7 @@ def installing(wanted: Iterable[File], found: Found, *, force: bool) -> list[Ste
         steps.append(Write(file))
     if changed and not force:
         paths = ", ".join(changed)
-        raise ExitError(Exit.FAILURE, f"would overwrite {paths}; look at them, or use --force")
+        raise MendableError(f"would overwrite {paths}; look at them, or use --force")
     return [*steps, *INSTALLED]
 
 
@@ -244,7 +241,7 @@ def uninstalling(
     ]
     for path in others:
         what = "certificates and their authority" if path == Path(TLS) else "not the service's own"
-        steps.append(RemoveAll(path) if purge else Keep(path, f"{what}; --purge removes it"))
+        steps.append(Remove(path) if purge else Keep(path, f"{what}; --purge removes it"))
     for unit in stateful:
         where, what = STATES[unit]
         # systemd knows the real place of the state directory, as long as it knows the unit.
@@ -259,7 +256,7 @@ def state(unit: str) -> str:
     """Return systemd's report about a unit; "" if systemd does not answer."""
     about = "--property=ActiveState,SubState,StatusText,NRestarts"
     try:
-        done = called(("systemctl", "show", unit, about), ASK_S)
+        done = called(("systemctl", "show", unit, about), 10.0)
     except (OSError, subprocess.TimeoutExpired):
         return ""
     return done.stdout.strip() or done.stderr.strip()
@@ -273,7 +270,7 @@ def source() -> Path:
         return inside
     clone = package.parent / "deploy"
     if not clone.is_dir():
-        raise ExitError(Exit.FAILURE, f"neither {inside} nor {clone} exists; install acsard again")
+        raise MendableError(f"neither {inside} nor {clone} exists; install acsard again")
     return clone
 
 

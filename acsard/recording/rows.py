@@ -100,7 +100,7 @@ class Row(Struct, frozen=True, array_like=True):
     tick: bool
     port_open: bool
     at_once: bool
-    leaving: bool
+    shutting_down: bool
     superseded: bool
     now: int
     """Time since the previous tick of the batch, or since `Batch.mono_ns` before the first tick."""
@@ -163,7 +163,7 @@ def encode(first: int, taken: Sequence[Taken]) -> bytes:
                 tick=inputs.tick,
                 port_open=inputs.port_open,
                 at_once=inputs.at_once,
-                leaving=inputs.leaving,
+                shutting_down=inputs.shutting_down,
                 superseded=inputs.superseded,
                 now=now,
                 offset=offset,
@@ -276,7 +276,7 @@ def _steps(batch: Batch) -> Iterator[Step]:
             superseded=row.superseded,
             missed=rare.missed,
             events=rare.events_in,
-            leaving=row.leaving,
+            shutting_down=row.shutting_down,
         )
         recorded = RecordedOutputs(
             line=row.line,

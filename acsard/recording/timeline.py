@@ -79,7 +79,7 @@ class TimelineWriter:
         self._distance_m = 0.0
         """Distance of the present drive."""
         self._source = ""
-        self._leaving = False
+        self._shutting_down = False
         self._losses = LinkLosses()
 
     def step(self, step: Step) -> Iterator[TimelineEntry]:
@@ -97,9 +97,9 @@ class TimelineWriter:
             entry = entry_of(event, step.inputs.now.wall_ns)
             repeated = self._losses.repeated(entry.name)
             yield replace(entry, name="link_heard") if repeated else entry
-        if step.inputs.leaving and not self._leaving:
+        if step.inputs.shutting_down and not self._shutting_down:
             yield TimelineEntry(wall_s, "end", "the daemon received the request to end")
-        self._leaving = step.inputs.leaving
+        self._shutting_down = step.inputs.shutting_down
 
     def _drive(self, step: Step, wall_s: float) -> Iterator[TimelineEntry]:
         for pose in step.recorded.poses:

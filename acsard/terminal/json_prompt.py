@@ -51,16 +51,10 @@ hand, each command is a sign of life, and the source's timeout applies.
 
 LISTEN_S = 0.05
 
-LEAVING_S = 1.0
-"""Time to wait for the reader thread at the end, s, if the program does not read."""
-
 LINE_BYTES = 65536
 """Largest length of an input line. A longer one interrupts the verb, because the program is
 faulty.
 """
-
-CHECK_STEPS = 16
-"""Approximate number of findings in a complete check, for its progress."""
 
 KEY = " "
 
@@ -94,31 +88,27 @@ class JsonPrompt:
     def __exit__(self, *error: object) -> None:
         with self._news:
             self._left = True
-        self._reader.join(LEAVING_S)
+        self._reader.join(1.0)  # it does not end if the program does not read
 
     # Output
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """Announce the subject; this is the first line."""
         self._tell(Subject(subject, simulated))
 
     def say(self, text: str) -> None:
-        """Send a text that stays visible."""
         self._tell(JobMessage(text))
 
     def doing(self, text: str) -> None:
-        """Send the present activity."""
         self._tell(Doing(text))
 
     def progress(self, share: float) -> None:
-        """Send the progress, 0 to 1."""
         self._tell(Progress(round(share, 3)))
 
     def found(self, finding: Finding) -> None:
-        """Send a finding as it is made, and the progress."""
         self._found += 1
         self._tell(Found(finding))
-        self.progress(min(0.99, self._found / CHECK_STEPS))
+        # A complete check has about 16 findings.
+        self.progress(min(0.99, self._found / 16))
 
     def result(self, text: str) -> None:
         """Send the result as a terminal shows it. From now on nothing moves."""
@@ -127,16 +117,12 @@ class JsonPrompt:
         self._tell(Result(text.strip("\n")))
 
     def ask(self, question: str, answers: Sequence[str]) -> str:
-        """Return one of the answers."""
         return self._choose(question, answers)
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Return when the leg may begin."""
         self._choose(text, ("start",), leg=True, by_key=by_key)
 
     def number(self, ask: Ask) -> float:
-        """Return the number that the person read off."""
-
         def read(value: str | float | None) -> float:
             return ask.number("" if value is None else str(value))
 

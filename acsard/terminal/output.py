@@ -65,7 +65,6 @@ def show_whole(text: Text) -> None:
 
 
 def plain(*parts: RenderableType, width: int = WHOLE) -> str:
-    """Return the parts as plain text."""
     file = io.StringIO()
     _console(file, width).print(Group(*parts))
     return "\n".join(line.rstrip() for line in file.getvalue().splitlines())

@@ -22,7 +22,6 @@ from acsard.checkup.findings import Finding
 from acsard.terminal.output import SENTENCES, show, table
 from acsard.terminal.prompt import Ask, NobodyError
 
-COLUMNS = 88
 BAR = 30
 
 LEAVES = "q"
@@ -51,16 +50,13 @@ class Screen:
         self._clear()
 
     def begin(self, subject: str, *, simulated: bool) -> None:
-        """Print the subject."""
         if not self._as_json:
             print(subject, flush=True)
 
     def say(self, text: str) -> None:
-        """Print a text."""
         self._print(f"\n{_wrapped(text)}\n")
 
     def doing(self, text: str) -> None:
-        """Show the present activity."""
         if self._on:
             # Cut the line and never wrap it, because a wrapped line cannot be overwritten.
             room = (os.get_terminal_size(sys.stderr.fileno()).columns or 80) - 1
@@ -68,13 +64,11 @@ class Screen:
             self._shown = True
 
     def found(self, finding: Finding) -> None:
-        """Print a finding."""
         if not self._as_json:
             self._clear()
             show(row(finding), most=SENTENCES)
 
     def result(self, text: str) -> None:
-        """Print the result."""
         self._clear()
         print(text)
 
@@ -83,7 +77,6 @@ class Screen:
         return False
 
     def _clear(self) -> None:
-        """Erase the activity line before other output."""
         if self._shown:
             self._print("\r\033[K")
             self._shown = False
@@ -103,11 +96,9 @@ class NoPrompt(Screen):
         return answers[0] if len(answers) == 1 else None
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Print the text."""
         self.say(text)
 
     def number(self, ask: Ask) -> float:
-        """Return the default."""
         if ask.usual is None:
             raise NobodyError("this method needs a person who measures: leave --yes out")
         return ask.usual
@@ -142,7 +133,6 @@ class TerminalPrompt(Screen):
             self._print(f"   please type {' or '.join(answers)}; {LEAVES} quits\n")
 
     def start(self, text: str, by_key: bool = False) -> None:
-        """Return when Enter is pressed."""
         self.say(text)
         # Keys that were pressed before the text appeared must not start anything.
         termios.tcflush(sys.stdin, termios.TCIFLUSH)
@@ -155,7 +145,6 @@ class TerminalPrompt(Screen):
                 raise KeyboardInterrupt
 
     def number(self, ask: Ask) -> float:
-        """Return the typed number."""
         with _lines():
             termios.tcflush(sys.stdin, termios.TCIFLUSH)
             while True:
@@ -169,7 +158,6 @@ class TerminalPrompt(Screen):
                     self.say(f"{error} (q quits)")
 
     def keys(self, wait_s: float) -> str:
-        """Return the keys that were pressed."""
         return _read() if select.select([sys.stdin], [], [], wait_s)[0] else ""
 
     def progress(self, share: float) -> None:
@@ -210,4 +198,4 @@ def _lines() -> Iterator[None]:
 
 
 def _wrapped(text: str) -> str:
-    return "\n".join(textwrap.wrap(text, COLUMNS))
+    return "\n".join(textwrap.wrap(text, 88))

@@ -11,10 +11,7 @@ from acsard.client.watch import Watch
 from acsard.core.messages.encodings import DecodeError
 from acsard.core.messages.schema import Info, RobotState
 from acsard.host.errors import MendableError, ReplyError
-from acsard.top.screen_data import ScreenData
-
-SPAN_S = 1.0
-"""Time over which rates are averaged; over less they would jump."""
+from acsard.top.text import ScreenData
 
 
 class Feed:
@@ -57,7 +54,8 @@ class Feed:
             self._past.clear()
             self._refresh_info()
         self._past.append((now, state))
-        while len(self._past) > 2 and now - self._past[1][0] >= SPAN_S:
+        # Rates are averaged over a second; over less they would jump.
+        while len(self._past) > 2 and now - self._past[1][0] >= 1.0:
             self._past.popleft()
 
     def seen(self, hint: str = "") -> ScreenData:

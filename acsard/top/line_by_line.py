@@ -33,7 +33,8 @@ def drive(ride: Ride) -> None:
             ride.step(typed)
             seen = ride.seen()
             if due.tell(seen, time.monotonic()):
-                print("\n".join(page.with_help(news(seen, _width()), _height())), flush=True)
+                width, height = _size()
+                print("\n".join(page.with_help(news(seen, width), height)), flush=True)
 
 
 def part(ride: Ride) -> None:
@@ -48,18 +49,15 @@ def part(ride: Ride) -> None:
         seen, took = ride.seen(), time.monotonic() - left
         rests = seen.state is not None and seen.age < took and not moves(seen.state)
         if rests or took > PART_S:
-            print("\n".join(parting(seen, _width())), flush=True)
+            print("\n".join(parting(seen, _size().columns)), flush=True)
             return
         time.sleep(PERIOD_S)
 
 
-def _width() -> int:
-    """Return the terminal's width in columns. A file's width is unlimited."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else NO_END
-
-
-def _height() -> int:
-    return shutil.get_terminal_size().lines if sys.stdout.isatty() else NO_END
+def _size() -> os.terminal_size:
+    """Return the size of the terminal. A file is unlimited."""
+    unlimited = os.terminal_size((NO_END, NO_END))
+    return shutil.get_terminal_size() if sys.stdout.isatty() else unlimited
 
 
 class News:

@@ -16,8 +16,7 @@ from rich.text import Text
 from acsard.core.formatting import rough, signed
 from acsard.core.messages.schema import RobotState
 from acsard.daemon.latencies import NAMES
-from acsard.top.screen_data import ScreenData
-from acsard.top.text import clean, count, rule
+from acsard.top.text import ScreenData, clean, count, rule
 from acsard.top.wide_screen import (
     certificate,
     drives,
@@ -106,7 +105,6 @@ LINES = (("lines in", "lines"), ("lines out", "lines_sent"), ("commands", "comma
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
-    """Return the daemon's timing figures."""
     heads = "".join(f"{name:>7}" for name in ("p50", "p99", "max"))
     lines = [rule(width, [(0, "timing")])]
     for since, last in (("last minute", True), ("since start", False)):

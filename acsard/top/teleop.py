@@ -7,17 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from textwrap import wrap
-from typing import TYPE_CHECKING
 
 from msgspec import Struct
+from rich.text import Text
 
 from acsard.core.formatting import printable
 from acsard.core.messages.one_line import place, speeds
 from acsard.core.messages.schema import RobotState
-from acsard.top.screen_data import MODES
-
-if TYPE_CHECKING:
-    from rich.text import Text
+from acsard.top.text import MODES
 
 HELP = (
     " u  i  o    arrows drive, too",
@@ -49,8 +46,6 @@ class Teleop(Struct, frozen=True):
 
 def lines(seen: Teleop, width: int, height: int | None = None) -> list[Text]:
     """Return the screen as lines of at most `width` characters."""
-    from rich.text import Text
-
     width = max(20, width)
     head = printable(f"{seen.robot_id} as {seen.source}  {seen.endpoint}")
     shown = [Text(head, "bold")]
@@ -118,7 +113,6 @@ def reason(state: RobotState) -> str:
 
 
 def asked(seen: Teleop) -> str:
-    """Return the speeds that the keys set."""
     return f"{seen.linear:.2f} m/s, {seen.angular:.2f} rad/s"
 
 
@@ -146,6 +140,4 @@ def _words(told: Sequence[str], width: int, figures: Sequence[str] = ()) -> list
 
 
 def _wrapped(text: str, width: int, style: str) -> list[Text]:
-    from rich.text import Text  # here, so that `acsard --help` does not load rich for 20 ms
-
     return [Text(line, style) for line in wrap(text, width, subsequent_indent="  ")]

@@ -10,10 +10,10 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
@@ -28,17 +28,10 @@ from acsard.top.view import screen
 
 PERIOD_S = 0.25
 
-KEYS_S = 0.05
-"""Interval at which the keys are read and the robot is driven."""
-
-ONCE_S = 0.5
-"""Time over which `--once` averages rates; a person waits for it."""
-
 
 def once(feed: Feed) -> str:
-    """Return one screen as plain text."""
     feed.ask()
-    time.sleep(ONCE_S)
+    time.sleep(0.5)  # rates are averaged over this time
     feed.ask()
     _be_lenient()
     width = Console().width
@@ -51,56 +44,47 @@ def live(feed: Feed) -> None:
     with suppress(AcsardError):
         feed.ask()
     console = Console()
-    _hold(lambda suspend: _watch(feed, console, suspend))
+
+    def draw() -> RenderableType:
+        feed.poll()
+        return screen(feed.seen("q quits"), *console.size)
+
+    _hold(lambda suspend: _watch(draw, console, suspend))
 
 
 def drive(step: Callable[[str], None], seen: Callable[[], Teleop]) -> None:
     """Pass the typed keys to `step`, "" if none, and show the result of `seen`, until a signal."""
     console = Console()
-    _hold(lambda suspend: _steer(step, seen, _teleop(console), suspend))
+    _hold(lambda suspend: _steer(step, seen, console, suspend))
 
 
 def roster(fleet: Fleet) -> None:
     """Show a line for each robot and update them until a key or a signal."""
     console = Console()
-    _hold(lambda suspend: _roster(fleet, console, suspend))
+
+    def draw() -> RenderableType:
+        rows = fleet.rows()
+        width, height = console.size
+        told = [Text(line, no_wrap=True) for line in table(rows, width, height - 2)]
+        told[0].stylize("bold cyan")
+        for line in told[1:]:
+            if "GONE" in line.plain or "SILENT" in line.plain:
+                line.stylize("bold red")
+        below = f"q quits   {fleet.more or fleet.seen}" if rows else fleet.hint()
+        last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
+        return Group(*told, Text(), last)
+
+    _hold(lambda suspend: _watch(draw, console, suspend))
 
 
-def _watch(feed: Feed, console: Console, suspend: list[bool]) -> bool:
+def _watch(draw: Callable[[], RenderableType], console: Console, suspend: list[bool]) -> bool:
     with keys() as read, _screen(console) as shown:
         while not suspend:
-            feed.poll()
-            width, height = console.size
-            shown.update(screen(feed.seen("q quits"), width, height), refresh=True)
+            shown.update(draw(), refresh=True)
             typed = read(PERIOD_S)
             if typed is None or "q" in typed.lower():
                 return False
     return True
-
-
-def _roster(fleet: Fleet, console: Console, suspend: list[bool]) -> bool:
-    with keys() as read, _screen(console) as shown:
-        while not suspend:
-            rows = fleet.rows()
-            width, height = console.size
-            told = [Text(line, no_wrap=True) for line in table(rows, width, height - 2)]
-            told[0].stylize("bold cyan")
-            for line in told[1:]:
-                if "GONE" in line.plain or "SILENT" in line.plain:
-                    line.stylize("bold red")
-            below = f"q quits   {fleet.more or fleet.seen}" if rows else fleet.hint()
-            last = Text(below.rstrip(), "dim", no_wrap=bool(rows), overflow="ellipsis")
-            shown.update(Group(*told, Text(), last), refresh=True)
-            typed = read(PERIOD_S)
-            if typed is None or "q" in typed.lower():
-                return False
-    return True
-
-
-@contextmanager
-def _teleop(console: Console) -> Iterator[Callable[[Teleop], None]]:
-    with _screen(console) as shown:
-        yield lambda seen: shown.update(Group(*lines(seen, *console.size)), refresh=True)
 
 
 def _screen(console: Console) -> Live:
@@ -131,23 +115,23 @@ def _hold(shows: Callable[[list[bool]], bool]) -> None:
 def _steer(
     step: Callable[[str], None],
     seen: Callable[[], Teleop],
-    screen: AbstractContextManager[Callable[[Teleop], None]],
+    console: Console,
     suspend: list[bool],
 ) -> bool:
     """Pass the typed keys to `step`, "" if none, and show the screen.
 
     Return True at ^Z and False when the input ends.
     """
-    with keys() as read, screen as show:
+    with keys() as read, _screen(console) as shown:
         due = 0.0
         while not suspend:
-            typed = read(KEYS_S)
+            typed = read(0.05)
             if typed is None:
                 return False
             step(typed)
             if typed or time.monotonic() >= due:
                 due = time.monotonic() + PERIOD_S
-                show(seen())
+                shown.update(Group(*lines(seen(), *console.size)), refresh=True)
     for letter in ("k", "", ""):
         step(letter)  # stop the robot: no steps run while suspended
     return True

@@ -1,4 +1,4 @@
-"""Formats the values and lines on the screen of `acsard top`. This module is pure.
+"""The data, the values and the lines on the screen of `acsard top`. This module is pure.
 
 Every value becomes a text of bounded length, whatever arrives on the bus. Text from the bus reaches
 the terminal only through `clean`, and only inside rich's `Text`, which does not interpret markup.
@@ -9,10 +9,44 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from msgspec import Struct
 from rich.cells import cell_len
 from rich.text import Text
 
 from acsard.core.formatting import printable
+from acsard.core.messages.schema import Info, RobotState
+
+MODES = {
+    "driving": "bold white on green",
+    "ready": "bold white on blue",
+    "waiting": "bold black on yellow",
+    "shutdown": "bold black on yellow",
+    "inactive": "bold black on white",
+    "stopped": "bold white on red",
+    "fault": "bold white on red",
+}
+"""Colours of the modes, in the words of the library rich."""
+
+
+class ScreenData(Struct, frozen=True):
+    """Everything that the screen shows; `before` is an earlier state, used to compute rates."""
+
+    robot_id: str
+    endpoint: str
+    state: RobotState | None
+    before: RobotState | None = None
+    age: float = 0.0
+    """Seconds since `state` arrived, or since the wait for the first one began."""
+    info: Info | None = None
+    undecodable: int = 0
+    """Number of consecutive messages on the state's key that could not be decoded."""
+    hint: str = ""
+    silent: bool = False
+    """Whether the robot counts as silent, so that the shown data is old."""
+    passed: float = 0.0
+    """Seconds from `before` to `state` by the local clock. The stamps differ from it by more than
+    the network delay only if the robot's clock was set."""
+
 
 MOST = 256
 """Maximum number of characters of a text; a screen shows fewer."""
@@ -53,7 +87,6 @@ def bar(value: float, scale: float, cells: int) -> str:
 
 
 def row(label: str, told: str, style: str = "") -> Text:
-    """Return a line with a label in front."""
     return Text.assemble((f"{label:<12}", "dim"), (told, style))
 
 

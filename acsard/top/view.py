@@ -17,8 +17,7 @@ from acsard.core.formatting import lasting, rough
 from acsard.core.messages.schema import RobotState
 from acsard.top import narrow_screen
 from acsard.top import wide_screen as beside
-from acsard.top.screen_data import MODES, ScreenData
-from acsard.top.text import clean, ends
+from acsard.top.text import MODES, ScreenData, clean, ends
 from acsard.top.wide_screen import WIDEST
 
 MOST_SOURCES = 32

@@ -15,8 +15,7 @@ from acsard.core.messages.schema import Info, RobotState, SourceState, Spread
 from acsard.core.motion.gyro import WORDS
 from acsard.core.values import NS_PER_S
 from acsard.daemon.latencies import NAMES
-from acsard.top.screen_data import ScreenData
-from acsard.top.text import bar, clean, count, rate, row, rule
+from acsard.top.text import ScreenData, bar, clean, count, rate, row, rule
 
 WIDEST = 116
 """Maximum width in cells; longer lines are harder to read."""
@@ -191,7 +190,6 @@ def overrun(state: RobotState) -> Text:
 
 
 def _gyro(does: str) -> Text:
-    """Return the effect of the gyro on the heading."""
     good = does in ("used", "waiting for rest")
     told = next((f"{name}: {words}" for name, words in WORDS.items() if name == does), clean(does))
     return row("gyro", told, "" if good else "yellow")
@@ -238,7 +236,6 @@ def refused(state: RobotState, before: RobotState) -> list[tuple[str, list[Text]
 
 
 def timing(state: RobotState, width: int) -> list[Text]:
-    """Return the daemon's timing figures."""
     long = width >= WIDEST
     room = LONG_WORDS if long else SHORT_WORDS
     start = 16 + room

@@ -28,7 +28,7 @@ def quiet(world: World) -> None:
     world.run(2.0)  # a clear that names no latch is refused for 2 s
     world.call("clear")
     world.drive(-0.4, 0.0, 1.0)
-    world.loop.leaving = True
+    world.loop.shutting_down = True
     world.run(0.7)
 
 

@@ -321,9 +321,9 @@ def test_a_zero_from_before_the_clear_does_not_count_as_neutral(world: World) ->
     assert "send a zero first" in world.state.reason
 
 
-def test_leaving_ramps_to_rest_and_obeys_nobody(world: World) -> None:
+def test_shutting_down_ramps_to_rest_and_obeys_nobody(world: World) -> None:
     world.drive(0.9, seconds=2.0)
-    world.loop.leaving = True
+    world.loop.shutting_down = True
     world.hold(0.9, seconds=0.35)
     assert world.loop.at_rest
     assert world.state.mode == "shutdown"

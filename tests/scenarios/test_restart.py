@@ -335,7 +335,7 @@ def test_a_stop_beside_a_bug_outside_of_the_robot_is_there_at_the_next_start(
 def test_a_stop_on_the_way_down_is_there_at_the_next_start() -> None:
     host = Host(random.Random(5))
     host.patrols(2 * CYCLE_S)
-    host.world.loop.leaving = True
+    host.world.loop.shutting_down = True
     host.patrols(0.1)
     host.world.put("stop", b"")
     assert host.world.state.mode == "shutdown"

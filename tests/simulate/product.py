@@ -351,7 +351,7 @@ class Product:
         """End the daemon by SIGTERM (`term`) or at once (`kill`)."""
         world = self._world
         if way == "term":
-            world.loop.leaving = True
+            world.loop.shutting_down = True
             for _ in range(60):
                 self.run_until(world.now_ns + 10_000_000)
                 if world.loop.at_rest:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from acsard.bench.measure import bench_config, measure
 from acsard.core.config.settings import Config, ControlConfig
-from acsard.host.errors import Exit, ExitError
+from acsard.host.errors import Exit, MendableError
 from tests.each import each
 from tests.system.harness import (
     ZERO_LINE,
@@ -99,7 +99,9 @@ def test_a_port_that_is_no_device_is_66_at_once(what: str) -> None:
 def test_commands_that_never_reach_the_wire_end_it_with_the_daemons_own_reason() -> None:
     config = bench_config(Config(), simulated=True)
     config = replace(config, control=ControlConfig(auto_activate=False))
-    with pytest.raises(ExitError, match=r"none of the \d+ commands .* says: switched off") as told:
+    with pytest.raises(
+        MendableError, match=r"none of the \d+ commands .* says: switched off"
+    ) as told:
         measure(config, "", 1.0)
     assert told.value.code == Exit.FAILURE
 

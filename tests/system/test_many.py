@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 from acsard.cli import main
-from acsard.client import connecting
+from acsard.client import synchronous
 from acsard.daemon.bus.robot_discovery import ALL, stop
 from tests.pages import blocks
 from tests.system.fleet_router import ROBOT_FILE, certified, router
@@ -174,14 +174,14 @@ def test_a_table_for_a_pipe_does_not_wait_for_the_connection_to_be_closed(
     near, far = os.pipe()
     os.set_blocking(near, False)
     told = [b""]
-    really = connecting._close
+    really = synchronous.close
 
     def close(session: zenoh.Session) -> None:
         with suppress(BlockingIOError):
             told.append(os.read(near, 65536))
         really(session)
 
-    monkeypatch.setattr(connecting, "_close", close)
+    monkeypatch.setattr(synchronous, "close", close)
     with os.fdopen(near, "rb"), os.fdopen(far, "w") as pipe, redirect_stdout(pipe):
         main(robots.words("fleet", "--once", who=f"{ONE},{TWO}")[3:])
     assert b"ready" in told[-1]

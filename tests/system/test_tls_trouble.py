@@ -26,7 +26,7 @@ ALL_NAMES = ["localhost", "127.0.0.1"]
 def _tls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An authority with a client's certificate, one that has expired, and another authority's."""
     place = tmp_path_factory.mktemp("tls")
-    ours = Authority.make(place / "ca", "ours", 10)
+    ours = Authority.make(place / "ca", "ours", 10, ["robot.example"])
     ours.issue(place / "client", "client", [], 1)
     ours.issue(place / "ended", "client", [], -1)
     ours.issue(place / "robot", "robot", ALL_NAMES, 1)

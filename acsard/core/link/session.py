@@ -14,7 +14,7 @@ from collections import Counter
 from acsard.core.config.motion_rules import LONGEST_REPLY_S
 from acsard.core.config.settings import FeedbackConfig, McuConfig
 from acsard.core.link import link_diagnosis
-from acsard.core.link.check import Reading, unseal
+from acsard.core.link.checksum import Reading, unseal
 from acsard.core.link.codec import Codec, FrameError
 from acsard.core.link.feedback import Feedback, Timeline
 from acsard.core.link.lines import LineReader
@@ -126,7 +126,7 @@ class McuSession:
         if port_open:
             for piece in received:
                 feedback += self._read(piece)
-            more = self._lines.too_long - self.rejects.get("too_long", 0)
+            more = self._lines.too_long - self.rejects.get("too_long", 0) if received else 0
             if more > 0:
                 self._reject("too_long", more=more)
                 self._bad()

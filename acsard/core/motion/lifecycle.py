@@ -20,7 +20,7 @@ from functools import lru_cache
 
 from msgspec.structs import replace
 
-from acsard.core.motion.modes import LEAVING, Mode, RefusedError, mode_of, require_allowed
+from acsard.core.motion.modes import GOING_DOWN, Mode, RefusedError, mode_of, require_allowed
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
 
 LOOK_FIRST_S = 2.0
@@ -42,7 +42,7 @@ class Lifecycle:
         """Start in the mode of these latches, or switched off if `active` is False."""
         self.latches = latches
         self.mode = Mode.WAITING
-        self._leaving = self._linked = self._commanded = False
+        self._shutting_down = self._linked = self._commanded = False
         self._dormant = not active
         """True until the first `activate`, with `control.auto_activate = false`."""
         found = (latches.stop, latches.fault, latches.inactive)
@@ -80,7 +80,7 @@ class Lifecycle:
 
     def leave(self) -> None:
         """Note that the daemon is going down."""
-        self._leaving = True
+        self._shutting_down = True
         self._derive()
 
     def fault(self, why: str, now: Instant) -> bool:
@@ -99,8 +99,8 @@ class Lifecycle:
         if not repeated:
             self._stopped_ns, self._stop_asked_ns = now.mono_ns, asked_ns
             self._latch(stop=self._made(now, by, f"stopped by {by or 'request'}"))
-        if self._leaving:
-            return f"stopped and latched; {LEAVING}"
+        if self._shutting_down:
+            return f"stopped and latched; {GOING_DOWN}"
         if self.latches.fault is not None:
             return "stopped and latched; srv/clear releases the fault first, then the stop"
         return "stopped and latched; srv/clear releases it"
@@ -206,7 +206,7 @@ class Lifecycle:
 
     def _derive(self) -> None:
         self.mode = mode_of(
-            leaving=self._leaving,
+            shutting_down=self._shutting_down,
             fault=self.latches.fault is not None,
             stopped=self.latches.stop is not None,
             inactive=self._off,

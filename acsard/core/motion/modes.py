@@ -37,10 +37,16 @@ class RefusedError(AcsardError):
 
 
 def mode_of(
-    *, leaving: bool, fault: bool, stopped: bool, inactive: bool, linked: bool, commanded: bool
+    *,
+    shutting_down: bool,
+    fault: bool,
+    stopped: bool,
+    inactive: bool,
+    linked: bool,
+    commanded: bool,
 ) -> Mode:
     """Return the first mode of the module's list whose condition holds."""
-    if leaving:
+    if shutting_down:
         return Mode.SHUTDOWN
     if fault:
         return Mode.FAULT
@@ -53,12 +59,12 @@ def mode_of(
     return Mode.DRIVING if commanded else Mode.READY
 
 
-LEAVING = "the daemon is going down"
+GOING_DOWN = "the daemon is going down"
 
 REFUSALS: dict[tuple[Mode, Verb], str] = {
-    (Mode.SHUTDOWN, "clear"): LEAVING,
-    (Mode.SHUTDOWN, "activate"): LEAVING,
-    (Mode.SHUTDOWN, "deactivate"): LEAVING,
+    (Mode.SHUTDOWN, "clear"): GOING_DOWN,
+    (Mode.SHUTDOWN, "activate"): GOING_DOWN,
+    (Mode.SHUTDOWN, "deactivate"): GOING_DOWN,
     (Mode.FAULT, "activate"): "the robot is in fault: call srv/clear first",
     (Mode.FAULT, "deactivate"): "the robot is in fault and cannot move: call srv/clear first",
     (Mode.STOPPED, "activate"): "the robot is stopped: call srv/clear first",

@@ -225,11 +225,13 @@ class Inbox:
         put = sample.kind == zenoh.SampleKind.PUT
         stamp, stamp_ns, sender, received_ns = sample.timestamp, None, "", None
         if stamp is not None:
-            stamp_ns, sender = stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id())
-            if stamp.get_id() == self.own_id:
-                stamp_ns, sender, received_ns = None, "", stamp_ns
-            elif via == "native" and sender in self.routers:
-                sender = ""
+            at_ns, session = stamp.get_time_as_ntp64().as_nanos(), stamp.get_id()
+            if session == self.own_id:
+                received_ns = at_ns
+            else:
+                stamp_ns, sender = at_ns, str(session)
+                if via == "native" and sender in self.routers:
+                    sender = ""
         arrival = Arrival(
             key,
             put,

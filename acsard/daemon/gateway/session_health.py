@@ -12,8 +12,8 @@ from typing import Literal
 from msgspec import Struct
 
 from acsard.core.values import NS_PER_S, Event, EventName
+from acsard.host.child import Silence
 from acsard.host.rate_limits import Bucket, Rate
-from acsard.host.silence import Silence
 
 STUCK_NS = NS_PER_S
 """Time without a new observation after which Zenoh counts as stuck, ns.

@@ -19,14 +19,7 @@ from contextlib import suppress
 import serial
 
 from acsard.host import clock
-from acsard.host.errors import (
-    Exit,
-    ExitError,
-    InUseError,
-    MendableError,
-    NoPortError,
-    NotPermittedError,
-)
+from acsard.host.errors import InUseError, MendableError, NoPortError, NotPermittedError
 from acsard.host.processes import holder_of
 
 _left_open: list[int] = []
@@ -178,7 +171,7 @@ def refusal(path: str, error: OSError) -> MendableError:
             who = f"process {holder.pid}" if holder else "another process"
             return InUseError(f"{path} is in use by {who}; {_FREE}")
         case _:
-            return ExitError(Exit.FAILURE, f"cannot open {path}: {error}")
+            return MendableError(f"cannot open {path}: {error}")
 
 
 _LISTED = "`acsard ports` lists the serial ports"

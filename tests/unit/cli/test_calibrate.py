@@ -12,7 +12,7 @@ from mcap.writer import Writer
 
 from acsard.cli import parser
 from acsard.core.config.parsing import parse
-from acsard.host.errors import Exit, ExitError, UnreachableError, UsageError
+from acsard.host.errors import Exit, MendableError, UnreachableError, UsageError
 from tests.unit.calibration.cut import usual
 
 GOOD = usual().csv(places=False)
@@ -99,7 +99,7 @@ def test_of_two_logs_put_together_a_distance_is_the_straight_one_s(
 def test_a_refusal_ends_with_failure_and_an_object(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(ExitError, match="column") as end:
+    with pytest.raises(MendableError, match="column") as end:
         called(tmp_path, "a,b\n1,2\n", "--json", "--write")
     assert end.value.code == Exit.FAILURE
     assert "column" in json.loads(capsys.readouterr().out)["refused"]
@@ -111,14 +111,14 @@ def test_a_refusal_has_what_was_told_of_the_log(
 ) -> None:
     rows = [f"{i / 100},1,1,0.1" for i in range(500)]
     rows[100] = "1,1,1,900"
-    with pytest.raises(ExitError, match="\\nnote: 1 cell of yaw_rate left out"):
+    with pytest.raises(MendableError, match="\\nnote: 1 cell of yaw_rate left out"):
         called(tmp_path, "t,left,right,yaw_rate\n" + "\n".join(rows), "--json")
     assert "1 cell of yaw_rate" in json.loads(capsys.readouterr().out)["notes"][0]
 
 
 def test_a_log_that_is_not_there_is_told(tmp_path: Path) -> None:
     args = parser(["calibrate"]).parse_args(["calibrate", "--log", str(tmp_path / "none.csv")])
-    with pytest.raises(ExitError, match="correct --log"):
+    with pytest.raises(MendableError, match="correct --log"):
         args.main(args)
 
 
@@ -138,7 +138,7 @@ def test_what_ros_records_is_told_to_be_exported(
             writer.add_message(channel, 1, b"\0\1\0\0", 1)
             writer.finish()
     args = parser(["calibrate"]).parse_args(["calibrate", "--json", "--log", str(log)])
-    with pytest.raises(ExitError, match="export it as CSV"):
+    with pytest.raises(MendableError, match="export it as CSV"):
         args.main(args)
     assert "export it as CSV" in json.loads(capsys.readouterr().out)["refused"]
 

@@ -13,7 +13,7 @@ from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.host import config_file
 from acsard.host.config_file import PLACES, find, writable
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
 from tests.each import each
 
 
@@ -89,11 +89,13 @@ def test_a_named_file_that_is_missing_is_an_error_and_never_replaced(
 ) -> None:
     places.fill()
     places.variable.unlink()
-    with pytest.raises(ExitError, match=r"cannot read /nowhere/x\.toml: No such file") as caught:
+    with pytest.raises(
+        MendableError, match=r"cannot read /nowhere/x\.toml: No such file"
+    ) as caught:
         find("/nowhere/x.toml")
     assert caught.value.code == Exit.BAD_CONFIG
     monkeypatch.setenv("ACSARD_CONFIG", str(places.variable))
-    with pytest.raises(ExitError, match="cannot read"):
+    with pytest.raises(MendableError, match="cannot read"):
         find(None)
 
 
@@ -101,7 +103,7 @@ def test_a_file_here_that_cannot_be_read_is_an_error_and_not_passed_over(places:
     places.fill()
     places.here.unlink()
     places.here.mkdir()
-    with pytest.raises(ExitError, match=r"cannot read acsard\.toml: Is a directory") as caught:
+    with pytest.raises(MendableError, match=r"cannot read acsard\.toml: Is a directory") as caught:
         find(None)
     assert caught.value.code == Exit.BAD_CONFIG
 
@@ -120,7 +122,7 @@ def test_every_problem_is_printed_with_the_file_it_is_in(
     places: Places, capsys: pytest.CaptureFixture[str], text: str, words: str
 ) -> None:
     places.option.write_text(text)
-    with pytest.raises(ExitError, match=words) as caught:
+    with pytest.raises(MendableError, match=words) as caught:
         load(str(places.option))
     assert int(caught.value.code) == 78
     out, err = capsys.readouterr()
@@ -178,7 +180,7 @@ def test_a_certificate_goes_with_a_tls_endpoint_only(
 def test_a_tool_without_an_address_says_so(tmp_path: Path) -> None:
     file = tmp_path / "a.toml"
     file.write_text("[bus]\nlisten = []\n")
-    with pytest.raises(ExitError) as caught:
+    with pytest.raises(MendableError) as caught:
         robot_address(argparse.Namespace(config=str(file), connect=None, id=None, tls=None))
     assert caught.value.code is Exit.BAD_CONFIG
 
@@ -257,7 +259,7 @@ def test_where_it_is_recorded_is_told_whole_to_who_stands_elsewhere(
 
 
 def test_who_has_no_file_to_write_to_is_sent_to_the_robot(places: Places) -> None:
-    with pytest.raises(ExitError) as raised:
+    with pytest.raises(MendableError) as raised:
         writable(None)
     assert "on the robot" in str(raised.value)
     assert "acsard.toml there" in str(raised.value)

@@ -6,7 +6,12 @@ import pytest
 
 from acsard.cli import main
 from acsard.host import errors
-from acsard.host.errors import WORDS, Exit, ExitError, MendableError
+from acsard.host.errors import (
+    WORDS,
+    Exit,
+    ExitError,
+    MendableError,
+)
 from tests.each import each
 
 PROMISED = [

@@ -11,7 +11,8 @@ import sys
 import pytest
 
 from acsard.cli import foxglove
-from acsard.host.errors import Exit, ExitError, UsageError
+from acsard.host.errors import Exit, MendableError, UsageError
+from tests.each import each
 
 
 def test_without_its_library_it_says_which_extra_to_install(
@@ -20,7 +21,7 @@ def test_without_its_library_it_says_which_extra_to_install(
     for name in [name for name in sys.modules if name.startswith("acsard.foxglove")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "foxglove", None)  # as if the library were not installed
-    with pytest.raises(ExitError, match=r"pip install .*\[foxglove\]'") as told:
+    with pytest.raises(MendableError, match=r"pip install .*\[foxglove\]'") as told:
         foxglove.main(argparse.Namespace())
     assert told.value.code == Exit.FAILURE
 
@@ -51,9 +52,7 @@ def test_beyond_this_machine_is_refused_with_the_reason_and_the_tunnel(text: str
         foxglove.loopback(text)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"]
-)
+@each("text", ["", "8765", "127.0.0.1", "robot:8765", "127.0.0.1:x", "[::1]:8765"])
 def test_what_is_no_address_is_told_how_to_write_one(text: str) -> None:
     with pytest.raises(UsageError, match=r"write it like 127\.0\.0\.1:8765"):
         foxglove.loopback(text)

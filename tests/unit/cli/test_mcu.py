@@ -23,7 +23,7 @@ from acsard.core.config.parsing import parse
 from acsard.core.config.settings import Config
 from acsard.core.simulator.fake_mcu import FakeMcu
 from acsard.core.simulator.virtual_wire import VirtualWire
-from acsard.host.errors import Exit, ExitError, NoPortError, UsageError
+from acsard.host.errors import Exit, MendableError, NoPortError, UsageError
 from acsard.terminal.prompt import ended_by_signals
 from acsard.terminal.terminal_prompt import TerminalPrompt
 from tests.unit.checkup.robots import Busy, Robot
@@ -127,7 +127,7 @@ def test_findings_are_told_also_when_the_file_cannot_be_written(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("acsard.host.config_file.replace", full)
-    with pytest.raises(ExitError, match="No space left"):
+    with pytest.raises(MendableError, match="No space left"):
         called(tmp_path, "--port", "sim", "--yes", "--json", "--write")
     assert json.loads(capsys.readouterr().out)["written"] is None
     assert (tmp_path / "acsard.toml").read_text() == ""
@@ -140,7 +140,7 @@ def test_write_without_a_file_is_told_before_anything_moves(
     monkeypatch.delenv("ACSARD_CONFIG", raising=False)
     monkeypatch.setattr("acsard.host.config_file.PLACES", (Path("acsard.toml"),))
     args = parser(["mcu"]).parse_args(["mcu", "check", "--port", "sim", "--yes", "--write"])
-    with pytest.raises(ExitError, match="no configuration file"):
+    with pytest.raises(MendableError, match="no configuration file"):
         args.main(args)
 
 
@@ -148,7 +148,7 @@ def test_write_without_tomlkit_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "tomlkit", None)
-    with pytest.raises(ExitError, match=r"pip install .*\[write\]'"):
+    with pytest.raises(MendableError, match=r"pip install .*\[write\]'"):
         called(tmp_path, "--port", "sim", "--yes", "--write")
 
 

@@ -25,7 +25,7 @@ from acsard.core.config.settings import (
     WheelMap,
 )
 from acsard.core.guard import MARGIN_NS, Guard, Memory
-from acsard.core.link.check import seal
+from acsard.core.link.checksum import seal
 from acsard.core.link.codec import Codec
 from acsard.core.motion.kinematics import Kinematics
 from acsard.core.motion.limits import Limiter
@@ -433,9 +433,9 @@ class Clocked:
         return trip
 
 
-def test_an_hour_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
+def test_ten_minutes_of_one_speed_after_a_stop_is_cut_short_when_the_longest_ramp_is_over() -> None:
     clocked = Clocked()
-    trips = [clocked.trip(ms, "stopped") for ms in range(10, 3_600_000, 10)]
+    trips = [clocked.trip(ms, "stopped") for ms in range(10, 600_000, 10)]
     first = next(n for n, trip in enumerate(trips) if trip)
     assert trips[first] == LATE
     assert (first + 1) * 10 == 10 + 500 + MARGIN_NS // MS + 10

@@ -74,7 +74,7 @@ class Bench:
         self.opened = 1
         self.port_open = True
         self.reply: bytes | None = self.codec.stop
-        self.leaving = False
+        self.shutting_down = False
         self.out = self.robot.step(Inputs(self.now, tick=False, port_open=False))
 
     @property
@@ -119,7 +119,7 @@ class Bench:
                 refusals=refusals,
                 guard_trip=guard_trip,
                 superseded=superseded,
-                leaving=self.leaving,
+                shutting_down=self.shutting_down,
             )
         )
         return self.out
@@ -916,33 +916,33 @@ def test_after_a_fault_each_source_must_be_neutral() -> None:
 # shutdown
 
 
-def test_leaving_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
+def test_shutting_down_ramps_to_zero_by_the_stop_deceleration_and_stays_there() -> None:
     bench = Bench().driving()
-    bench.leaving = True
+    bench.shutting_down = True
     path = [bench.step(GO).applied.linear for _ in range(20)]
     assert path[:3] == pytest.approx([0.47, 0.44, 0.41])
     assert path[17:] == [0.0, 0.0, 0.0]
     assert (bench.mode(), bench.out.reason) == ("shutdown", "the daemon is going down")
 
 
-def test_leaving_is_one_event() -> None:
+def test_shutting_down_is_one_event() -> None:
     bench = Bench().driving()
-    bench.leaving = True
+    bench.shutting_down = True
     (event,) = bench.step().events
     assert event == Event("mode", "driving -> shutdown: the daemon is going down")
     assert names(bench.step()) == []
 
 
 @pytest.mark.parametrize("verb", ["clear", "activate", "deactivate"])
-def test_a_leaving_robot_refuses_to_be_switched(verb: Verb) -> None:
+def test_a_robot_that_shuts_down_refuses_to_be_switched(verb: Verb) -> None:
     bench = Bench().linked()
-    bench.leaving = True
+    bench.shutting_down = True
     assert bench.answer(verb) == Answer(7, False, "the daemon is going down")
 
 
-def test_a_leaving_robot_never_drives_again() -> None:
+def test_a_robot_that_shuts_down_never_drives_again() -> None:
     bench = Bench(Config(commands=CommandsConfig(neutral_first=False))).driving()
-    bench.leaving = True
+    bench.shutting_down = True
     for _ in range(100):
         bench.step(GO)
     assert (bench.mode(), bench.out.applied) == ("shutdown", REST)
@@ -1116,7 +1116,7 @@ def test_a_linked_robot_is_ready_in_the_step_that_activates_it() -> None:
 
 def test_a_stop_on_the_way_down_is_latched_for_the_next_start() -> None:
     bench = Bench().linked()
-    bench.leaving = True
+    bench.shutting_down = True
     assert bench.answer("stop") == Answer(7, True, "stopped and latched; the daemon is going down")
     assert bench.out.mode == "shutdown"
     assert bench.out.latches.stop is not None

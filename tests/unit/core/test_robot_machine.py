@@ -187,7 +187,7 @@ class RobotMachine(RuleBasedStateMachine):
         self.period_ms = 1000 / config.rate_hz
         self.books = {s.name: Books(s, config.commands.neutral_first) for s in SOURCES}
         self.now_ns = 50 * NS_PER_S
-        self.port_open, self.opened, self.blocked, self.leaving = True, 1, False, False
+        self.port_open, self.opened, self.blocked, self.shutting_down = True, 1, False, False
         self.trip, self.superseded = "", False
         self.commands: list[Command] = []
         self.requests: list[Request] = []
@@ -408,7 +408,7 @@ class RobotMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.now_ns % 7 == 0)
     @rule()
     def it_leaves(self) -> None:
-        self.leaving = True
+        self.shutting_down = True
         self.step(reply=True)
 
     # inputs of the robot
@@ -496,7 +496,7 @@ class RobotMachine(RuleBasedStateMachine):
                 requests=requests,
                 guard_trip=self.trip,
                 superseded=self.superseded,
-                leaving=self.leaving,
+                shutting_down=self.shutting_down,
             )
         )
         self.commands.clear()
@@ -571,7 +571,7 @@ class RobotMachine(RuleBasedStateMachine):
         mode, was = outputs.mode, "" if self.before is None else self.before.mode
         if "stop" in done and "clear" not in done:
             assert mode in ("stopped", "fault", "shutdown")
-        if was == "shutdown" or self.leaving:
+        if was == "shutdown" or self.shutting_down:
             assert mode == "shutdown"
         elif was in ("stopped", "fault") and "clear" not in done:
             assert mode in (was, "fault")

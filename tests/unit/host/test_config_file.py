@@ -10,7 +10,7 @@ from tomlkit.exceptions import NonExistentKey
 
 from acsard.core.config.parsing import parse
 from acsard.host.config_file import change
-from acsard.host.errors import ExitError
+from acsard.host.errors import MendableError
 
 REFERENCE = Path(__file__).parents[3] / "acsard.toml"
 
@@ -48,7 +48,7 @@ def test_only_the_values_of_the_reference_change(tmp_path: Path) -> None:
 def test_a_file_that_would_not_check_is_left_as_it_was(tmp_path: Path) -> None:
     file = tmp_path / "acsard.toml"
     file.write_text("[mcu]\n")
-    with pytest.raises(ExitError, match="was not changed"):
+    with pytest.raises(MendableError, match="was not changed"):
         change(file, {"mcu.baud_rate": 300})
     assert file.read_text() == "[mcu]\n"
     assert os.listdir(tmp_path) == ["acsard.toml"]
@@ -62,7 +62,7 @@ def test_what_the_library_cannot_do_is_said(
 
     monkeypatch.setattr("tomlkit.parse", fails)
     (tmp_path / "acsard.toml").write_text("# mine\n")
-    with pytest.raises(ExitError, match="was not changed"):
+    with pytest.raises(MendableError, match="was not changed"):
         change(tmp_path / "acsard.toml", KEYS)
     assert (tmp_path / "acsard.toml").read_text() == "# mine\n"
 
@@ -77,7 +77,7 @@ def test_a_link_stays_one(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ExitError):
+    with pytest.raises(MendableError):
         change(tmp_path / "none.toml", KEYS)
 
 

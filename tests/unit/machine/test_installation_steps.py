@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.host.errors import ExitError
-from acsard.machine.installation_steps import File, Remove, RemoveAll, Run, Write
+from acsard.host.errors import MendableError
+from acsard.machine.installation_steps import File, Remove, Run, Write
 
 
 def test_written_and_removed_a_directory_is_as_it_was(tmp_path: Path) -> None:
@@ -36,10 +36,10 @@ def test_a_directory_with_something_else_in_it_stays(tmp_path: Path) -> None:
 
 def test_a_command_that_fails_ends_it_unless_it_may() -> None:
     words = ("sh", "-c", "echo no >&2; exit 1")
-    with pytest.raises(ExitError, match="no"):
+    with pytest.raises(MendableError, match="no"):
         Run(words).do()
     Run(words, may_fail=True).do()
-    with pytest.raises(ExitError, match="no such program"):
+    with pytest.raises(MendableError, match="no such program"):
         Run(("no such program",)).do()
 
 
@@ -47,7 +47,7 @@ def test_a_whole_directory_goes_and_those_of_ours_that_are_empty_then(tmp_path: 
     place = tmp_path / "acsard" / "tls"
     (place / "clients").mkdir(parents=True)
     (place / "clients" / "key.pem").touch()
-    RemoveAll(place).do()
+    Remove(place).do()
     assert not list(tmp_path.iterdir())
 
 
@@ -55,5 +55,5 @@ def test_what_cannot_be_read_is_a_sentence(tmp_path: Path) -> None:
     place = File(tmp_path / "acsard.toml", b"")
     place.path.mkdir()
     assert place.condition() == "unreadable"
-    with pytest.raises(ExitError, match=r"cannot read .*acsard\.toml"):
+    with pytest.raises(MendableError, match=r"cannot read .*acsard\.toml"):
         place.found()

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from acsard.host.errors import ExitError
-from acsard.machine.installation_steps import File, Keep, Remove, RemoveAll, Run, Write
+from acsard.host.errors import MendableError
+from acsard.machine.installation_steps import File, Keep, Remove, Run, Write
 from acsard.machine.service_installation import (
     GATEWAY,
     GONE,
@@ -116,7 +116,7 @@ def test_what_is_as_installed_is_kept_and_the_commands_run_all_the_same() -> Non
 
 def test_somebody_else_s_file_is_overwritten_by_force_only() -> None:
     found = there(unit=b"mine", own=None)
-    with pytest.raises(ExitError, match=f"would overwrite {UNIT_FILE.path};"):
+    with pytest.raises(MendableError, match=f"would overwrite {UNIT_FILE.path};"):
         installing(ALL, found, force=False)
     steps = installing(ALL, found, force=True)
     assert [step for step in steps if isinstance(step, Write)] == [Write(UNIT_FILE), Write(OWN)]
@@ -185,7 +185,7 @@ def test_a_purge_keeps_nothing() -> None:
     tls, found = Path("/etc/acsard/tls"), there(unit=b"mine", own=b"mine")
     steps = uninstalling(ALL, found, [tls], force=True, purge=True)
     assert not [step for step in steps if isinstance(step, Keep)]
-    assert {step.path for step in steps if isinstance(step, (Remove, RemoveAll))} == {
+    assert {step.path for step in steps if isinstance(step, (Remove, Remove))} == {
         *(file.path for file in ALL),
         tls,
     }

@@ -75,7 +75,7 @@ PARTS: dict[str, st.SearchStrategy[object]] = {
     "missed": st.integers(0, 5),
     "events": st.lists(st.builds(Event, st.just("imu_refused"), TEXT), max_size=1).map(tuple),
     "at_once": st.booleans(),
-    "leaving": st.booleans(),
+    "shutting_down": st.booleans(),
 }
 INPUTS = st.builds(Inputs, **PARTS)
 

@@ -23,7 +23,7 @@ def driven() -> Tape:
     world.drive(0.5, seconds=2.0)
     world.call("stop")
     world.run(0.5)
-    world.loop.leaving = True
+    world.loop.shutting_down = True
     world.run(0.1)
     return tape
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from acsard.core.messages.schema import Info, Latency, RobotState, SourceState, Spread, Time
 from acsard.daemon.latencies import NAMES
-from acsard.top.screen_data import ScreenData
+from acsard.top.text import ScreenData
 from acsard.top.view import screen
 
 MEASURED = Latency(Spread(9000, 56.2, 112.2, 8000.0), Spread(6000, 63.1, 891.0, 9700.0))

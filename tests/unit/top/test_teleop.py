@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from acsard.core.motion.modes import Mode
-from acsard.top.screen_data import MODES
 from acsard.top.teleop import HELP, Teleop, lines, news, parting
+from acsard.top.text import MODES
 from tests.each import each
 from tests.unit.top.screens import STATE
 

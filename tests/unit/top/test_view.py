@@ -13,7 +13,7 @@ from rich.cells import cell_len
 from acsard.core.messages.schema import Latency, RobotState, SourceState, Spread, Time
 from acsard.core.motion.modes import Mode
 from acsard.daemon.latencies import NAMES
-from acsard.top.screen_data import MODES, ScreenData
+from acsard.top.text import MODES, ScreenData
 from tests.each import each
 from tests.unit.top.screens import INFO, MEASURED, SEEN, STATE, line_with, lines_of, of, painted
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from acsard.core.motion.lifecycle import LOOK_FIRST_S, Lifecycle, utc
 from acsard.core.motion.modes import Mode, RefusedError, mode_of
 from acsard.core.values import NS_PER_S, Instant, Latch, Latches
+from tests.each import each
 
 WALL_NS = 1_800_000_000 * NS_PER_S
 AT = "2027-01-15 08:00"
@@ -79,7 +80,7 @@ FAULT = Latch(8, WALL_NS, "", "a wheel is dead", kept=True)
 OFF = Latch(9, WALL_NS, "joe", "switched off by joe", kept=True)
 
 
-@pytest.mark.parametrize(
+@each(
     ("latches", "begins", "why"),
     [
         (
@@ -241,8 +242,8 @@ def test_a_step_of_the_wall_clock_does_not_end_the_two_seconds() -> None:
         life.clear(None, ns(1.5), Instant(ns(1.5), WALL_NS + ns(3600.0)))
 
 
-@pytest.mark.parametrize("wall_s", [-3e8, 0.0, 1.5, 3e8])
-@pytest.mark.parametrize("kept", [True, False])
+@each("wall_s", [-3e8, 0.0, 1.5, 3e8])
+@each("kept", [True, False])
 def test_the_two_seconds_of_a_stop_from_the_start_count_from_the_first_step(
     kept: bool, wall_s: float
 ) -> None:
@@ -560,7 +561,7 @@ def test_the_limits_are_kept_beside_the_latches() -> None:
 class State(NamedTuple):
     """All facts that decide the mode."""
 
-    leaving: bool
+    shutting_down: bool
     fault: bool
     stopped: bool
     inactive: bool
@@ -617,7 +618,7 @@ PAUSES = (0.5, LOOK_FIRST_S + 1.0)
 def state_of(life: Lifecycle) -> State:
     latches = life.latches
     return State(
-        life._leaving,
+        life._shutting_down,
         latches.fault is not None,
         latches.stop is not None,
         latches.inactive is not None,
@@ -679,9 +680,9 @@ def test_every_combination_of_facts_and_latches_is_reached() -> None:
 def test_the_mode_always_follows_from_the_list() -> None:
     for edge in EDGES:
         *held, inactive, linked, commanded, dormant = edge.after
-        leaving, fault, stopped = held
+        shutting_down, fault, stopped = held
         assert edge.mode is mode_of(
-            leaving=leaving, fault=fault, stopped=stopped, inactive=inactive or dormant,
+            shutting_down=shutting_down, fault=fault, stopped=stopped, inactive=inactive or dormant,
             linked=linked, commanded=commanded,
         )  # fmt: skip
 
@@ -715,7 +716,7 @@ def test_clear_releases_exactly_one_latch_and_the_fault_first() -> None:
 def test_a_clear_by_the_current_number_succeeds_unless_the_daemon_goes_down() -> None:
     for edge in EDGES:
         if edge.trigger == "clear by number":
-            assert edge.refused == edge.before.leaving
+            assert edge.refused == edge.before.shutting_down
 
 
 def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -> None:
@@ -723,14 +724,14 @@ def test_a_clear_that_names_another_latch_or_came_before_it_releases_nothing() -
     for edge in EDGES:
         if edge.trigger in wrong:
             assert edge.before == edge.after
-            held = edge.before.fault or edge.before.stopped or edge.before.leaving
+            held = edge.before.fault or edge.before.stopped or edge.before.shutting_down
             assert edge.refused == held
 
 
 def test_a_plain_clear_is_refused_until_two_seconds_after_a_stop() -> None:
     for edge in EDGES:
         if edge.trigger == "clear without a number" and edge.pause_s > LOOK_FIRST_S:
-            assert edge.refused == edge.before.leaving
+            assert edge.refused == edge.before.shutting_down
 
 
 def test_nothing_but_activate_ends_inactive() -> None:
@@ -779,7 +780,7 @@ def test_a_stop_always_ends_in_a_latched_stop() -> None:
 
 
 def test_the_shutdown_is_for_good() -> None:
-    assert all(edge.after.leaving for edge in EDGES if edge.before.leaving)
+    assert all(edge.after.shutting_down for edge in EDGES if edge.before.shutting_down)
 
 
 def test_driving_begins_only_without_any_latch() -> None:
@@ -799,7 +800,7 @@ def test_switching_off_is_refused_exactly_while_a_latch_holds_or_the_daemon_leav
     for edge in EDGES:
         if edge.trigger == "deactivate":
             before = edge.before
-            assert edge.refused == (before.leaving or before.fault or before.stopped)
+            assert edge.refused == (before.shutting_down or before.fault or before.stopped)
             assert edge.refused or edge.after.inactive
 
 
@@ -810,11 +811,11 @@ def test_switching_on_by_number_is_refused_exactly_while_a_latch_holds_or_the_da
         late = edge.trigger == "activate without a number" and edge.pause_s > LOOK_FIRST_S
         if edge.trigger == "activate by number" or late:
             before = edge.before
-            assert edge.refused == (before.leaving or before.fault or before.stopped)
+            assert edge.refused == (before.shutting_down or before.fault or before.stopped)
             assert edge.refused or not (edge.after.inactive or edge.after.dormant)
 
 
-@pytest.mark.parametrize(
+@each(
     ("wall_ns", "text"),
     [
         (0, "1970-01-01 00:00:00 UTC"),

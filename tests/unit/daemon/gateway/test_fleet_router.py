@@ -137,8 +137,8 @@ def test_for_the_robot_of_the_template_the_file_is_the_template() -> None:
     assert made(["robot1"]) == read(TEMPLATE)
 
 
-@pytest.mark.parametrize("role", ROLES)
-@pytest.mark.parametrize("message", ["query", "put"])
+@each("role", ROLES)
+@each("message", ["query", "put"])
 def test_each_role_may_use_the_same_keys_as_at_the_gateway_of_a_robot(
     role: Role, message: str
 ) -> None:
