@@ -198,7 +198,7 @@ class LatchFile:
             return stopped(Latches(), unreadable(self.where, _reason(error)), now)
 
     def _take_lock(self, path: Path) -> None:
-        """Lock the file against other daemons; raise `InUseError` if another daemon has locked it."""
+        """Lock the file against other daemons; raise `InUseError` if another one has locked it."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
