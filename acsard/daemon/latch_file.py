@@ -1,9 +1,9 @@
 """The file that keeps stop, fault, `inactive` and lowered limits over every end of the process.
 
-A thread writes it. The control loop only hands over the newest latches and never waits for the
-disk. From the rename on, a killed process loses nothing. From the sync on, a power cut loses
-nothing. The file is read once, before the robot exists. `latch_rules.py` decides what the robot
-starts with.
+A thread writes the file. The control loop only hands the newest latches to the thread, and never
+waits for the disk. After the thread has renamed the new file, a kill of the process loses nothing.
+After the thread has synced it, a power cut loses nothing. The file is read once, before the robot
+exists. `latch_rules.py` decides with which latches the robot starts.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from acsard.host.mailbox import Mailbox
 from acsard.host.threads import NoThreadError, in_thread
 
 START_S = 2.0
-"""Time limit of one write, and of reading and writing at the start. A slower disk hangs."""
+"""Time limit of one write, and of reading and writing at the start. A slower disk is said to hang.
+"""
 
 PACE_S = 0.05
 """Pause after each write. A flood of stops, each a new latch, must not wear out an SD card."""
@@ -48,15 +49,15 @@ RETRY_S = 1.0
 """Pause between two attempts to write a file that could not be written."""
 
 CLOSE_S = 0.3
-"""Time limit of the last write on the way down."""
+"""Time limit of the last write, when the daemon ends."""
 
 HANGS = f"the disk did not answer within {START_S:g} s"
 
 EVENTS = 64
-"""Events that wait for the control loop at most. It takes them in every step."""
+"""Largest number of events that wait for the control loop, which takes them in every step."""
 
 NO_PLACE = "no directory"
-"""Stands for the path where none can be found."""
+"""Text in messages in place of the path, if no directory for the file can be found."""
 
 
 def place(config: Config, environ: Mapping[str, str]) -> Path:
@@ -71,11 +72,11 @@ def place(config: Config, environ: Mapping[str, str]) -> Path:
             return Path(config.control.state_directory).expanduser() / name
     except RuntimeError as error:
         raise OSError(errno.ENOENT, f"control.state_directory: {error}") from None
-    # systemd gives several directories with colons between them.
+    # systemd may name several directories, with colons between them.
     service = environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if service:
         return Path(service) / name
-    # Its specification wants a relative path to be ignored.
+    # The XDG specification says that a relative path must be ignored.
     if environ.get("XDG_STATE_HOME", "").startswith("/"):
         return Path(environ["XDG_STATE_HOME"]) / "acsard" / name
     try:
@@ -91,29 +92,31 @@ class LatchFile:
     """The latch file of one robot. Call `start` once, then `keep` after every step."""
 
     def __init__(self, config: Config, environ: Mapping[str, str]) -> None:
+        """Find the path of the file from the configuration and the environment of the process."""
         self.where = NO_PLACE
         """Path of the file, for messages."""
         self._path: Path | None = None
         self._robot = config.robot.id
         self._barred = ""
-        """Why nothing may be written at all; empty if it may."""
+        """Why the file must not be written at all; "" if it may be written."""
         try:
             self._path = place(config, environ)
             self.where = str(self._path)
         except OSError as error:
             self._barred = _reason(error)
         self._lock = -1
-        """Descriptor that keeps other daemons away from this file."""
+        """Descriptor of the lock that keeps other daemons away from the latch file."""
         self._disk = threading.Lock()
-        """Held by the thread that is at the disk; the control loop never takes it."""
+        """The thread that uses the disk holds this lock. The control loop never takes it."""
         self._abandoned = False
-        """True if the start has stopped waiting for the first look at the file."""
+        """True if `start` has given up waiting for the first read of the file."""
         self._found: Latches | None = None
-        """The latches that the file had at the start; None until it has been read."""
+        """The latches that the file had at the start; None until the file has been read."""
         self._blind = False
-        """True if the robot has started without the content, and the file is not yet written."""
+        """True if the robot has started without the file's content, and the file is not written."""
         self._missed = Latches()
-        """Latches in the file that the robot did not start with, since the read took too long."""
+        """Latches of the file with which the robot did not start, because the read took too long.
+        """
         self._box = Mailbox[Latches](1)
         """The newest latches that were handed over, until the thread takes them."""
         self._news = Mailbox[Event](EVENTS)
@@ -121,7 +124,7 @@ class LatchFile:
         """The latches in the file."""
         self._failed = ""
         self._handed: Latches | None = None
-        """The latches that were handed over last."""
+        """The latches that `keep` took last."""
         self._busy_ns: int | None = None
         """Monotonic time at which the present write began; None between two writes."""
         self._hung = False
@@ -131,10 +134,10 @@ class LatchFile:
     # the start
 
     async def start(self, now: Instant) -> Latches:
-        """Return the latches to start with, after reading the file and trying to write it.
+        """Read the file, try to write it, and return the latches with which the robot starts.
 
         Raises:
-            InUseError: Another daemon keeps the latches of a robot with this id in this file.
+            InUseError: another daemon uses this file for a robot with the same id.
         """
         try:
             latches = await in_thread(lambda: self._look(now), START_S)
@@ -159,12 +162,15 @@ class LatchFile:
         return latches
 
     def _look(self, now: Instant) -> Latches:
-        """Read the file, decide, and write it once to see that it can be written."""
+        """Read the file, and write it once to find out whether it can be written.
+
+        Returns the latches with which the robot starts.
+        """
         with self._disk:
             if self._abandoned:
                 return Latches()
             latches = self._found = self._read(now)
-            # The thread syncs: a sync takes up to seconds on an SD card.
+            # The thread syncs the file, because a sync takes up to seconds on an SD card.
             trouble = self._replace(latches)
             if trouble and not self._abandoned:
                 self._fail(trouble)
@@ -179,7 +185,8 @@ class LatchFile:
             return Latches()
         self._take_lock(path)
         try:
-            # Any other error may hide a stop. A link to nothing is there: its disk may be missing.
+            # Only an absent file means that there is no stop. A link whose target is absent counts
+            # as unreadable, because the disk of the target may not be mounted.
             os.lstat(path)
         except FileNotFoundError:
             return Latches()
@@ -191,12 +198,13 @@ class LatchFile:
             return stopped(Latches(), unreadable(self.where, _reason(error)), now)
 
     def _take_lock(self, path: Path) -> None:
-        """Lock out every other daemon that would write this file; raise `InUseError`."""
+        """Lock the file against other daemons; raise `InUseError` if another one has locked it."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError:
-            return  # Writing the file fails too, and that is reported.
+            # Writing the file will fail too, and that failure is reported.
+            return
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -209,7 +217,8 @@ class LatchFile:
             raise InUseError(self._barred) from None
         except OSError:
             os.close(lock)
-            return  # A file system without locks: two daemons with one id are seen on the bus.
+            # This file system has no locks. The bus detects two daemons with the same id.
+            return
         self._lock = lock
         # A process that was killed while it wrote has left its temporary file.
         for left in path.parent.glob(f".{path.name}.*"):
@@ -219,7 +228,7 @@ class LatchFile:
     # the control loop's side
 
     def keep(self, latches: Latches) -> None:
-        """Hand over the latches that are in force from now on."""
+        """Take the latches that are in force from now on."""
         self._handed = latches
         self._box.put(latches)
 
@@ -228,7 +237,7 @@ class LatchFile:
         return self._held is latches
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Wait until `holds` is true, at most this time."""
+        """Wait until `holds` is true or writing fails, but at most `seconds`."""
         end_ns = clock.mono_ns() + seconds * NS_PER_S
         while not self.holds(latches) and not self._failed and clock.mono_ns() < end_ns:
             time.sleep(0.001)
@@ -246,7 +255,7 @@ class LatchFile:
 
     @property
     def trouble(self) -> str:
-        """Why the latches in force are not kept, in words; empty if they are."""
+        """Why the latches in force are not kept, in words; "" if they are kept."""
         if self._thread is not None and not self._thread.is_alive():
             return "the thread that keeps a stop over a restart has ended; restart the daemon"
         failed = self._failed or (HANGS if self._hangs else "")
@@ -275,7 +284,7 @@ class LatchFile:
     def _work(self, now: Instant) -> None:
         latches = None if self._failed else self._sync_first()
         while True:
-            # Look for the end before the latches, so that the last ones are not overlooked.
+            # Read `closed` before the latches, so that the last latches are not missed.
             over = self._box.closed
             latches = self._box.pop() or latches
             if latches is not None and not self._try(latches, now):
@@ -287,7 +296,10 @@ class LatchFile:
             self._box.wait(None if latches is None else RETRY_S)
 
     def _try(self, latches: Latches, now: Instant) -> str:
-        """Write these latches and report a failure or a recovery; return the failure."""
+        """Write these latches, and report a failure or a recovery.
+
+        Returns the reason of a failure, or "".
+        """
         self._busy_ns = clock.mono_ns()
         with self._disk:
             if self._blind:
@@ -301,7 +313,7 @@ class LatchFile:
         return trouble
 
     def _sync_first(self) -> Latches | None:
-        """Sync the write of the start; return the latches to write again if that fails."""
+        """Sync the file that `start` has written; return the latches to write again if it fails."""
         self._busy_ns = clock.mono_ns()
         with self._disk:
             trouble = self._sync()
@@ -318,15 +330,16 @@ class LatchFile:
             try:
                 self._found = self._read(now)
             except InUseError:
-                self._found = Latches()  # `_barred` says why nothing is written.
+                # `_barred` says why the file is not written.
+                self._found = Latches()
         self._missed = replace_fields(self._found, stop=None)
 
     def _write(self, latches: Latches) -> str:
-        """Replace and sync the file; return the reason if that fails."""
+        """Replace and sync the file; return the reason of a failure, or ""."""
         return self._replace(latches) or self._sync()
 
     def _replace(self, latches: Latches) -> str:
-        """Replace the file; return the reason if that fails."""
+        """Replace the file without a sync; return the reason of a failure, or ""."""
         if self._path is None or self._barred:
             return self._barred
         try:
@@ -342,7 +355,7 @@ class LatchFile:
         return ""
 
     def _sync(self) -> str:
-        """Wait until the disk has the file, which `_replace` has written; return a failure."""
+        """Sync the file that `_replace` has written; return the reason of a failure, or ""."""
         assert self._path is not None
         try:
             sync(self._path)
@@ -352,9 +365,9 @@ class LatchFile:
         return ""
 
     def _with_missed(self, latches: Latches) -> Latches:
-        """Return these latches with those that only the next start can put in force.
+        """Return these latches and the missed ones, which come into force at the next start.
 
-        A stop that was missed is not among them: the robot started stopped for it.
+        A missed stop is not among them, because the robot has started stopped anyway.
         """
         missed = self._missed
         if latches.fault is not None:

@@ -1,8 +1,8 @@
-"""The latches as bytes of a file, and the latches with which the daemon starts.
+"""The rules of the latch file: its content, and the latches with which the daemon starts.
 
-One rule decides the start: if the file cannot be read or cannot be written, the robot starts
-stopped until `clear`. Whether the process before ended in order does not matter, since every
-latch is written when it is set and not at the end. `latch_file.py` does the reading and writing.
+If the latch file cannot be read or cannot be written, the robot starts stopped until `clear`. It
+does not matter how the previous process ended, because each latch is written when it is set and not
+at the end. This module is pure; `latch_file.py` reads and writes the file.
 """
 
 from __future__ import annotations
@@ -16,23 +16,26 @@ from msgspec.structs import replace
 from acsard.core.values import NS_PER_S, AcsardError, Event, Instant, Latch, Latches
 
 FORMAT = 1
-"""Version of the file's layout. A file with another number counts as unreadable."""
+"""Version of the content. A file with another number counts as unreadable."""
 
 MAX_BYTES = 65_536
-"""Size of the largest file that is read. Three latches and all limits take about 1 kB."""
+"""Largest size of a file that is read. Three latches and all limits take about 1 kB."""
 
 MAX_TEXT = 500
-"""Characters of a name or a reason that are written: both may come from a stranger."""
+"""Largest number of characters of a name or a reason, which may come from a stranger."""
 
 ANSWER_NS = NS_PER_S // 5
-"""Longest wait of an answer for the file. A slow disk must not make a stop look unheard."""
+"""Longest time for which the answer to a stop waits for the file.
+
+With a slow disk, a longer wait would make a client believe that the robot did not receive the stop.
+"""
 
 BY = "acsard"
-"""Name under which the daemon stops the robot itself."""
+"""Name of the caller if the daemon itself stops the robot."""
 
 
 class LatchFileError(AcsardError):
-    """These bytes are not a latch file of this version."""
+    """The bytes are not a latch file of this version and of this robot."""
 
 
 class _Content(Struct, frozen=True):
@@ -42,7 +45,7 @@ class _Content(Struct, frozen=True):
 
 
 def encode(robot: str, latches: Latches) -> bytes:
-    """Return the content of the latch file, as indented JSON."""
+    """Return the content of a robot's latch file, as indented JSON."""
     stop, fault, inactive = (
         None if latch is None else replace(latch, by=_safe(latch.by), why=_safe(latch.why))
         for latch in (latches.stop, latches.fault, latches.inactive)
@@ -52,10 +55,11 @@ def encode(robot: str, latches: Latches) -> bytes:
 
 
 def decode(robot: str, data: bytes) -> Latches:
-    """Return the latches in this content, each marked as kept.
+    """Return the latches in the content of a robot's latch file, each marked as kept.
 
-    Every prefix of a valid file is refused, since a power cut may leave one. So is a file with a
-    missing or an unknown name in it: a damaged name must not make a stop disappear.
+    Every prefix of a valid file is refused, because a power cut may leave a part of a file. A file
+    with a missing or an unknown name is refused too, because a damaged name must not make a stop
+    disappear.
 
     Raises:
         LatchFileError: The content is damaged, of another version or of another robot.
@@ -80,24 +84,28 @@ def decode(robot: str, data: bytes) -> Latches:
 
 
 def at_start(why: str) -> str:
-    """Return the reason of a stop that the daemon itself sets at its start."""
+    """Return the text of a stop that the daemon itself sets when it starts, because of `why`."""
     return f"stopped when the daemon started, because {why}"
 
 
 def unreadable(where: str, reason: str) -> str:
-    """Return the reason for a start whose latch file cannot be read."""
+    """Return the text of the stop that the daemon sets if it cannot read the latch file."""
     return at_start(f"{where} cannot be read: {reason}; a stop may have been lost")
 
 
 def unwritable(where: str, reason: str) -> str:
-    """Return why a stop is not kept, for a latch file that cannot be written."""
+    """Return the message for a latch file that cannot be written."""
     return f"a stop cannot be kept over a restart: {where}: {reason}"
 
 
 def stopped(latches: Latches, why: str, now: Instant, by: str = BY) -> Latches:
-    """Return these latches with a stop, by the daemon itself unless a client asked for it.
+    """Return these latches with a stop. A stop that is latched already stays.
 
-    A stop that is latched already stays.
+    Args:
+        latches: the latches to change.
+        why: text of the stop.
+        now: time of the stop.
+        by: the client that asked for the stop, or `BY` for the daemon itself.
     """
     if latches.stop is not None:
         return latches
@@ -107,46 +115,49 @@ def stopped(latches: Latches, why: str, now: Instant, by: str = BY) -> Latches:
 
 
 class LatchKeeper(Protocol):
-    """Keeps the latches over a restart; no method but `wait` waits for a disk."""
+    """Keeps the latches over a restart. Only the method `wait` waits for the disk."""
 
     def keep(self, latches: Latches) -> None:
-        """Take the latches that are in force from now on; only the newest are written."""
+        """Take the latches that are in force from now on. Only the newest latches are written."""
 
     def holds(self, latches: Latches) -> bool:
         """Return whether a process that is killed now would start with these latches."""
 
     def wait(self, latches: Latches, seconds: float) -> None:
-        """Wait until `holds` is true, at most this time."""
+        """Wait until `holds` is true, but at most `seconds`."""
 
     def news(self) -> list[Event]:
         """Return the events since the last call."""
 
     @property
     def trouble(self) -> str:
-        """Why the latches in force are not kept, in words; empty if they are."""
+        """Why the latches in force are not kept, in words; "" if they are kept."""
 
 
 class Handover:
-    """Hands the latches over to their keeper, and knows when a request may be answered.
+    """Hands the latches of the control loop to their keeper, and says when they are kept.
 
-    A stop that was answered survives a kill, so its answer waits for the file. The robot obeys in
-    the meantime.
+    The answer to a stop waits until the stop is kept, so that a stop which was answered survives a
+    kill of the process. The robot stops at once.
     """
 
     def __init__(self, latches: Latches, keeper: LatchKeeper | None) -> None:
-        """Start with the latches that the keeper has read; None keeps nothing."""
+        """Begin with the latches that the keeper has read. Without a keeper nothing is kept."""
         self.latches = latches
         self._keeper = keeper
 
     def take(self, latches: Latches) -> None:
-        """Hand these latches over if they have changed."""
+        """Hand these latches to the keeper if they have changed."""
         if latches is not self.latches:
             self.latches = latches
             if self._keeper is not None:
                 self._keeper.keep(latches)
 
     def take_stops(self, latches: Latches, by: list[str], now: Instant) -> None:
-        """Hand these latches over with the stops of clients that no control step has served."""
+        """Hand these latches to the keeper, with the stops that no control step has taken.
+
+        `by` names the clients that asked for these stops.
+        """
         for name in by:
             latches = stopped(latches, f"stopped by {name or 'request'}", now, name)
         self.take(latches)
@@ -157,7 +168,7 @@ class Handover:
         return self._keeper is None or self._keeper.holds(self.latches)
 
     def wait(self) -> None:
-        """Give the disk its time to take the latches; only on the way down."""
+        """Wait at most `ANSWER_NS` until the latches are kept. Call this only at the end."""
         if self._keeper is not None:
             self._keeper.wait(self.latches, ANSWER_NS / NS_PER_S)
 
@@ -167,7 +178,7 @@ class Handover:
 
     @property
     def trouble(self) -> str | None:
-        """Why the latches are not kept, in words; None where nothing is kept."""
+        """Why the latches are not kept, in words; "" if they are kept, None without a keeper."""
         return None if self._keeper is None else self._keeper.trouble
 
 

@@ -44,7 +44,7 @@ def explain_silence(key: str, robot_id: str, endpoint: str, presence: Presence) 
         near = get_close_matches(robot_id, presence.others, MAX_NAMED, 0.0)
         more = len(presence.others) - len(near)
         named = ", ".join(near) + (f" and {more} more (`acsard fleet`)" if more else "")
-        return f"there is no robot {robot_id}, but there is {named}: choose one, --id {near[0]}"
+        return f"there is no robot {robot_id}, but there is {named}; use --id {near[0]}"
     if endpoint.startswith(TLS):
         return (
             f"robot {robot_id} is not visible: no robot at {endpoint} has this robot.id, or your "
