@@ -22,15 +22,6 @@ from acsard.recording.recorded_steps import MICRO, Step
 from acsard.recording.timeline import TimelineEntry, TimelineWriter
 from acsard.report.command_sources import LOOK_S, MOST_TEXT, CommandSources
 
-GOOD = "lines"
-"""Name of the counter of lines that were parsed."""
-
-BAD = "line_"
-"""Prefix of the counters of dropped lines."""
-
-IMPOSSIBLE = "line_implausible"
-"""Counter of lines that were parsed but whose content was impossible."""
-
 NS_PER_MS = 1_000_000
 
 
@@ -100,8 +91,9 @@ class Link:
 
 
 def _heard(counters: Mapping[str, int]) -> tuple[int, int]:
-    bad = sum(count for name, count in counters.items() if name.startswith(BAD))
-    return counters.get(GOOD, 0) - counters.get(IMPOSSIBLE, 0), bad
+    """Return the number of good and of dropped lines. An implausible line was parsed, too."""
+    bad = sum(count for name, count in counters.items() if name.startswith("line_"))
+    return counters.get("lines", 0) - counters.get("line_implausible", 0), bad
 
 
 class Lateness:
